@@ -32,6 +32,7 @@ from stages.extract_frames.config import Config as FramesConfig
 from stages.register_videos import registration
 from stages.register_videos.config import AlignmentConfig, ConfidenceConfig, VoteConfig
 from stages.register_videos.config import Config as RegistrationConfig
+from stages.register_videos.point_alignment import Walk
 from stages.train_localizer import training
 from stages.train_localizer.config import Config as LocalizerConfig
 
@@ -97,10 +98,11 @@ def nobody(clip: Clip, folder: Path) -> Masks:
 
 
 def registered(
-    made: SceneTemplate, localizer: Localizer, session: Clip, masks: Masks
+    made: SceneTemplate, walk: Clip, localizer: Localizer, session: Clip, masks: Masks
 ) -> Float[np.ndarray, "frame 4 4"]:
     """Register the second half; NaN where it is rejected."""
-    maps = registration.Maps(made.mesh, made.mesh, localizer, localizer)
+    cameras = np.where(made.registered[:, None, None], made.world_from_camera, np.nan)
+    maps = registration.Maps(made.mesh, made.mesh, localizer, localizer, walk=Walk(walk, cameras))
     rng = np.random.default_rng(EVERY_FRAME.seed)
     result = registration.register(session, masks, maps, EVERY_FRAME, rng)
     if isinstance(result, registration.Rejected):
@@ -127,7 +129,7 @@ def measured(scene: Path, folder: Path) -> dict[str, dict[str, dict[str, float]]
     points = localizing.sift_map(walk.clip, made.world_from_camera, range(len(walk.clip)))
     pictures = localizing.gallery(walk.clip, made.world_from_camera, range(len(walk.clip)))
     poses = {
-        "ours": registered(made, localizer, clip, nobody(clip, folder / "masks")),
+        "ours": registered(made, walk.clip, localizer, clip, nobody(clip, folder / "masks")),
         "ours, single frames": localizing.placed_by_localizer(localizer, clip, frames, hide)[0],
         "SIFT, PnP on the template's walk": localizing.placed_by_sift(points, clip, frames),
         "retrieval": localizing.placed_by_retrieval(pictures, clip, frames),

@@ -1,14 +1,19 @@
 """Bundle adjustment with depth, as a term of `pose_optimization`.
 
-`TrackedPoints` are pixels that show the same point, with the depth measured there. `PointTerm` fits points to
-given cameras and eliminates them: normal equations of the cameras remain (Triggs et al. 2000, section 6).
+`TrackedPoints` are pixels that show the same point, with the depth measured there; `chained` makes them of
+matches. `PointTerm` fits points and lenses to given cameras and eliminates the points: normal equations of
+the cameras remain (Triggs et al. 2000, section 6).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from pipeline.mapping.depth_scans import depth_noise
 
 ROBUST_SIGMAS = 3.0
 """Width of the robust weight, standard deviations."""
@@ -25,6 +30,9 @@ POINT_DAMPING = 1e-6
 """Damping of a point's step, share of its matrix's trace: points that parallel rays see stay solvable."""
 NEAREST_M = 0.05
 """Observations of points nearer than this do not count, metres."""
+RADIAL_SIGMA, LEAST_BEND_PX = 0.05, 0.5
+"""Deviation of a lens's radial distortion from none, and the distortion at its outermost point below which it
+counts as none: what noise finds in a pinhole."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +47,8 @@ class TrackedPoints:
     depth_m: Float[np.ndarray, "observation"]
     """Measured depth, NaN where there is none."""
     depth_sigma_m: Float[np.ndarray, "observation"]
+    lens: Int[np.ndarray, "observation"]
+    """Which lens saw it, from 0."""
 
     @property
     def points(self) -> int:
@@ -64,6 +74,34 @@ class TrackedPoints:
         return total / np.maximum(count, 1)[:, None]
 
 
+def chained(
+    pixels: Sequence[Float[np.ndarray, "_ 2"]],
+    depths_m: Sequence[Float[np.ndarray, "_"]],
+    intrinsics: Float[np.ndarray, "camera 3 3"],
+    lens: Int[np.ndarray, "camera"],
+    links: Sequence[tuple[int, int, Int[np.ndarray, "_ 2"]]],
+) -> TrackedPoints:
+    """Chain matches to points: each camera's keypoints with the depth under them (NaN: unknown), and pairs of
+    cameras with the rows of their keypoints that match. What shows twice in a picture is no point.
+    """
+    starts = np.concatenate([[0], np.cumsum([len(each) for each in pixels])])
+    linked = [found + starts[[first, second]] for first, second, found in links]
+    first, second = np.concatenate([np.zeros((0, 2), int), *linked]).T
+    graph = sparse.coo_array((np.ones(len(first)), (first, second)), shape=(starts[-1], starts[-1]))
+    point = connected_components(graph, directed=False)[1]
+    camera = np.repeat(np.arange(len(pixels)), np.diff(starts))
+    _, place, met = np.unique(np.stack([point, camera]), axis=1, return_inverse=True, return_counts=True)
+    twice = np.zeros(starts[-1] + 1, bool)
+    twice[point[(met > 1)[place.ravel()]]] = True
+    row = np.flatnonzero((np.bincount(point, minlength=1)[point] > 1) & ~twice[point])
+    camera, pinhole = camera[row], intrinsics[camera[row]]
+    pixel = np.concatenate([np.zeros((0, 2)), *pixels])[row]
+    depth = np.concatenate([np.zeros(0), *depths_m])[row]
+    focal, center, sigma = pinhole[:, [0, 1], [0, 1]], pinhole[:, :2, 2], depth_noise(np.nan_to_num(depth))
+    point = np.unique(point[row], return_inverse=True)[1]
+    return TrackedPoints(camera, point, pixel, focal, center, depth, sigma, lens[camera])
+
+
 class PointTerm:
     """The squared, robust reprojection and depth errors of tracked points, minimized over the points."""
 
@@ -71,6 +109,10 @@ class PointTerm:
         """Begin with the points where depth and these cameras place them."""
         self.tracked, self.points_world = tracked, tracked.lifted(world_from_camera)
         self.sigma_px, self.depth_inflation = FIRST_SIGMA_PX, LEAST_DEPTH_INFLATION
+        self.radial = np.zeros(int(tracked.lens.max(initial=0)) + 1)
+        """Per lens: what it shows r focal lengths from the centre belongs at r (1 + radial r^2)."""
+        flat = (tracked.pixel - tracked.center_px) / tracked.focal_px
+        self._bend_px = tracked.focal_px * flat * (flat**2).sum(1, keepdims=True)
 
     def normal_equations(
         self, world_from_camera: Float[np.ndarray, "camera 4 4"]
@@ -106,9 +148,15 @@ class PointTerm:
         moved = self.points_world[self.tracked.point] - pose[:, :3, 3]
         return np.einsum("oji,oj->oi", pose[:, :3, :3], moved)
 
+    def _error_px(self, local):
+        """Return how far from their straightened pixels points are seen."""
+        t = self.tracked
+        seen = local[:, :2] / np.maximum(local[:, 2:], NEAREST_M) * t.focal_px + t.center_px
+        return seen - t.pixel - self.radial[t.lens, None] * self._bend_px
+
     def _measure(self, world_from_camera):
         t, local = self.tracked, self._local(world_from_camera)
-        error_px = local[:, :2] / np.maximum(local[:, 2:], NEAREST_M) * t.focal_px + t.center_px - t.pixel
+        error_px = self._error_px(local)
         self.sigma_px = max(LEAST_SIGMA_PX, MAD_TO_SIGMA * float(np.median(np.abs(error_px))))
         known = np.isfinite(t.depth_m)
         if known.any():
@@ -120,7 +168,7 @@ class PointTerm:
         """Return weighted residuals [observation 3], their derivative by the point, and the local points."""
         t, local = self.tracked, self._local(world_from_camera)
         z = np.maximum(local[:, 2:], NEAREST_M)
-        pixel = (local[:, :2] / z * t.focal_px + t.center_px - t.pixel) / self.sigma_px
+        pixel = self._error_px(local) / self.sigma_px
         known = np.isfinite(t.depth_m)
         depth = np.where(known, local[:, 2] - np.nan_to_num(t.depth_m), 0.0)
         depth = depth / (self.depth_inflation * t.depth_sigma_m)
@@ -137,6 +185,7 @@ class PointTerm:
         weight = weight[:, [0, 0, 1]]
         camera_from_world = np.swapaxes(world_from_camera[t.camera, :3, :3], 1, 2)
         by_point = weight[..., None] * (projection @ camera_from_world)
+        self._weight = weight
         return weight * np.column_stack([pixel, depth]), by_point, local
 
     def _hessian(self, by_point):
@@ -146,12 +195,24 @@ class PointTerm:
         return hessian
 
     def _fit(self, world_from_camera):
+        t, lenses = self.tracked, len(self.radial)
+        own = np.eye(lenses)[t.lens]
         for _ in range(POINT_STEPS):
             residual, by_point, _ = self._linearized(world_from_camera)
-            gradient = np.zeros((self.tracked.points, 3))
-            np.add.at(gradient, self.tracked.point, np.einsum("oki,ok->oi", by_point, residual))
-            step = np.linalg.solve(_damped(self._hessian(by_point)), gradient[..., None])[..., 0]
-            self.points_world = self.points_world - step
+            bend = -(self._weight[:, :2] * self._bend_px / self.sigma_px)[..., None] * own[:, None]
+            gradient, cross = np.zeros((t.points, 3)), np.zeros((t.points, 3, lenses))
+            np.add.at(gradient, t.point, np.einsum("oki,ok->oi", by_point, residual))
+            np.add.at(cross, t.point, np.einsum("oki,okl->oil", by_point[:, :2], bend))
+            inverse = np.linalg.inv(_damped(self._hessian(by_point)))
+            pulled = inverse @ cross
+            normal = np.einsum("okl,okm->lm", bend, bend) - np.einsum("pil,pim->lm", cross, pulled)
+            slope = np.einsum("okl,ok->l", bend, residual[:, :2]) - np.einsum("pil,pi->l", pulled, gradient)
+            prior = np.eye(lenses) / RADIAL_SIGMA**2
+            step = np.linalg.solve(normal + prior, slope + prior @ self.radial)
+            self.radial = self.radial - step
+            self.points_world = self.points_world - np.einsum("pij,pj->pi", inverse, gradient - cross @ step)
+        most = (np.abs(self.radial) * np.linalg.norm(self._bend_px, axis=1)[:, None] * own).max(0, initial=0)
+        self.radial = np.where(most < LEAST_BEND_PX, 0.0, self.radial)
 
 
 def _damped(hessian):

@@ -11,6 +11,8 @@ from pipeline.geometry import cameras
 RATIO = 0.8
 """Ratio test: the best match must be this much nearer than the second (Lowe 2004)."""
 LEAST_NORM = 1e-6
+PEAK_THRESHOLD = 0.04
+"""OpenCV's contrast threshold."""
 
 
 @dataclass(frozen=True)
@@ -28,9 +30,15 @@ def sift_points(
     depth: Float[np.ndarray, "depth_height depth_width"],
     depth_intrinsics: Float[np.ndarray, "3 3"],
     most: int,
+    peak_threshold: float = PEAK_THRESHOLD,
+    usable: UInt8[np.ndarray, "height width"] | None = None,
 ) -> SiftPoints:
-    """Describe the ``most`` strongest points of a picture and keep those with depth, metres."""
-    keypoints, descriptors = cv2.SIFT.create(most).detectAndCompute(gray, None)
+    """Describe the ``most`` strongest points of a picture, where it is ``usable``, and keep those with depth,
+    metres; plain walls need a low contrast threshold.
+    """
+    # Otherwise OpenCV's points lie a quarter of a pixel to the lower right.
+    sift = cv2.SIFT.create(most, contrastThreshold=peak_threshold, enable_precise_upscale=True)
+    keypoints, descriptors = sift.detectAndCompute(gray, usable)
     if not keypoints:
         return SiftPoints(np.zeros((0, 128), np.float32), np.zeros((0, 3)))
     ray = cameras.unproject(np.array([point.pt for point in keypoints]) + 0.5, intrinsics)
@@ -41,7 +49,7 @@ def sift_points(
 
 def matches(first: SiftPoints, second: SiftPoints) -> Int[np.ndarray, "match 2"]:
     """Return index pairs (first, second) of distinctive descriptors by the ratio test."""
-    if len(second.descriptors) < 2:
+    if not len(first.descriptors) or len(second.descriptors) < 2:
         return np.zeros((0, 2), int)
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
     return np.array(

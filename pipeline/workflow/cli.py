@@ -93,10 +93,11 @@ class Task:
             for artifact_name in of_homes:
                 self._below(folder, self.config.homes, artifact_name)
             return {name: folder / name for name in self.config.homes}
-        if dag.NODES[field.name].trials == "each":
+        need = named[0] if named else Need(field.name)
+        if dag.NODES[need.artifact].trials == "each":
             trials = recipes.trial_ids(self.config.methods, self.config.seeds)
             return {id: self._opened(folder / id, f"{field.name}/{id}") for id in trials}
-        return self._per_video(next((need for need in named if not need.option), Need(field.name)))
+        return self._per_video(need)
 
     def recording(self) -> Video | None:
         """Return the recording to treat; None where the stage was run by hand without saying which."""
@@ -116,7 +117,7 @@ class Task:
         if not self.videos:
             remedy = "give --videos build/<agent>/plan/videos.json"
             raise InputError("ART-004", f"which recordings of {need.artifact}?", self.stage, remedy)
-        found, folder = {}, self.paths[need.artifact]
+        found, folder = {}, self.paths[need.option or need.artifact]
         for video in sorted(self.videos, key=lambda video: video.id):
             if need.wants(video, dag.NODES[need.artifact].roles):
                 made = dag.folder_of(need.artifact, video)

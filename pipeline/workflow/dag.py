@@ -199,7 +199,10 @@ FLOW: tuple[Node, ...] = (
     Node(
         "video_poses",
         "register_videos",
-        ("frames", "masks", "features", *TEMPLATES, *LOCALIZERS),
+        (
+            *("frames", "masks", "features", *TEMPLATES, *LOCALIZERS),
+            Need("frames", roles=("walkthrough",), option="walk"),
+        ),
         roles=("session",),
         gpu=1,
         seconds_per_frame=0.08,

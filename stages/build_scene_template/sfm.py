@@ -11,16 +11,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 from jaxtyping import Float, Int, Num
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from pipeline.core.progress import log
 from pipeline.data.clips import Clip
 from pipeline.geometry import align, cameras, rigid
 from pipeline.mapping import colmap
-from pipeline.mapping.bundle_adjustment import TrackedPoints
+from pipeline.mapping.bundle_adjustment import TrackedPoints, chained
 from pipeline.mapping.colmap import SparseModel, read_sparse_model
-from pipeline.mapping.depth_scans import depth_noise
 from stages.build_scene_template.config import SfmConfig
 
 KEYFRAME_M, KEYFRAME_DEG = 0.12, 9.0
@@ -151,25 +148,12 @@ def tracked_points(clip: Clip, database: Path, keyframes: Int[np.ndarray, "key"]
         pairs = sorted(pycolmap.pair_id_to_image_pair(pair) for pair in table.read_two_view_geometries()[0])
         matches = {pair: table.read_two_view_geometry(*pair).inlier_matches.astype(int) for pair in pairs}
     assert len(images) == len(keyframes), f"{len(images)} pictures of {len(keyframes)} keyframes"
-    starts = np.concatenate([[0], np.cumsum([len(each) for each in pixels])])
-    start_of = {image.image_id: start for image, start in zip(images, starts[:-1], strict=True)}
-    linked = [found + np.array([start_of[a], start_of[b]]) for (a, b), found in matches.items()]
-    first, second = np.concatenate([np.zeros((0, 2), int), *linked]).T
-    graph = sparse.coo_array((np.ones(len(first)), (first, second)), shape=(starts[-1], starts[-1]))
-    point = connected_components(graph, directed=False)[1]
-    key = np.repeat(np.arange(len(images)), np.diff(starts))
-    _, place, met = np.unique(np.stack([point, key]), axis=1, return_inverse=True, return_counts=True)
-    twice = np.zeros(starts[-1] + 1, bool)
-    twice[point[(met > 1)[place.ravel()]]] = True
-    row = np.flatnonzero((np.bincount(point, minlength=1)[point] > 1) & ~twice[point])
-    key, pixel = key[row], np.concatenate([np.zeros((0, 2)), *pixels])[row]
-    depth = np.full(len(row), np.nan)
-    for index in np.unique(key):
-        depth[key == index] = points_under(clip, int(keyframes[index]), pixel[key == index])[:, 2]
-    lens = clip.intrinsics[keyframes[key]]
-    sigma = depth_noise(np.nan_to_num(depth))
-    point = np.unique(point[row], return_inverse=True)[1]
-    return TrackedPoints(key, point, pixel, lens[:, [0, 1], [0, 1]], lens[:, :2, 2], depth, sigma)
+    place = {image.image_id: index for index, image in enumerate(images)}
+    links = [(place[a], place[b], found) for (a, b), found in matches.items()]
+    depths = [
+        points_under(clip, int(frame), pixel)[:, 2] for frame, pixel in zip(keyframes, pixels, strict=True)
+    ]
+    return chained(pixels, depths, clip.intrinsics[keyframes], np.zeros(len(pixels), int), links)
 
 
 def _confirmed(clip, frames, points, first, second, matches, rng) -> Num[np.ndarray, "match 2"]:

@@ -21,6 +21,7 @@ from pipeline.mapping.pose_optimization import Correspondences, RelativePoseFact
 from stages.register_videos.config import AlignmentConfig
 from stages.register_videos.feature_alignment import FeatureMap, feature_correspondences
 from stages.register_videos.flow_alignment import flow_correspondences
+from stages.register_videos.point_alignment import Walk, WalkTerm
 from stages.register_videos.votes import FrameVotes
 
 MOST_POINTS, LEAST_POINTS = 400_000, 40
@@ -77,8 +78,11 @@ def align(
     votes: FrameVotes,
     supports: Bool[np.ndarray, "vote"],
     config: AlignmentConfig,
+    walk: Walk | None = None,
 ) -> AlignedCameras:
-    """Optimize all frames: votes and odometry, then depth from coarse to fine, then flow, then features."""
+    """Optimize all frames: votes and odometry, then depth from coarse to fine, then flow, points of the walk,
+    and features.
+    """
     surface, frames = depth_scans.SurfaceMap(caster.mesh), np.arange(len(clip))
     most = max(MOST_POINTS // len(clip), LEAST_POINTS)
     scans = [
@@ -92,7 +96,7 @@ def align(
         depth = surface.correspondences(frames, scans, poses, reach_m, DEPTH_INFLATION)
         return Correspondences.join(depth, *voted, *by_flow, *by_features)
 
-    poses, last = world_from_camera, (LAST_REACH_M,) * PICTURE_ROUNDS
+    poses, last, points = world_from_camera, (LAST_REACH_M,) * PICTURE_ROUNDS, None
     if config.rounds:
         if voted:
             first = (FIRST_REACH_M,) * VOTE_ROUNDS
@@ -106,13 +110,16 @@ def align(
         ties = (flow_correspondences(clip, masks, caster, int(frame), poses[frame]) for frame in chosen)
         by_flow[:] = [tie for tie in ties if tie is not None]
         poses = optimize_poses(poses, find, odometry, reach_m=last).world_from_camera
+    if walk is not None:
+        points = WalkTerm(clip, masks, poses, walk)
+        poses = optimize_poses(poses, find, odometry, reach_m=2 * last, term=points).world_from_camera
     for _ in range(FEATURE_PASSES if config.feature_every_frames else 0):
         if features is None:
             break
         chosen = track(frames[:: config.feature_every_frames], "features")
         ties = (feature_correspondences(clip, masks, features, int(frame), poses[frame]) for frame in chosen)
         by_features[:] = [tie for tie in ties if tie is not None]
-        poses = optimize_poses(poses, find, odometry, reach_m=last).world_from_camera
+        poses = optimize_poses(poses, find, odometry, reach_m=last, term=points).world_from_camera
     covariance = pose_optimization.marginal_covariance(
         poses, find(poses, LAST_REACH_M), odometry, LAST_REACH_M
     )

@@ -26,6 +26,7 @@ from stages.register_videos.confidence import (
 )
 from stages.register_videos.config import Config
 from stages.register_videos.feature_alignment import FeatureMap
+from stages.register_videos.point_alignment import Walk
 from stages.register_videos.votes import LEAST_VOTES, FrameVotes
 
 LEAST_MEASURED = 0.2
@@ -49,6 +50,8 @@ class Maps:
     agent_localizer: Localizer
     scene_features: Float[np.ndarray, "vertex channel"] | None = None
     """Features of the scene's vertices; None: no feature-metric alignment."""
+    walk: Walk | None = None
+    """The walk-through, to whose pictures a recording without odometry is aligned; None: it is not."""
 
     @property
     def floor_m(self) -> float:
@@ -120,7 +123,7 @@ def register(
     scene = None
     if maps.scene_features is not None and features is not None:
         scene = FeatureMap(caster, maps.scene_features, features)
-    aligned = _aligned(clip, masks, caster, scene, start, motion, votes, config)
+    aligned = _aligned(clip, masks, caster, scene, start, motion, votes, config, maps.walk)
     measured = f"{int(np.isfinite(aligned.fit).sum())} of {len(clip)} frames"
     gap = f"{aligned.median_gap_m * 100:.1f} cm from the template, {aligned.median_fit:.0%} within 5 cm"
     log(f"static depth of {measured}: {gap}")
@@ -165,19 +168,25 @@ def _aligned(
     motion: Odometry,
     votes: FrameVotes,
     config: Config,
+    walk: Walk | None,
 ) -> AlignedCameras:
     """Align the cameras with the scene; where they come from the map, keep them."""
     cameras, relative = start.world_from_camera, motion.relative_poses
     if clip.mapped:
         return alignment.keep(clip, masks, caster, cameras, relative, config.alignment)
+    walk = None if _tracked_itself(clip, config) else walk
     return alignment.align(
-        clip, masks, caster, scene, cameras, relative, votes, start.supports, config.alignment
+        clip, masks, caster, scene, cameras, relative, votes, start.supports, config.alignment, walk
     )
+
+
+def _tracked_itself(clip, config) -> bool:
+    return config.odometry == "device" and clip.odometry_from_camera is not None
 
 
 def _odometry(clip, masks, config, rng) -> Odometry:
     """Return the motions between neighbours: the device's, or visual odometry."""
-    if config.odometry == "device" and clip.odometry_from_camera is not None:
+    if _tracked_itself(clip, config):
         device = odometry.of_device(clip)
         if device.jumps.any():
             jumps = f"{int(device.jumps.sum())} of {len(clip)} frames"

@@ -1,6 +1,7 @@
 """From one session's frames, masks and features to its poses and status."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from pipeline.data.templates import SceneCameras, read_vertex_features
 from pipeline.localization import localizer as localizers
 from stages.register_videos import pictures, registration
 from stages.register_videos.config import Config
+from stages.register_videos.point_alignment import Walk
 from stages.register_videos.registration import Maps, Registered, Rejected
 
 
@@ -27,6 +29,8 @@ class Inputs:
     agent_template: Path
     scene_localizer: Path
     agent_localizer: Path
+    walk: Mapping[str, Path]
+    """Frames of walk-throughs; the first one is used."""
     features: Path | None = None
     """Without features there is no feature-metric alignment."""
 
@@ -34,6 +38,7 @@ class Inputs:
 def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") -> Registered | Rejected:
     """Register one session and write its poses, or the reason why it does not fit."""
     clip, masks = Clip.open(inputs.frames), Masks.open(inputs.masks)
+    walk = SceneCameras.open(inputs.scene_template)
     features, scene_features = None, None
     if inputs.features is not None:
         features = open_features(inputs.features)
@@ -44,8 +49,8 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") ->
         scene_localizer=localizers.load(inputs.scene_localizer, device),
         agent_localizer=localizers.load(inputs.agent_localizer, device),
         scene_features=scene_features,
+        walk=Walk(Clip.open(next(iter(inputs.walk.values()))), walk.world_from_registered),
     )
-    walk = SceneCameras.open(inputs.scene_template)
     rng = np.random.default_rng(config.seed)
     result = registration.register(clip, masks, maps, config, rng, features)
     if isinstance(result, Registered):

@@ -6,7 +6,7 @@ from scipy import sparse
 
 from pipeline.geometry import cameras, rigid
 from pipeline.mapping import pose_optimization
-from pipeline.mapping.bundle_adjustment import PointTerm, TrackedPoints
+from pipeline.mapping.bundle_adjustment import PointTerm, TrackedPoints, chained
 
 CAMERAS, POINTS, FOCAL_PX = 6, 80, 300.0
 NO_INDEX, NO_POINT = np.zeros(0, int), np.zeros((0, 3))
@@ -37,14 +37,15 @@ def seen(rng, noise_px=0.0, depth_scale=1.0, noise_m=0.0):
         rows * [160.0, 120.0],
         depth,
         np.full(len(camera), 0.02),
+        np.zeros(len(camera), int),
     )
     return truth, tracked
 
 
-def optimized(start, tracked):
-    fixed = np.arange(CAMERAS) == 0
+def optimized(start, tracked, term=None):
+    fixed, term = np.arange(CAMERAS) == 0, term or PointTerm(tracked, start)
     return pose_optimization.optimize_poses(
-        start, lambda *_: NOTHING, None, reach_m=(1.0,) * 12, fixed=fixed, term=PointTerm(tracked, start)
+        start, lambda *_: NOTHING, None, reach_m=(1.0,) * 12, fixed=fixed, term=term
     ).world_from_camera
 
 
@@ -88,6 +89,30 @@ def test_deviations_are_measured():
     assert term.depth_inflation * 0.02 == pytest.approx(2 * 0.06, rel=0.3), "twice; points take up some"
     assert abs(normal - sparse.csc_array(normal.T)).max() < 1e-6 * abs(normal).max()
     assert gradient.shape == (6 * CAMERAS,)
+
+
+def test_the_lens_is_recovered():
+    """Pixels are nearer to the centre than a pinhole would show them."""
+    rng, radial = np.random.default_rng(5), 0.05
+    truth, tracked = seen(rng)
+    straight = (tracked.pixel - tracked.center_px) / FOCAL_PX
+    shown = straight
+    for _ in range(20):
+        shown = straight / (1 + radial * (shown**2).sum(1, keepdims=True))
+    tracked.pixel[:] = shown * FOCAL_PX + tracked.center_px
+    term = PointTerm(tracked, truth)
+    found = optimized(displaced(truth, rng), tracked, term)
+    assert term.radial == pytest.approx(radial, abs=0.005)
+    assert np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.005, "metres"
+
+
+def test_points_that_show_twice_in_a_picture_are_none():
+    pixels = [np.array([[1.0, 2], [3, 4], [5, 6]]), np.array([[7.0, 8], [9, 10]])]
+    depths, pinhole = [np.array([1.0, np.nan, 2]), np.array([3.0, 4])], np.repeat(np.eye(3)[None], 2, axis=0)
+    links = [(0, 1, np.array([[0, 0], [1, 1], [2, 1]]))]
+    found = chained(pixels, depths, pinhole, np.array([0, 1]), links)
+    assert found.pixel.tolist() == [[1, 2], [7, 8]] and found.depth_m.tolist() == [1, 3]
+    assert found.camera.tolist() == found.lens.tolist() == [0, 1] and found.points == 1
 
 
 def test_points_that_pairs_of_cameras_share_are_counted():

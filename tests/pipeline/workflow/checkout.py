@@ -168,7 +168,8 @@ def _fields(stage: str) -> str:
     )
     for node in nodes:
         for need in dag.needs_of(node, "recordings"):
-            several = (dag.NODES[need.artifact].roles and not node.roles and not need.option) or (
+            one = not need.roles if node.roles else need.option
+            several = (dag.NODES[need.artifact].roles and not one) or (
                 dag.NODES[need.artifact].trials == "each" and node.trials != "each"
             )
             kinds[need.option or need.artifact] = "Mapping[str, Path]" if several else "Path"

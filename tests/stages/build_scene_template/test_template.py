@@ -17,7 +17,7 @@ from stages.build_scene_template import anchor, fuse, refine, sfm, template
 from stages.build_scene_template.config import Config, FusionConfig, RefinementConfig, SfmConfig
 from tests.stages.textured_room import MemoryClip, aligned_errors, drifting, textured_room, walk
 
-NO_POINTS = TrackedPoints(*np.zeros((2, 0), int), *np.zeros((3, 0, 2)), *np.zeros((2, 0)))
+NO_POINTS = TrackedPoints(*np.zeros((2, 0), int), *np.zeros((3, 0, 2)), *np.zeros((2, 0)), np.zeros(0, int))
 SFM = SfmConfig(most_keyframes=16, features=600, overlap=4, loops_per_keyframe=1)
 
 
