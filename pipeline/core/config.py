@@ -45,7 +45,7 @@ def load(config: type[C], path: Path) -> C:
 def read_table(path: Path) -> dict[str, Any]:
     """Read a JSON (`.json`) or TOML file that holds one table."""
     try:
-        text = path.read_text()
+        text = path.read_text("utf-8-sig")
         table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
     except (OSError, ValueError, RecursionError) as error:
         raise InputError("REC-003", f"cannot be read: {error}", str(path), "repair the file") from error
@@ -93,12 +93,12 @@ def refuse_unknown(
 
 
 def refuse_impossible(value: Any, default: Any, *, where: str) -> None:
-    """Raise REC-002 for numbers that are not finite, negative unlike the default, or a rate of 0."""
+    """Raise REC-002 for numbers that are not finite, negative unlike the default, or a rate or size of 0."""
     if not isinstance(value, int | float) or not isinstance(default, int | float):
         return
-    stands_still = where.endswith("_hz") and value == 0
+    nothing = where.endswith(("_hz", "_px")) and value == 0
     counts = default > 0 or (default == 0 and isinstance(default, int))
-    if not math.isfinite(value) or (counts and value < 0) or (default > 0 and stands_still):
+    if not math.isfinite(value) or (counts and value < 0) or (default > 0 and nothing):
         remedy = f"give a number as the default is, {default!r}"
         raise InputError("REC-002", f"{shown(value)} cannot be", where, remedy)
 

@@ -6,6 +6,8 @@ depth. The app's own mesh, `raw.glb`, stands turned to its axes; the inverse of 
 """
 
 import io
+import json
+import struct
 from pathlib import Path
 
 import cv2
@@ -31,6 +33,8 @@ from pipeline.recordings.recording import (
 TRUSTED_M = 5.0
 """depth beyond this is unknown, metres"""
 MAX_MESH_BYTES = 512 << 20
+GLB_JSON_LENGTH_AT, GLB_JSON_AT = 12, 20
+"""where a binary glTF's JSON chunk has its length and begins, bytes"""
 COEFFICIENTS = ("fx", "fy", "cx", "cy")
 MATRIX = tuple(f"t_{row}{column}" for row in range(3) for column in range(4))
 
@@ -111,8 +115,11 @@ def _mesh(container: FolderContainer) -> Mesh:
         where = container.place("mesh_info.json")
         raise broken_metadata(where, f"no alignmentTransform of 16 numbers ({error!r})") from error
     try:
-        data = io.BytesIO(container.read("raw.glb", MAX_MESH_BYTES))
-        loaded = trimesh.load(data, file_type="glb", force="mesh")
+        data = container.read("raw.glb", MAX_MESH_BYTES)
+        listed = json.loads(data[GLB_JSON_AT:][: struct.unpack_from("<I", data, GLB_JSON_LENGTH_AT)[0]])
+        if sum(accessor["count"] for accessor in listed["accessors"]) > len(data):
+            raise ValueError("it lists more values than it has bytes")
+        loaded = trimesh.load(io.BytesIO(data), file_type="glb", force="mesh")
     except Exception as error:  # whatever the reader meets in a file that was cut
         raise damaged(container.place("raw.glb"), repr(error)) from error
     if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):

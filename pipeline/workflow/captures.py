@@ -113,9 +113,10 @@ def remarks(
     config.refuse_unknown(overrides, names, where=f"{where}: [videos]", kind="recording")
     said = {}
     for name in names:
-        if len(name.encode()) > LONGEST_NAME_BYTES:
-            what = f"the name of {name[:40]!r}... is longer than {LONGEST_NAME_BYTES} bytes"
-            raise InputError("CAP-041", what, str(folder), "give it a shorter name")
+        data = name.encode(errors="replace")
+        if len(data) > LONGEST_NAME_BYTES or data.decode() != name:
+            what = f"the name {name[:40]!r} is longer than {LONGEST_NAME_BYTES} bytes, or no UTF-8"
+            raise InputError("CAP-041", what, str(folder), "rename it")
         sidecar = folder / f"{name}{SIDECAR}"
         table = config.read_table(sidecar) if sidecar.is_file() else {}
         table = {**table, **overrides.get(name, {})}

@@ -271,8 +271,8 @@ def _keep(cache: sources.Cache, home: Home) -> None:
 
 def _read_marks(home: Home) -> str:
     """Hash name, size and time of all that a plan is made from."""
-    code, own = (sources.CODE / "pipeline", sources.CODE / "stages"), Path("captures", home.agent)
-    return artifact.digest_of([sources.marks(folder) for folder in (*code, Path("agents"), own)])
+    code = (f"{sources.CODE}/{folder}" for folder in ("pipeline", "stages"))
+    return artifact.digest_of([*map(sources.marks, (*code, "agents", f"captures/{home.agent}"))])
 
 
 def _written_marks(home: Home) -> str:

@@ -92,20 +92,22 @@ def digest(stage: str, cache: Cache) -> str:
     return cache.digests[stage]
 
 
-def marks(folder: Path) -> list[list[Any]]:
-    """Return path, size and times of every file below `folder`; where they change, one looks again."""
+def marks(folder: str, *, follow: bool = True) -> list[list[Any]]:
+    """Return path, size and times of every file below `folder`; where they change, one looks again.
+
+    Links to folders are followed in `folder` itself, where whole recordings may be links, not below.
+    """
     found: list[list[Any]] = []
-    try:
-        entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
-    except (FileNotFoundError, NotADirectoryError):
+    if not os.path.isdir(folder):
         return found
-    for entry in entries:
+    for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
         if entry.name in ("__pycache__", "node_modules"):
             continue
-        if entry.is_dir():
-            found += marks(Path(entry.path))
+        link = entry.is_symlink()
+        if os.path.isdir(entry.path) if link and follow else entry.is_dir(follow_symlinks=False):
+            found += marks(entry.path, follow=False)
         else:
-            stat = entry.stat(follow_symlinks=entry.is_file())
+            stat = entry.stat(follow_symlinks=not link or os.path.isfile(entry.path))
             found.append([entry.path, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns])
     return found
 

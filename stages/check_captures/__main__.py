@@ -13,7 +13,7 @@ from pathlib import Path
 from pipeline.core import config
 from pipeline.core.errors import InputError, printable
 from pipeline.core.videos import Role
-from pipeline.workflow import captures
+from pipeline.workflow import captures, recipes
 from stages.check_captures import stage
 from stages.check_captures.config import Config
 from stages.check_captures.stage import CaptureVerdict
@@ -53,7 +53,7 @@ def _files(folder: Path, recipe: Path) -> tuple[list[tuple[Path, Role]], list[Ca
         captures.refuse_strangers(folder)
         what = "there are no recordings; make builds from the built-in capture"
         raise InputError("CAP-042", what, str(folder), "copy recordings there (README: your own animal)")
-    overrides = config.read_table(recipe).get("videos", {}) if recipe.is_file() else {}
+    overrides = recipes.read(recipe)[0].get(recipes.VIDEOS_TABLE, {}) if recipe.is_file() else {}
     config.refuse_unknown(overrides, names, where=f"{recipe}: [videos]", kind="recording")
     files, refused = [], []
     for name in names:

@@ -27,6 +27,7 @@ class Outer:
     sizes: tuple[int, ...] = (1, 2)
     name: str | None = None
     inner: Inner = field(default_factory=Inner)
+    side_px: int = 640
 
 
 def test_a_table_becomes_a_dataclass():
@@ -47,6 +48,7 @@ def test_a_table_becomes_a_dataclass():
         ({"steps": True}, "REC-002"),
         ({"steps": -1}, "REC-002"),
         ({"seed": -1}, "REC-002"),
+        ({"side_px": 0}, "REC-002"),
         ({"kind": "c"}, "REC-002"),
         ({"sizes": 3}, "REC-002"),
         ({"name": 3}, "REC-002"),
@@ -65,6 +67,11 @@ def test_what_does_not_fit_is_refused(table, code):
         config.from_table(Outer, table, where="recipe")
     assert caught.value.code == code
     assert len(str(caught.value)) < 500
+
+
+def test_a_file_that_an_editor_began_with_a_mark_is_read(tmp_path):
+    (tmp_path / "luna.toml").write_text("steps = 5\n", "utf-8-sig")
+    assert config.load(Outer, tmp_path / "luna.toml").steps == 5
 
 
 def test_an_unknown_key_is_answered_with_the_known_ones():

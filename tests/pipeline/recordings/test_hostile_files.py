@@ -17,6 +17,7 @@ import lzfse
 import numpy as np
 import OpenEXR
 import pytest
+import trimesh
 
 from pipeline.core.errors import InputError, coded_disk_errors
 from pipeline.data import clicks, images, ply
@@ -252,6 +253,29 @@ def test_clicks_in_frames_that_cannot_be(tmp_path, number):
     (tmp_path / "clicks.json").write_text(json.dumps({"pairs": [{"seen": spot, "reference": spot}]}))
     with pytest.raises(InputError, match="EVA-001"):
         clicks.read(tmp_path / "clicks.json")
+
+
+def test_a_small_mesh_that_asks_for_gigabytes_is_not_read(tmp_path):
+    """A sparse accessor has no bytes for most of what it counts."""
+    folder = made_formats.polycam(tmp_path / "scan", walk(8))
+    made_formats.polycam_mesh(folder, trimesh.creation.box(), np.eye(4))
+    data = (folder / "raw.glb").read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    listed = json.loads(data[20 : 20 + length])
+    spot = listed["accessors"][listed["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
+    sparse = {"count": 1, "indices": {"bufferView": 0, "componentType": 5125}, "values": {"bufferView": 1}}
+    spot |= {"count": 100_000_000, "sparse": sparse}
+    del spot["bufferView"]
+    text = json.dumps(listed).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + length :]
+    head = struct.pack("<4s2I2I", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
+    (folder / "raw.glb").write_bytes(head + text + rest)
+    recording = open_recording(folder)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match="CAP-001"):
+        recording.read_mesh()
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000, "kB"
 
 
 def test_control_characters_do_not_reach_the_terminal():

@@ -197,6 +197,7 @@ def test_what_is_amiss_with_a_stranger_is_told(house):
         (["plan", "toy"], {**RECORDED, "captures/toy/a.r3d.toml": f"offset_s = {'9' * 400}\n"}, "REC-002"),
         (["plan", "toy"], {**RECORDED, "captures/toy/a.r3d.toml": "offset_s = nan\n"}, "CAP-041"),
         (["plan", "toy"], {**RECORDED, f"captures/toy/{'a' * 249}.r3d": "x"}, "CAP-041"),
+        (["plan", "toy"], {**RECORDED, "captures/toy/b\udcff.r3d": "x"}, "CAP-041"),
         (["new", "clean", "test", "clean"], {}, "REC-004"),
         (["plan", "toy"], {"captures/toy/session.heic": "x"}, "CAP-003"),
         (["plan", "toy"], {"captures/toy/walkthrough.r3d": "x", "captures/toy/a.r3d": "x"}, "CAP-040"),
@@ -222,6 +223,34 @@ def test_a_name_that_a_terminal_would_obey_is_spelled_out(house):
     for _ in range(2):  # once planned, once remembered
         told = house.python("pipeline.workflow.plan", "plan", "toy").stdout
         assert "\x1b" not in told and len(told.splitlines()) == 2
+
+
+def test_links_that_lead_in_circles_are_not_followed(house):
+    for name, text in RECORDED.items():
+        house.write(name, text)
+    house.write("captures/toy/scan/rgb.mp4", "x")
+    house.write("captures/toy/scan/odometry.csv", "x")
+    for link, target in (("scan/a", "."), ("scan/b", "."), ("c.r3d", "c.r3d"), ("elsewhere", "/nowhere")):
+        (house.folder / "captures/toy" / link).symlink_to(target)
+    for _ in range(2):
+        told = house.python("pipeline.workflow.plan", "plan", "toy")
+        assert told.returncode == 0, told.stderr
+        assert "'c.r3d' (a link that leads nowhere)" in told.stdout
+
+
+def test_a_recording_that_is_a_link_is_watched(house):
+    for name, text in RECORDED.items():
+        house.write(name, text)
+    house.write("phone/scan/rgb.mp4", "x")
+    house.write("phone/scan/odometry.csv", "x")
+    (house.folder / "captures/toy/scan").symlink_to(house.folder / "phone/scan")
+    hashes = set()
+    for text in "xy":
+        house.write("phone/scan/rgb.mp4", text)
+        assert house.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
+        videos = json.loads((house.folder / "build/toy/plan/videos.json").read_text())
+        hashes.add(next(video["sha256"] for video in videos if video["file"] == "scan"))
+    assert len(hashes) == 2
 
 
 def test_what_a_variant_does_not_touch_is_its_agents(house):

@@ -181,6 +181,7 @@ def test_the_server_serves_its_own_page_only(room, tmp_path):
         assert (
             ask(port, "GET", "/picture/0/99.jpg")
             == ask(port, "GET", "/picture/9/0.jpg")
+            == ask(port, "GET", f"/picture/0/{'9' * 5000}.jpg")
             == ask(port, "GET", "/../x")
             == 404
         )

@@ -241,9 +241,11 @@ def test_the_program_tells_all_and_fails_where_a_build_would(tmp_path, capsys):
     (tmp_path / "exported").mkdir()
     (tmp_path / "exported/metadata.json").write_text("{")
     (tmp_path / "notes.txt").write_text("x")
+    (tmp_path / "b\udcff.r3d").write_bytes(b"PK")
     assert front.main([str(tmp_path)]) == 2
     describe_capture = capsys.readouterr().out
     for expected in (
+        "CAP-041",
         "Record3D .r3d",
         "CAP-031",
         "CAP-001",
@@ -254,6 +256,14 @@ def test_the_program_tells_all_and_fails_where_a_build_would(tmp_path, capsys):
         "turnaround",
     ):
         assert expected in describe_capture, describe_capture
+
+
+@pytest.mark.parametrize("text", ["videos = 3", "[videos]\n'walkthrough.r3d' = 3"])
+def test_a_recipe_that_is_wrong_is_refused(tmp_path, capsys, text):
+    _made().write(tmp_path / "walkthrough.r3d")
+    (tmp_path / "luna.toml").write_text(text)
+    assert front.main([str(tmp_path), "--recipe", str(tmp_path / "luna.toml")]) == 2
+    assert "REC-002" in capsys.readouterr().err
 
 
 def _layers(near_step_px: int) -> list[SampledFrame]:
