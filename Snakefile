@@ -4,7 +4,8 @@
 #   snakemake --config agents=[luna,cat] --workflow-profile profiles/slurm
 #   snakemake --config homes=homes.tsv --workflow-profile profiles/slurm  (a table with the columns agent and, if needed, variant)
 # More configuration: variant=NAME, gpu=N (GPUs of a job that uses one), processes=N (per machine, where several fit one
-# model), launcher="srun --ntasks-per-node=1" (starts them on every machine of an allocation).
+# model), launcher="srun --ntasks-per-node=1" (starts them on every machine of an allocation), container=agent-to-sim.sif
+# (the image of envs/apptainer.def that jobs run in, with --software-deployment-method apptainer).
 import shlex
 import sys
 
@@ -18,6 +19,8 @@ if config.get("launcher"):
     TOGETHER += f" --launcher {shlex.quote(config['launcher'])}"
 if workflow.is_main_process:
     engine.plan(HOMES)
+if config.get("container"):
+    container: config["container"]
 
 
 wildcard_constraints:
@@ -44,7 +47,7 @@ for node in dag.FLOW:
             attempt=lambda wildcards, attempt: attempt,
         params:
             id=engine.job_pattern(node),
-            python=sys.executable,
+            python="python" if config.get("container") else sys.executable,
             together=TOGETHER if node.distributed else "",
         shell:
             "{params.python} -SE -m pipeline.workflow.run {params.together} --attempt {resources.attempt} "

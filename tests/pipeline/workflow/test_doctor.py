@@ -1,6 +1,14 @@
 """The doctor looks at everything it says it does, and fails only for what every build needs."""
 
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
 from pipeline.workflow import doctor
+
+ROOT = Path(__file__).parents[3]
 
 
 def test_a_machine_that_runs_these_tests_is_fit(capsys, monkeypatch):
@@ -26,3 +34,42 @@ def test_a_missing_library_is_named(monkeypatch):
     finding = doctor.libraries()
     assert finding.state == "fail"
     assert "no_such_library" in finding.text
+
+
+@pytest.mark.parametrize(
+    ("kind", "gpu", "state"),
+    [("cpu", False, "ok"), ("cpu", True, "warn"), ("cuda", False, "ok"), ("cuda", True, "ok")],
+)
+def test_a_lock_that_does_not_fit_the_machine_is_named(tmp_path, monkeypatch, kind, gpu, state):
+    monkeypatch.chdir(tmp_path)
+    assert doctor.lock().state == "warn", "no environment of envs/setup"
+    (tmp_path / ".venv").mkdir()
+    (tmp_path / ".venv/lock").write_text(f"{kind}\n")
+    monkeypatch.setattr(doctor.shutil, "which", lambda name: "/usr/bin/nvidia-smi" if gpu else None)
+    assert (doctor.lock().state, f"envs/{kind}.txt" in doctor.lock().text) == (state, True)
+    assert ("LOCK=cuda" in doctor.lock().text) == (state == "warn")
+
+
+def test_a_lock_that_does_not_exist_is_refused():
+    refused = subprocess.run([ROOT / "envs/setup", "metal"], capture_output=True, text=True)
+    assert refused.returncode == 2
+    assert "ENV-002 LOCK=metal" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("cores", "memory_mb", "jobs"), [(8, 8000, 2), (8, 64000, 8), (2, 2000, 1), (4, 0, 4)]
+)
+def test_no_more_jobs_at_once_than_memory_holds(tmp_path, cores, memory_mb, jobs):
+    pages = memory_mb * 1024 // 4
+    for name, text in {
+        "nproc": f"echo {cores}",
+        "getconf": f"case $1 in PAGESIZE) echo 4096;; *) echo {pages};; esac",
+        "cat": "exit 1",
+    }.items():
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    path = f"{tmp_path}:{os.environ['PATH']}"
+    found = subprocess.run(
+        [ROOT / "envs/parallel_jobs"], env={"PATH": path}, capture_output=True, text=True, check=True
+    )
+    assert int(found.stdout) == jobs

@@ -1,5 +1,6 @@
 """What the Snakefile is told: homes, resources, and several agents in one call."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -75,3 +76,38 @@ def test_snakemake_builds_several_agents(house):
     assert made.returncode == 0, made.stderr
     assert all((house.folder / target).is_file() for target in targets)
     assert not (house.folder / "build/toy/masks").exists()
+
+
+APPTAINER = """#!/bin/sh
+[ "$1" = --version ] && { echo apptainer version 1.3.0; exit; }
+echo "$*" >>calls.txt
+while [ "$1" != sh ] && [ "$1" != bash ]; do shift; done
+PATH=image:$PATH exec "$@"
+"""
+"""What it is asked for is written down, and done here with the `python` that is the image's."""
+
+
+@pytest.mark.slow
+def test_jobs_run_in_the_container_that_is_named(house, monkeypatch):
+    for name, text in (
+        ("bin/apptainer", APPTAINER),
+        ("image/python", f'#!/bin/sh\nexec {sys.executable} "$@"\n'),
+    ):
+        house.write(name, text)
+        (house.folder / name).chmod(0o755)
+    house.write("agent-to-sim.sif", "")
+    monkeypatch.setenv("PATH", f"{house.folder}/bin:{os.environ['PATH']}")
+    command = [sys.executable, "-m", "snakemake", "--cores", "1", "--quiet", "all"]
+    command += [
+        "--software-deployment-method",
+        "apptainer",
+        "--config",
+        "agent=toy",
+        "container=agent-to-sim.sif",
+    ]
+    target = "build/toy/frames/v001/.ok"
+    made = subprocess.run([*command, "--", target], cwd=house.folder, capture_output=True, text=True)
+    assert made.returncode == 0, made.stderr
+    assert (house.folder / target).is_file()
+    calls = (house.folder / "calls.txt").read_text().splitlines()
+    assert sum("agent-to-sim.sif" in call and "pipeline.workflow.run" in call for call in calls) == 2

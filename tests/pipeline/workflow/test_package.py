@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,13 @@ def test_a_wheel_installs_and_runs_outside_the_checkout(tmp_path):
     called = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
     assert called.returncode == 0, called.stderr
     assert "working_side_px = 1280" in called.stdout
+
+
+def test_package_citation_and_changelog_name_one_version():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    headings = [line for line in (ROOT / "CHANGELOG.md").read_text().splitlines() if line.startswith("## ")]
+    assert headings[0] in (f"## {version}", "## Unreleased")
 
 
 @pytest.mark.parametrize(
