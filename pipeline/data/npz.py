@@ -110,11 +110,11 @@ class Column:
 
 
 def load(
-    path: Path, names: tuple[str, ...] | None = None, optional: tuple[str, ...] = ()
+    path: Path, names: tuple[str, ...] | None = None, optional: tuple[str, ...] = (), most: int = MAX_BYTES
 ) -> dict[str, Shaped[np.ndarray, "..."]]:
     """Read the named arrays (default: all) and those ``optional`` ones that are there.
 
-    Raises InputError ART-010 for damaged files, missing names and object arrays.
+    Raises InputError ART-010 for damaged files, missing names, object arrays and more than ``most`` bytes.
     """
     with _readable(path) as archive:
         members = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
@@ -122,6 +122,8 @@ def load(
         if missing:
             raise ValueError(f"missing {', '.join(sorted(missing))}; it holds {', '.join(members)}")
         wanted = members if names is None else [*names, *(set(optional) & set(members) - set(names))]
+        if sum(archive.getinfo(f"{name}.npy").file_size for name in wanted) > most:
+            raise ValueError(f"it unpacks to more than {most >> 20} MB")
         return {name: _read(archive, name) for name in wanted}
 
 

@@ -15,6 +15,9 @@ from stages.read_trajectories.motion import MeasuredMotion, absent_observer, con
 MOTION_KEYS = (
     "timestamp_s", "world_from_agent", "agent_from_bone", "world_from_camera", "agent_from_bone_rest",
 )  # fmt: skip
+VOLUME_KEYS = ("volume/features", "volume/occupancy", "volume/origin", "volume/voxel_m")
+MAX_BYTES = 2 << 30
+"""Of all arrays of a file: they are read at once."""
 FLOOR_QUANTILE = 0.002
 MAX_DISTANCE_M = 10_000.0
 """Further from the origin single precision resolves no more than millimetres, of which walks are made."""
@@ -38,11 +41,11 @@ def _read(path: Path, config: Config) -> MeasuredMotion:
     if path.suffix.lower() == ".csv":
         return _from_csv(path, None, config)
     try:
-        stored = npz.load(path)
+        stored = npz.load(path, most=MAX_BYTES)
     except InputError as error:
         remedy = "save it again with numpy.savez, arrays of numbers only"
         raise InputError("TRJ-001", error.what, str(path), remedy) from error
-    return _from_life(stored) if set(MOTION_KEYS) <= set(stored) else _from_joints(path, stored, config)
+    return _from_life(path, stored) if set(MOTION_KEYS) <= set(stored) else _from_joints(path, stored, config)
 
 
 def _from_csv(path: Path, map_path: Path | None, config: Config) -> MeasuredMotion:
@@ -58,10 +61,15 @@ def _from_csv(path: Path, map_path: Path | None, config: Config) -> MeasuredMoti
     return MeasuredMotion(time, agent, bones, camera, rest, volume, companions)
 
 
-def _from_life(stored: dict[str, np.ndarray]) -> MeasuredMotion:
-    features, occupancy, origin = (stored[f"volume/{name}"] for name in ("features", "occupancy", "origin"))
-    volume = FeatureVolume(features, occupancy, origin, float(stored["volume/voxel_m"]))
+def _from_life(path: Path, stored: dict[str, np.ndarray]) -> MeasuredMotion:
     motion = {name: stored[name] for name in MOTION_KEYS}
+    frames, bones = (motion[name].shape[:1] for name in ("timestamp_s", "agent_from_bone_rest"))
+    shapes = frames, (*frames, 4, 4), (*frames, *bones, 4, 4), (*frames, 4, 4), (*bones, 4, 4)
+    if not (frames and tuple(a.shape for a in motion.values()) == shapes and set(VOLUME_KEYS) <= set(stored)):
+        remedy = f"store {', '.join((*MOTION_KEYS, *VOLUME_KEYS))} as a life of `synthetic_lives` has them"
+        raise InputError("TRJ-001", "holds a life with arrays missing or of other shapes", str(path), remedy)
+    features, occupancy, origin, voxel_m = (stored[name] for name in VOLUME_KEYS)
+    volume = FeatureVolume(features, occupancy, origin, float(voxel_m))
     return MeasuredMotion(**motion, volume=volume, companions=stored.get("companions"))
 
 

@@ -1,12 +1,14 @@
 """Tables of motion: what is written is read back, joints find their tree, and nonsense is refused by name."""
 
+import zipfile
+
 import numpy as np
 import pytest
 
 from pipeline.behavior.trajectories import ABSENT_M
 from pipeline.core.errors import InputError
 from pipeline.geometry import rigid
-from stages.read_trajectories import captured, pictures
+from stages.read_trajectories import captured, pictures, reading
 from stages.read_trajectories.config import Config
 from stages.read_trajectories.motion import CLIP_GAP_S, concatenated_times
 from stages.read_trajectories.reading import read
@@ -162,6 +164,38 @@ def test_arrays_that_are_no_joints_are_refused(tmp_path, stored):
     np.savez(tmp_path / "t.npz", **stored)
     with pytest.raises(InputError, match="TRJ-001.*no joint positions"):
         read(tmp_path / "t.npz", READING)
+
+
+@pytest.mark.parametrize("wrong", ["volume/origin", "timestamp_s", "agent_from_bone"])
+def test_a_life_that_is_not_whole_is_refused(tmp_path, wrong):
+    poses, frames = np.tile(np.eye(4), (5, 1, 1)), np.arange(5) / 10
+    stored = {"timestamp_s": frames, "world_from_agent": poses, "agent_from_bone": poses[:, None]}
+    stored |= {"world_from_camera": poses, "agent_from_bone_rest": np.eye(4)[None]}
+    stored |= {"volume/features": np.zeros((1, 1, 1, 1)), "volume/occupancy": np.zeros((1, 1, 1))}
+    stored |= {"volume/origin": np.zeros(3), "volume/voxel_m": np.float64(0.1)}
+    np.savez(tmp_path / "a.npz", **stored)
+    assert len(read(tmp_path / "a.npz", READING).timestamp_s) == 5
+    del stored[wrong]
+    if "/" not in wrong:
+        stored[wrong] = np.zeros(())
+    np.savez(tmp_path / "a.npz", **stored)
+    with pytest.raises(InputError, match="TRJ-001.*missing or of other shapes"):
+        read(tmp_path / "a.npz", READING)
+
+
+def test_a_table_that_unpacks_to_gigabytes_is_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        with archive.open("a.npy", "w", force_zip64=True) as member:
+            shape = (reading.MAX_BYTES // 24 + 1, 1, 3)
+            header = {"descr": "<f8", "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(member, header)
+    data = (tmp_path / "a.npz").read_bytes()
+    at = data.rindex(b"PK\x01\x02") + 24  # the directory says how much a member unpacks to
+    (tmp_path / "a.npz").write_bytes(
+        data[:at] + (reading.MAX_BYTES + 128).to_bytes(4, "little") + data[at + 4 :]
+    )
+    with pytest.raises(InputError, match="TRJ-001.*more than 2048 MB"):
+        read(tmp_path / "a.npz", READING)
 
 
 def test_a_file_that_is_no_archive_of_arrays_is_refused(tmp_path):
