@@ -16,8 +16,7 @@ MOTION_KEYS = (
     "timestamp_s", "world_from_agent", "agent_from_bone", "world_from_camera", "agent_from_bone_rest",
 )  # fmt: skip
 VOLUME_KEYS = ("volume/features", "volume/occupancy", "volume/origin", "volume/voxel_m")
-MAX_BYTES = 2 << 30
-"""Of all arrays of a file: they are read at once."""
+MAX_BYTES = 2 << 30  # of all arrays of a file, which are read at once
 FLOOR_QUANTILE = 0.002
 MAX_DISTANCE_M = 10_000.0
 """Further from the origin single precision resolves no more than millimetres, of which walks are made."""
