@@ -123,7 +123,7 @@ def load(
             raise ValueError(f"missing {', '.join(sorted(missing))}; it holds {', '.join(members)}")
         wanted = members if names is None else [*names, *(set(optional) & set(members) - set(names))]
         if sum(archive.getinfo(f"{name}.npy").file_size for name in wanted) > most:
-            raise ValueError(f"it unpacks to more than {most >> 20} MB")
+            raise ValueError(f"it unpacks to more than {most} bytes")
         return {name: _read(archive, name) for name in wanted}
 
 

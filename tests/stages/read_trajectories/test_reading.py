@@ -194,7 +194,7 @@ def test_a_table_that_unpacks_to_gigabytes_is_refused(tmp_path):
     (tmp_path / "a.npz").write_bytes(
         data[:at] + (reading.MAX_BYTES + 128).to_bytes(4, "little") + data[at + 4 :]
     )
-    with pytest.raises(InputError, match="TRJ-001.*more than 2048 MB"):
+    with pytest.raises(InputError, match="TRJ-001.*more than 2147483648 bytes"):
         read(tmp_path / "a.npz", READING)
 
 
