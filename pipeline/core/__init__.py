@@ -1,3 +1,1 @@
-"""What every package stands on: coded errors, configuration, processes and threads, progress, the training
-loop.
-"""
+"""What every package stands on: coded errors, configuration, processes, threads, progress, training."""

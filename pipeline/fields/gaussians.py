@@ -1,5 +1,4 @@
-"""3D Gaussians of scene and agent: made from meshes, posed by bones, drawn together, kept in standard PLY
-files.
+"""3D Gaussians of scene and agent: made from meshes, posed by bones, drawn together, kept in PLY.
 
 `Gaussians` holds learnable Gaussians; `from_mesh` covers a surface with them; `Splats` puts the room and the
 posed agent before one camera; `save_ply` and `load_ply` use the 62 floats a row that every viewer of 3DGS

@@ -1,5 +1,4 @@
-"""Long-term motion through sub-goals, and any other motion, made physical; and what it is worth before and
-after.
+"""Long-term motion through sub-goals, and any other motion, made physical; its worth before and after.
 
 Both are judged by the same feet: those that should stand in the motion as it was given.
 """

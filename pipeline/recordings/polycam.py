@@ -33,8 +33,7 @@ from pipeline.recordings.recording import (
 TRUSTED_M = 5.0
 """depth beyond this is unknown, metres"""
 MAX_MESH_BYTES = 512 << 20
-GLB_JSON_LENGTH_AT, GLB_JSON_AT = 12, 20
-"""where a binary glTF's JSON chunk has its length and begins, bytes"""
+GLB_JSON_LENGTH_AT, GLB_JSON_AT = 12, 20  # where a binary glTF's JSON chunk has its length and begins
 COEFFICIENTS = ("fx", "fy", "cx", "cy")
 MATRIX = tuple(f"t_{row}{column}" for row in range(3) for column in range(4))
 
@@ -117,8 +116,7 @@ def _mesh(container: FolderContainer) -> Mesh:
     try:
         data = container.read("raw.glb", MAX_MESH_BYTES)
         listed = json.loads(data[GLB_JSON_AT:][: struct.unpack_from("<I", data, GLB_JSON_LENGTH_AT)[0]])
-        if sum(accessor["count"] for accessor in listed["accessors"]) > len(data):
-            raise ValueError("it lists more values than it has bytes")
+        assert sum(each["count"] for each in listed["accessors"]) <= len(data), "more values than bytes"
         loaded = trimesh.load(io.BytesIO(data), file_type="glb", force="mesh")
     except Exception as error:  # whatever the reader meets in a file that was cut
         raise damaged(container.place("raw.glb"), repr(error)) from error

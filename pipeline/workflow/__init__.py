@@ -1,3 +1,1 @@
-"""The batch workflow: declaration of the DAG, planner, runner, artifacts, recipes and the command line of
-stages.
-"""
+"""The batch workflow: declaration of the DAG, planner, runner, artifacts, recipes, stages' command line."""

@@ -1,7 +1,6 @@
 """What the Snakefile knows of the flow: homes, targets, and per rule its inputs and resources.
 
-The process that the user starts plans; jobs on other machines only read the small file of the job that they
-do. Standard library only.
+The process that the user starts plans; jobs elsewhere only read their small file. Standard library only.
 """
 
 import csv

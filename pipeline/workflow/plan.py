@@ -1,5 +1,4 @@
-"""The planner: recipe + recordings + declaration -> `build/<home>/plan/`, which Make, Snakemake and `run`
-read.
+"""The planner: recipe + recordings + declaration -> `build/<home>/plan/`, which engines and `run` read.
 
     python -SE -m pipeline.workflow.plan plan HOME...
     python -SE -m pipeline.workflow.plan redo HOME ARTIFACT        have one artifact made again

@@ -1,5 +1,4 @@
-"""Build again from a report's crate, and name the first artifact that differs. `make reproduce CRATE=path`
-calls both:
+"""Build again from a report's crate, and name what differs first. `make reproduce CRATE=path` calls both:
 
     python -SE -m pipeline.workflow.reproduce begin CRATE             recipe, recordings of `again_<hash>`
     python -SE -m pipeline.workflow.reproduce compare CRATE AGENT     exit 1 where something differs

@@ -1,5 +1,4 @@
-"""The runner: do one job so that its artifact is complete or absent. What Make, Snakemake and schedulers
-call.
+"""The runner, which engines call: do one job so that its artifact is complete or absent.
 
     python -SE -m pipeline.workflow.run [OPTIONS] HOME JOB      for example `toy masks.v002`
 
@@ -47,8 +46,7 @@ LOGS_KEPT = 9
 EXPLAINED = {
     75: "stopped after saving; run the same again to go on",
     76: "training diverged; its diagnosis stands above",
-    128 + signal.SIGINT: "stopped; run the same again to go on",
-    128 + signal.SIGTERM: "stopped; run the same again to go on",
+    **dict.fromkeys((128 + signal.SIGINT, 128 + signal.SIGTERM), "stopped; run the same again to go on"),
     128 + signal.SIGKILL: "killed; if nobody did it, memory was full: close programs, or build with -j1",
 }
 

@@ -93,10 +93,7 @@ def digest(stage: str, cache: Cache) -> str:
 
 
 def marks(folder: str, *, follow: bool = True) -> list[list[Any]]:
-    """Return path, size and times of every file below `folder`; where they change, one looks again.
-
-    Links to folders are followed in `folder` itself, where whole recordings may be links, not below.
-    """
+    """Return path, size and times of all files below `folder`; in it, not below, links to folders count."""
     found: list[list[Any]] = []
     if not os.path.isdir(folder):
         return found

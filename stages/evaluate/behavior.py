@@ -1,5 +1,4 @@
-"""Predictions of the next 5.6 s on the test video: our model, a location prior, standing still, constant
-velocity.
+"""Predict the next 5.6 s on the test video: ours, a location prior, standing still, constant velocity.
 
 Each method draws 16 samples a window in several trials; the best of 16 counts (minADE), and the energy score
 rewards the whole distribution. Truth is the reconstructed future of the test video, as in the paper. Every

@@ -65,10 +65,12 @@ def _from_life(path: Path, stored: dict[str, np.ndarray]) -> MeasuredMotion:
     frames, bones = (motion[name].shape[:1] for name in ("timestamp_s", "agent_from_bone_rest"))
     shapes = frames, (*frames, 4, 4), (*frames, *bones, 4, 4), (*frames, 4, 4), (*bones, 4, 4)
     if not (frames and tuple(a.shape for a in motion.values()) == shapes and set(VOLUME_KEYS) <= set(stored)):
-        remedy = f"store {', '.join((*MOTION_KEYS, *VOLUME_KEYS))} as a life of `synthetic_lives` has them"
-        raise InputError("TRJ-001", "holds a life with arrays missing or of other shapes", str(path), remedy)
-    features, occupancy, origin, voxel_m = (stored[name] for name in VOLUME_KEYS)
-    volume = FeatureVolume(features, occupancy, origin, float(voxel_m))
+        what, remedy = (
+            "has arrays of a life missing or of other shapes",
+            "see data_layout.md, synthetic_lives",
+        )
+        raise InputError("TRJ-001", what, str(path), remedy)
+    volume = FeatureVolume(*(stored[name] for name in VOLUME_KEYS[:3]), float(stored[VOLUME_KEYS[3]]))
     return MeasuredMotion(**motion, volume=volume, companions=stored.get("companions"))
 
 

@@ -1,5 +1,4 @@
-"""The animal live in a browser, computed here: for networks and machines that a page cannot hold (viser, an
-extra).
+"""The animal live in a browser, computed here (viser, an extra): for networks that a page cannot hold.
 
 The server listens on this machine alone and answers its own page only. One visitor drags the person about;
 `run` goes on until it is stopped, or is interrupted, and returns all that happened as a take.

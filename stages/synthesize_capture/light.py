@@ -1,5 +1,4 @@
-"""Light the room once per recording: daylight through the window, a lamp, and the soft light between
-surfaces.
+"""Light the room once per recording: daylight through the window, a lamp, soft light between surfaces.
 
 `Light` is one session's light; `lit_sheets` multiplies each sheet's picture by a smooth light map that is
 found by casting rays at a coarse grid of points (Lambertian surfaces, one bounce approximated by a constant).

@@ -1,5 +1,4 @@
-"""What the phone makes of light, distance and motion: timestamps, lens, picture, LiDAR depth, drifting
-odometry.
+"""What the phone makes of light and motion: timestamps, lens, picture, LiDAR depth, drifting odometry.
 
 Each function turns truth into what a Record3D phone would store; none of them knows about files.
 """

@@ -1,5 +1,4 @@
-"""Does the animal mind the observer? The same sampled noise under observers that come close, are far, or
-absent.
+"""Does the animal mind the observer? The same noise under observers that come close, are far, or absent.
 
 The observer walks up to the animal from one side, from the other side, stands beyond the radius of
 perception, and is dropped; everything else, scene, past and noise, is the same.
