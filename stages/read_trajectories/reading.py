@@ -70,7 +70,8 @@ def _from_life(path: Path, stored: dict[str, np.ndarray]) -> MeasuredMotion:
             "see data_layout.md, synthetic_lives",
         )
         raise InputError("TRJ-001", what, str(path), remedy)
-    volume = FeatureVolume(*(stored[name] for name in VOLUME_KEYS[:3]), float(stored[VOLUME_KEYS[3]]))
+    features, occupancy, origin, voxel_m = (stored[name] for name in VOLUME_KEYS)
+    volume = FeatureVolume(features, occupancy, origin, float(voxel_m))
     return MeasuredMotion(**motion, volume=volume, companions=stored.get("companions"))
 
 
