@@ -19,16 +19,15 @@ from pipeline.data.flow import STRIDE_PX
 MATCH_WINDOW_PX = 5
 """side of the window over which two candidates are compared, pixels at half the reduced size"""
 MATCH_MARGIN = 2.0
-"""brightness difference (of 255) by which the second candidate must be better: on plain walls chance is not
-enough"""
+"""brightness difference (of 255) by which the second candidate must win: on plain walls chance suffices"""
 MATCH_CLIP = 40.0
 """brightness difference (of 255) beyond which a mismatch is not worse"""
 
-PATCH_STRIDE_PX = 3
-"""distance between patches, reduced pixels: denser than DIS's own fast presets (4), for limbs a few pixels
-wide"""
-DESCENT_STEPS = 50
-"""gradient-descent iterations per patch: more than the presets' 16 to 25, for motion blur and weak texture"""
+DESCENT_STEPS, GUIDED_STEPS = 50, 25
+"""gradient-descent iterations per patch, without and with a guess (where more change nothing): more than
+the presets' 16 to 25, for motion blur and weak texture"""
+REFINEMENT_STEPS = 1
+"""variational iterations of the coarse-to-fine search: they smooth walls, and from 2 on small things too"""
 TOLERANCE_PX = 1.5
 """forward-backward error at which confidence is 1/e, reduced pixels"""
 
@@ -59,6 +58,7 @@ class Estimator:
         self._tolerance_px = TOLERANCE_PX / scale
         # A search that was given a guess remembers it in later ones: so one of its own for those.
         self._coarse, self._fine, self._guided = (_search(fine_only=fine) for fine in (False, True, True))
+        self._guided.setGradientDescentIterations(GUIDED_STEPS)
         self._pixel = _index_grid(*self.dense_size)
 
     def reduce(self, color: UInt8[np.ndarray, "height width 3"]) -> Gray:
@@ -166,7 +166,6 @@ def _search(*, fine_only: bool) -> cv2.DISOpticalFlow:
     search.setFinestScale(1)
     if fine_only:
         search.setCoarsestScale(1)
-    search.setPatchStride(PATCH_STRIDE_PX)
     search.setGradientDescentIterations(DESCENT_STEPS)
-    search.setVariationalRefinementIterations(0)
+    search.setVariationalRefinementIterations(0 if fine_only else REFINEMENT_STEPS)
     return search

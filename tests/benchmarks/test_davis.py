@@ -50,10 +50,25 @@ def test_joints_follow_true_flow_and_not_none(sequence):
     (footage,) = davis.animals(sequence).values()
     true = np.zeros((*SIZE, 2), np.float32)
     true[..., 0] = SHIFT_PX
-    found = flow.hits(lambda frame: true, footage)
-    assert len(found) == 3 and found.all()
-    none = flow.hits(lambda frame: 0 * true, footage)
-    assert none.tolist() == [False, True, True], "6 px are more than 0.2 of 20 px, 3 px are not"
+    np.testing.assert_allclose(flow.errors(flow.chained(lambda first, last: true), footage), 0, atol=1e-6)
+    none = flow.errors(lambda points, first, last: points, footage)
+    np.testing.assert_allclose(none * 20, [6, 3, 3], rtol=1e-5)
+
+
+def test_points_take_the_most_certain_path():
+    """Steps of one frame are wrong at the second point; one of four frames is right there and unsure elsewhere."""
+
+    def step(first, last):
+        found, confidence = np.zeros((*SIZE, 2), np.float32), np.full(SIZE, 0.9, np.float32)
+        found[..., 0] = SHIFT_PX * (last - first)
+        wrong = slice(50, None) if last - first < 4 else slice(None, 50)
+        found[:, wrong], confidence[:, wrong] = 0, 0.1
+        return found, confidence
+
+    points = np.array([[10.0, 20], [70, 20]])
+    there = flow.most_certain(step)(points, 0, 4)
+    np.testing.assert_allclose(there, points + np.array([4 * SHIFT_PX, 0]))
+    assert np.array_equal(flow.chained(lambda first, last: step(first, last)[0])(points, 0, 4)[1], points[1])
 
 
 def test_every_frame_is_a_picture_without_depth(sequence, tmp_path):
