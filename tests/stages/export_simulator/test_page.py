@@ -344,6 +344,11 @@ def test_keys_stay_alive_while_the_panel_is_used(simulator: Path, chromium: Brow
         page.keyboard.up("s")
         page.keyboard.up("Alt")
         _check_nobody_walks(page)
+        for key in "?h":
+            page.wait_for_function("document.getElementById('help').classList.contains('gone')")
+            page.keyboard.press(key)
+            assert "gone" not in str(page.get_attribute("#help", "class"))
+            page.keyboard.press(key)
         assert wrong == []
 
 
@@ -391,21 +396,11 @@ def test_the_first_look_shows_the_animal(simulator: Path, chromium: Browser, tmp
     with browser.shown(chromium, (simulator / "index.html").as_uri()) as (page, _):
         page.evaluate("ats.pause(); ats.reset()")
         eye, animal = (np.array(page.evaluate(f"ats.state().{what}")[:3]) for what in ("eye", "animal"))
-    small_world.write(tmp_path)
+        assert not page.evaluate("ats.state().outlined")
     place = animal + 0.4 * (eye - animal) / np.linalg.norm((eye - animal)[[0, 2]])
     box = trimesh.creation.box((0.3, 0.3, 0.3), rigid.make(np.eye(3), place))
     cast = RayCaster(Mesh(np.asarray(box.vertices, np.float32), np.asarray(box.faces))).cast
-    scene = ply.read_ply(tmp_path / "reconstruction/scene.ply")
-    vertices, faces = (
-        np.concatenate([scene.vertices, box.vertices]),
-        np.concatenate([scene.faces, box.faces + len(scene.vertices)]),
-    )
-    color = np.concatenate([scene.color, np.full((8, 3), 99)]).astype(np.uint8)
-    ply.write_ply(
-        tmp_path / "reconstruction/scene.ply",
-        Mesh(vertices.astype(np.float32), faces.astype(np.int32), color),
-    )
-    out = small_world.exported(tmp_path, tmp_path / "build/simulator")
+    out = _exported_with(box, tmp_path)
     with browser.shown(chromium, (out / "index.html").as_uri()) as (page, wrong):
         shown_from = np.array(page.evaluate("ats.state().eye"))
         assert (
@@ -414,6 +409,35 @@ def test_the_first_look_shows_the_animal(simulator: Path, chromium: Browser, tmp
             < cast(shown_from, (animal - shown_from)[None]).distance[0]
         )
         assert wrong == []
+
+
+def test_a_hidden_animal_is_outlined(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
+    """A lid over it hides it from wherever one looks down."""
+    with browser.shown(chromium, (simulator / "index.html").as_uri()) as (page, _):
+        page.evaluate("ats.pause(); ats.reset()")
+        x, y, z = page.evaluate("ats.state().animal")[:3]
+    lid = trimesh.creation.box((1.2, 0.02, 1.2), rigid.make(np.eye(3), np.array([x, y + 0.35, z])))
+    out = _exported_with(lid, tmp_path)
+    with browser.shown(chromium, (out / "index.html").as_uri()) as (page, wrong):
+        page.evaluate("ats.pause(); ats.reset()")
+        page.wait_for_function("ats.state().outlined", timeout=10_000)
+        assert page.evaluate("ats.state().settings.outline") == 0
+        assert wrong == []
+
+
+def _exported_with(thing: trimesh.Trimesh, folder: Path) -> Path:
+    """Export the small world with one more thing in its mesh."""
+    small_world.write(folder)
+    scene = ply.read_ply(folder / "reconstruction/scene.ply")
+    vertices, faces = (
+        np.concatenate([scene.vertices, thing.vertices]),
+        np.concatenate([scene.faces, thing.faces + len(scene.vertices)]),
+    )
+    color = np.concatenate([scene.color, np.full((len(thing.vertices), 3), 99)]).astype(np.uint8)
+    ply.write_ply(
+        folder / "reconstruction/scene.ply", Mesh(vertices.astype(np.float32), faces.astype(np.int32), color)
+    )
+    return small_world.exported(folder, folder / "build/simulator")
 
 
 def test_hash_keeps_a_setting_on_a_phone(simulator: Path, chromium: Browser) -> None:

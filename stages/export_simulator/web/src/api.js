@@ -25,6 +25,7 @@ export function api(simulator) {
         observer: [...observer.place],
         eye: room.camera.getWorldPosition(room.camera.position.clone()).toArray(),
         headset: simulator.headset.presenting,
+        outlined: selected().outline.visible,
         plans: turnNumber,
         milliseconds: simulator.milliseconds,
         aim: stops.next,

@@ -72,7 +72,7 @@ export class Controls {
       this.on.play();
       event.preventDefault();
     } else if (key === 'r') this.on.reset();
-    else if (key === 'h') this.on.how();
+    else if (key === 'h' || key === '?') this.on.how();
     else if (key === 'c') this.on.call();
     else if (key === 'l') this.on.tell();
     else if (key === 'n') this.on.next();

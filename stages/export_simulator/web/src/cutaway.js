@@ -8,7 +8,7 @@ const RADIUS_M = 0.34; // shows an animal of half a metre whole
 const SHORT_OF_M = 0.3; // the cut ends this far before the animal, so that what carries it stays
 const ABOVE_FLOOR_M = 0.06; // lower things stay: they hide nothing
 const FLAT_EDGE_M = 0.08; // splats fade out over this
-const LOOK_EVERY_MS = 300; // between tests of whether anything hides the animal, where a processor draws
+const LOOK_EVERY_MS = 300; // between tests of whether anything hides the animal
 // the cut moves in such steps there, so that the still is drawn again a few times a second at most
 const STEP_M = 0.12;
 
@@ -22,6 +22,7 @@ export class Cutaway {
       cutFloor: { value: floor + ABOVE_FLOOR_M },
     };
     this.looked = -Infinity;
+    this.hidden = false; // whether the room's mesh, uncut, hides the animal
   }
 
   // Make a material of the room's mesh leave the capsule out.
@@ -64,19 +65,18 @@ export class Cutaway {
     splats.add(edit, this.capsule);
   }
 
-  // Follow eye and animal. hidden: () => whether the mesh hides the animal; asked where cutting costs a
-  // redrawn still.
-  follow(eye, animal, hidden) {
+  // Follow eye and animal. hides: () => whether the mesh hides the animal; still: whether cutting costs a
+  // redrawn still, and is done only where the animal is hidden.
+  follow(eye, animal, hides, still) {
     const { cutFrom, cutTo, cutRadius } = this.uniforms;
-    if (hidden) {
-      if (performance.now() - this.looked > LOOK_EVERY_MS) {
-        this.looked = performance.now();
-        cutRadius.value = hidden() ? RADIUS_M : 0;
-      }
-    } else cutRadius.value = RADIUS_M;
+    if (performance.now() - this.looked > LOOK_EVERY_MS) {
+      this.looked = performance.now();
+      this.hidden = hides();
+    }
+    cutRadius.value = this.hidden || !still ? RADIUS_M : 0;
     const far = eye.distanceTo(animal);
     const to = animal.clone().lerp(eye, Math.min(1, SHORT_OF_M / Math.max(far, 1e-6)));
-    if (hidden && to.distanceTo(cutTo.value) < STEP_M && eye.distanceTo(cutFrom.value) < 1e-3) return;
+    if (still && to.distanceTo(cutTo.value) < STEP_M && eye.distanceTo(cutFrom.value) < 1e-3) return;
     cutFrom.value.copy(eye);
     cutTo.value.copy(to);
     if (!this.capsule) return;

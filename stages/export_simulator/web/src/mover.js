@@ -179,9 +179,7 @@ export class Mover {
   // Put everything back to where it was recorded.
   restore() {
     if (this.held) this.cancel();
-    const refused = [...this.by.keys()]
-      .map((piece) => this.refusal({ piece, by: [0, 0] }, []))
-      .find(Boolean);
+    const refused = [...this.by.keys()].map((piece) => this.refusal({ piece, by: [0, 0] }, [])).find(Boolean);
     if (refused) return this.say(`Not everything can be put back now. ${refused}`);
     this.by.clear();
     this.past = [];

@@ -342,7 +342,8 @@ export class Resident {
     this.place = root.slice(0, 3);
     this.animal.shown = this.present;
     if (this.present) this.animal.pose(frame, this.groundAt(root));
-    this.outline.visible = this.present && this.selected && Boolean(state.outline);
+    const hidden = this.home.room.cutaway.hidden && state.view !== 'you';
+    this.outline.visible = this.present && this.selected && (Boolean(state.outline) || hidden);
     if (this.outline.visible) this.outline.pose(frame, this.contract.scene.floor_m);
     this.overlays.group.visible = this.selected && this.present;
     this.overlays.follow(root);

@@ -364,7 +364,8 @@ export class Room {
     this.cutaway.follow(
       this.camera.position,
       point,
-      this.backdrop && (() => !this.sees(this.camera.position, point)),
+      () => !this.sees(this.camera.position, point),
+      Boolean(this.backdrop),
     );
   }
 
