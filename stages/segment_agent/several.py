@@ -5,13 +5,13 @@ animal goes the way of a single one (`masks`): its track, its appearance in this
 of the others are unknown in the mask of the one that is followed: neither it nor the room.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from pipeline.core.errors import InputError
 from pipeline.core.progress import log
@@ -40,8 +40,8 @@ PORTRAITS_SHARE = 0.25
 """portraits that a recording's appearance is learned from too, as a share of its own examples: more would
 outweigh what its room looks like"""
 STRANGER_SHARE = 0.5
-"""share of the frames in which something moves about that is none of the animals, from which on an animal
-without a turnaround lives here; less may be people"""
+"""share of the frames in which anything is tracked that show a stranger, from which on an animal without a
+turnaround lives here; less may be one that visits"""
 
 
 @dataclass
@@ -90,14 +90,16 @@ def segment(
     path = steady(clip, flow, np.random.default_rng(config.seed))
     poses, margins = path.world_from_camera, Margins(clip, network, config.height_px)
     references, walkers = people.set_apart(clip, poses, config.references)
-    strangers = _strangers(clip, poses, references, config, margins)
+    nobody = margins.of(len(network.names))
+    strange = tracked(find_mover(clip, poses, references, config.animal, None, apart=nobody))
     painters = find_all(clip, poses, references, config, margins, portraits)
-    for name, painter in zip(network.names, painters, strict=True):
-        seen = sum(ball is not None and not ball.presumed for ball in painter.balls)
-        log(f"{name}: tracked in {seen} of {len(clip)} frames" if seen else f"{name} is not here")
+    known = [tracked(painter.balls) for painter in painters]
+    for name, seen in zip(network.names, known, strict=True):
+        log(f"{name}: tracked in {seen.sum()} of {len(clip)} frames" if seen.any() else f"{name} is not here")
+    _refuse_strangers(clip, strange, np.any([strange, *known], axis=0))
     own = network.names.index(followed)
     found = (joined(painters, margins, own, frame) for frame in range(len(clip)))
-    return Segmentation(people.hide(found, walkers, clip, poses), path, walkers, strangers)
+    return Segmentation(people.hide(found, walkers, clip, poses), path, walkers, float(strange.mean()))
 
 
 def find_all(
@@ -184,7 +186,7 @@ def joined(painters: list[Painter], margins: Margins, own: int, frame: int) -> M
 
 def _is_here(painter: Painter, apart: AppearanceOf) -> bool:
     """Return whether what was tracked is this animal, by most of its pixels."""
-    seen = [frame for frame, ball in enumerate(painter.balls) if ball is not None and not ball.presumed]
+    seen = np.flatnonzero(tracked(painter.balls)).tolist()
     if len(seen) < LEAST_FRAMES:
         return False
     shares = []
@@ -208,15 +210,16 @@ def _any_hidden(
     return np.any([np.zeros(size, bool), *found], axis=0)
 
 
-def _strangers(
-    clip: Clip, poses: np.ndarray, references: References, config: Config, margins: Margins
-) -> float:
-    """Return the share of frames in which something moves about that looks like none of the animals."""
-    nobody: Callable[[int], np.ndarray] = margins.of(len(margins.network.names))
-    balls = find_mover(clip, poses, references, config.animal, None, apart=nobody)
-    share = float(np.mean([ball is not None and not ball.presumed for ball in balls]))
-    if share > STRANGER_SHARE:
-        what = f"in {100 * share:.0f} % of the frames something moves that none of the turnarounds shows"
+def tracked(balls: Sequence[Sphere | None]) -> Bool[np.ndarray, "frame"]:
+    """Return in which frames something is seen to move about."""
+    return np.array([ball is not None and not ball.presumed for ball in balls])
+
+
+def _refuse_strangers(
+    clip: Clip, strange: Bool[np.ndarray, "frame"], anybody: Bool[np.ndarray, "frame"]
+) -> None:
+    share = strange.sum() / max(anybody.sum(), 1)
+    if strange.sum() >= LEAST_FRAMES and share > STRANGER_SHARE:
+        what = f"in {100 * share:.0f} % of the frames that show an animal it is none of the turnarounds'"
         remedy = "film a turnaround of each animal that lives here (turnaround_<name>), or leave this out"
         raise InputError("MSK-007", what, str(clip.folder), remedy)
-    return share

@@ -167,6 +167,16 @@ def test_one_that_is_not_here_has_no_mask(network, portraits, tmp_path):
     assert not any((mask.labels == 255).any() for mask in found.masks)
 
 
+@pytest.mark.slow
+def test_a_third_animal_without_a_turnaround_is_reported(network, portraits, tmp_path, monkeypatch):
+    monkeypatch.setattr(scenery, "ANIMAL_COLOR", np.array([60, 70, 190]))
+    poses, agent = scenery.session()
+    scenery.record(tmp_path / "frames", poses, agent, scenery.drifted(poses))
+    clip = Clip.open(tmp_path / "frames")
+    with pytest.raises(InputError, match="MSK-007.*turnaround of each animal"):
+        several.segment(clip, Path("none"), "green", network, portraits, OPTIONS)
+
+
 def test_a_hint_that_names_no_animal_is_refused(network, together, tmp_path):
     network.save(tmp_path)
     hint = tmp_path / "hint.toml"
