@@ -1,4 +1,4 @@
-"""Where a person can walk: columns of the scene without anything solid between shin and head."""
+"""Where a person can walk: columns that were seen between shin and head, with nothing solid there."""
 
 from dataclasses import dataclass
 
@@ -27,14 +27,18 @@ class PersonFloor:
 
     @classmethod
     def of(cls, volume: FeatureVolume, roots_world: Float[np.ndarray, "frame 3"]) -> "PersonFloor":
-        """Find the floor, the level below the animal with the most solid voxels, and what stands on it."""
+        """Find the floor, the level below the animal with the most solid voxels, and what stands on it; what
+        nobody saw, as all that is outside, is no floor.
+        """
         solid = volume.occupancy == 1
         height = volume.origin[1] + (np.arange(solid.shape[1]) + 1) * volume.voxel_m
         below = height <= np.percentile(roots_world[:, 1], 5)
         count = np.where(below, solid.sum((0, 2)), 0)
         floor_m = float(height[count.argmax()]) if count.any() else float(roots_world[:, 1].min())
         above = (height > floor_m + SHIN_M) & (height <= floor_m + HEAD_M)
-        return cls(solid[:, above].any(1), volume.origin[[0, 2]], volume.voxel_m, floor_m)
+        seen = volume.occupancy[:, above]
+        blocked = (seen == 1).any(1) | ((seen != 0).all(1) & above.any())
+        return cls(blocked, volume.origin[[0, 2]], volume.voxel_m, floor_m)
 
     def blocks(self, points: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
         """Return which world points (x, z; metres) are blocked or outside; none without a scene."""

@@ -233,7 +233,8 @@ class AnimalWorld:
         for axes in ([1.0, 1.0], [1.0, 0.0], [0.0, 1.0]):
             stuck = (persons.position == begin).all(-1)
             target = begin + step * axes
-            free = stuck & ~self._blocked(target)
+            # a wall of one voxel is thinner than a step
+            free = stuck & ~self._blocked(target) & ~self._blocked((begin + target) / 2)
             persons.position[free] = target[free]
         persons.velocity = (persons.position - begin) * RATE_HZ
 

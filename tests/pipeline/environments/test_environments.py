@@ -10,11 +10,12 @@ import pytest
 
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import BehaviorNets
+from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.planning import Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
 from pipeline.core.errors import InputError
 from pipeline.environments.config import EnvironmentConfig
-from pipeline.environments.floor import to_local, to_world
+from pipeline.environments.floor import PersonFloor, to_local, to_world
 from pipeline.environments.homes import Habitat
 from pipeline.environments.rewards import REWARDS, StepOutcome
 from pipeline.environments.world import AnimalWorld
@@ -154,6 +155,25 @@ def test_persons_keep_out_of_walls_and_walk_as_told():
         world.step(np.array([[1.0, 0.0, 0.0], [1.0, 0.3, 0.0]]))
     assert (np.abs(world.persons.position) < 2.0).all(), "the walls begin at 2 m"
     assert np.abs(world.persons.position).max(1).min() > 1.7
+
+
+def test_what_nobody_saw_is_no_floor_for_persons():
+    """Around the room's thin walls is the rest of the box that holds it."""
+    occupancy = np.full((44, 20, 44), 2, np.uint8)
+    occupancy[10:34, :, 10:34] = 1
+    occupancy[11:33, 2:, 11:33] = 0
+    volume = FeatureVolume(
+        np.zeros((1, *occupancy.shape), np.float16), occupancy, np.array([-2.2, -0.2, -2.2]), 0.1
+    )
+    floor = PersonFloor.of(volume, np.array([[0.0, 0.2, 0.0]]))
+    assert not floor.blocked[11:33, 11:33].any() and floor.blocked.sum() == 44**2 - 22**2
+    world = small_world()
+    world.floors[0] = floor
+    world.begin(40, np.random.default_rng(0))
+    assert (np.abs(world.persons.position) < 1.1).all(), "metres: inside"
+    for _ in range(30):
+        world.step(np.tile([1.0, 0.0, 0.1], (40, 1)))
+        assert (np.abs(world.persons.position) < 1.1).all()
 
 
 def test_frames_of_persons():
