@@ -27,9 +27,7 @@ class PersonFloor:
 
     @classmethod
     def of(cls, volume: FeatureVolume, roots_world: Float[np.ndarray, "frame 3"]) -> "PersonFloor":
-        """Find the floor, the level below the animal with the most solid voxels, and what stands on it; what
-        nobody saw, as all that is outside, is no floor.
-        """
+        """Find the floor, the level below the animal with the most solid voxels; what nobody saw is none."""
         solid = volume.occupancy == 1
         height = volume.origin[1] + (np.arange(solid.shape[1]) + 1) * volume.voxel_m
         below = height <= np.percentile(roots_world[:, 1], 5)

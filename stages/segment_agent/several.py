@@ -91,15 +91,15 @@ def segment(
     poses, margins = path.world_from_camera, Margins(clip, network, config.height_px)
     references, walkers = people.set_apart(clip, poses, config.references)
     nobody = margins.of(len(network.names))
-    strange = tracked(find_mover(clip, poses, references, config.animal, None, apart=nobody))
+    strangers = tracked(find_mover(clip, poses, references, config.animal, None, apart=nobody))
     painters = find_all(clip, poses, references, config, margins, portraits)
     known = [tracked(painter.balls) for painter in painters]
     for name, seen in zip(network.names, known, strict=True):
         log(f"{name}: tracked in {seen.sum()} of {len(clip)} frames" if seen.any() else f"{name} is not here")
-    _refuse_strangers(clip, strange, np.any([strange, *known], axis=0))
+    _refuse_strangers(clip, strangers.sum() / max(np.any([strangers, *known], axis=0).sum(), LEAST_FRAMES))
     own = network.names.index(followed)
     found = (joined(painters, margins, own, frame) for frame in range(len(clip)))
-    return Segmentation(people.hide(found, walkers, clip, poses), path, walkers, float(strange.mean()))
+    return Segmentation(people.hide(found, walkers, clip, poses), path, walkers, float(strangers.mean()))
 
 
 def find_all(
@@ -215,11 +215,8 @@ def tracked(balls: Sequence[Sphere | None]) -> Bool[np.ndarray, "frame"]:
     return np.array([ball is not None and not ball.presumed for ball in balls])
 
 
-def _refuse_strangers(
-    clip: Clip, strange: Bool[np.ndarray, "frame"], anybody: Bool[np.ndarray, "frame"]
-) -> None:
-    share = strange.sum() / max(anybody.sum(), 1)
-    if strange.sum() >= LEAST_FRAMES and share > STRANGER_SHARE:
+def _refuse_strangers(clip: Clip, share: float) -> None:
+    if share > STRANGER_SHARE:
         what = f"in {100 * share:.0f} % of the frames that show an animal it is none of the turnarounds'"
         remedy = "film a turnaround of each animal that lives here (turnaround_<name>), or leave this out"
         raise InputError("MSK-007", what, str(clip.folder), remedy)
