@@ -11,6 +11,7 @@ import ast
 import dataclasses
 import importlib
 import io
+import math
 import re
 import tokenize
 from collections import Counter
@@ -27,14 +28,13 @@ PRIVATE_WORDS = frozenset(
 """Words that this project once used for terms that the field has other names for; see docs/glossary.md."""
 KEYS_OF_FILES = ("pace_m",)
 """Names that artifacts and models hold; `longterm.json` has this one."""
-PLAIN_NUMBERS = frozenset(
-    (10, 60, 90, 100, 180, 255, 360, 1000, 0.5, 0.25, 0.1, 0.01, 1e-3, 2.5, 97.5, 95, 99)
-)
-"""Numbers that explain themselves; so do 1.0, integers below 10, powers of two, the largest values of integer
-types (127, 65535), the bounds of a 95 % interval, percentiles of the tail, and what only keeps a quotient
-finite."""
-NAMED_BY_CALL = ("Check", "qa.Check")
-"""Calls whose numbers have their name and unit beside them: the thresholds of a quality check."""
+PLAIN_NUMBERS = frozenset((60, 90, 180, 255, 127.5, 360, 0.5, 0.25, 2.5, 97.5, 95, 99, 99.5))
+"""Numbers that explain themselves; so do integers below 10, powers of two and of ten, the largest values of
+integer types (127, 65535), the bounds of a 95 % interval, percentiles of the tail, and what only keeps a
+quotient finite."""
+NAMED_BY_CALL = ("Check", "qa.Check", "np.quantile", "np.percentile")
+"""Calls whose numbers have their name beside them: the thresholds of a quality check, the order of a
+quantile."""
 DRAWN = ("stages/synthesize_capture",)
 """Where numbers are the measures of a drawn world."""
 FIGURES = ("pictures.py", "plots.py")
@@ -149,20 +149,33 @@ def repeated_classes() -> list[str]:
     ]
 
 
+def is_exponent(node: ast.AST, parent: ast.AST) -> bool:
+    """Return whether a number is one of bits (`1 << 20`) or the exponent of another number (`2**30`)."""
+    if not isinstance(parent, ast.BinOp) or node is not parent.right:
+        return False
+    of_number = isinstance(parent.op, ast.Pow) and isinstance(parent.left, ast.Constant)
+    return of_number or isinstance(parent.op, ast.LShift | ast.RShift)
+
+
 def numbers_in(tree: ast.AST) -> list[ast.Constant]:
     """Return the numeric literals in a tree's functions that neither explain themselves nor have a name."""
 
     def plain(value: float) -> bool:
-        whole = isinstance(value, int) and (value < 10 or value.bit_count() == 1)
+        small = isinstance(value, int) and value < 10
         largest = isinstance(value, int) and value >= 127 and (value + 1).bit_count() == 1
-        return whole or largest or value == 1 or value in PLAIN_NUMBERS or abs(value) <= 1e-5
+        power = (value > 0 and math.log10(value).is_integer()) or (
+            value >= 1 and math.log2(value).is_integer()
+        )
+        return small or largest or power or value in PLAIN_NUMBERS or abs(value) <= 1e-5
 
     def walk(node: ast.AST) -> Iterator[ast.AST]:
         yield node
         for child in ast.iter_child_nodes(node):
             own = isinstance(node, ast.Call) and ast.unparse(node.func) in NAMED_BY_CALL
-            threshold = child.value if isinstance(child, ast.keyword) else child
-            if not (own and isinstance(threshold, ast.Constant)):
+            number = child.value if isinstance(child, ast.keyword) else child
+            listed = isinstance(number, ast.List) and all(isinstance(e, ast.Constant) for e in number.elts)
+            named = own and (listed or isinstance(number, ast.Constant))
+            if not named and not is_exponent(child, node):
                 yield from walk(child)
 
     return [

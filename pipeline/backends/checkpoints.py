@@ -19,6 +19,8 @@ from pipeline.core.errors import InputError
 
 CONFIG = "config.json"
 PREPARATION = "preprocessor_config.json"
+LONGEST_REASON = 200
+"""letters of a library's message that are passed on: some list every weight"""
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """ImageNet's, where a checkpoint has none"""
 
@@ -48,7 +50,7 @@ def model(kind: str, path: Path, device: str) -> Any:
     try:
         loaded = getattr(library(), kind).from_pretrained(path, local_files_only=True)
     except (OSError, ValueError, RuntimeError, KeyError) as error:
-        what = f"no usable {kind} ({str(error)[:200]})"
+        what = f"no usable {kind} ({str(error)[:LONGEST_REASON]})"
         raise InputError("MOD-003", what, str(path), "download the checkpoint again") from error
     return loaded.to(device).eval()
 

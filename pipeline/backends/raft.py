@@ -14,9 +14,12 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
+from pipeline.backends.checkpoints import LONGEST_REASON
 from pipeline.core.errors import InputError
 
 HIDDEN = 128
+ENCODER_CHANNELS, MOTION_CHANNELS = (64, 96, 128), (192, 64)
+"""of the published network: its three layers; what is made of the correlation and of the flow"""
 LEVELS, RADIUS = 4, 4
 CELL_PX = 8
 """pixels per cell in which flow is searched"""
@@ -64,7 +67,7 @@ def load(path: Path, device: str = "cpu") -> Raft:
         # `norm3` is the second name of what `downsample.1` holds.
         network.load_state_dict({name: value for name, value in stored.items() if ".norm3." not in name})
     except (RuntimeError, AttributeError, EOFError, ValueError) as error:
-        what = f"these are not weights of the basic RAFT ({str(error)[:200]})"
+        what = f"these are not weights of the basic RAFT ({str(error)[:LONGEST_REASON]})"
         raise InputError("MOD-003", what, str(path), REMEDY) from error
     except Exception as error:
         if type(error).__name__ == "UnpicklingError":
@@ -163,11 +166,12 @@ class _Encoder(nn.Module):
 
     def __init__(self, channels: int, norm: type[nn.Module]) -> None:
         super().__init__()
-        self.conv1, self.norm1 = nn.Conv2d(3, 64, 7, 2, 3), norm(64)
-        self.layer1 = nn.Sequential(_Residual(64, 64, norm, 1), _Residual(64, 64, norm, 1))
-        self.layer2 = nn.Sequential(_Residual(64, 96, norm, 2), _Residual(96, 96, norm, 1))
-        self.layer3 = nn.Sequential(_Residual(96, 128, norm, 2), _Residual(128, 128, norm, 1))
-        self.conv2 = nn.Conv2d(128, channels, 1)
+        first, second, third = ENCODER_CHANNELS
+        self.conv1, self.norm1 = nn.Conv2d(3, first, 7, 2, 3), norm(first)
+        self.layer1 = nn.Sequential(_Residual(first, first, norm, 1), _Residual(first, first, norm, 1))
+        self.layer2 = nn.Sequential(_Residual(first, second, norm, 2), _Residual(second, second, norm, 1))
+        self.layer3 = nn.Sequential(_Residual(second, third, norm, 2), _Residual(third, third, norm, 1))
+        self.conv2 = nn.Conv2d(third, channels, 1)
 
     def forward(self, picture: Tensor) -> Tensor:
         x = torch.relu(self.norm1(self.conv1(picture)))
@@ -194,9 +198,10 @@ class _Motion(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         seen = LEVELS * (2 * RADIUS + 1) ** 2
-        self.convc1, self.convc2 = nn.Conv2d(seen, 256, 1), nn.Conv2d(256, 192, 3, 1, 1)
-        self.convf1, self.convf2 = nn.Conv2d(2, 128, 7, 1, 3), nn.Conv2d(128, 64, 3, 1, 1)
-        self.conv = nn.Conv2d(64 + 192, HIDDEN - 2, 3, 1, 1)
+        around, flow = MOTION_CHANNELS
+        self.convc1, self.convc2 = nn.Conv2d(seen, 256, 1), nn.Conv2d(256, around, 3, 1, 1)
+        self.convf1, self.convf2 = nn.Conv2d(2, 128, 7, 1, 3), nn.Conv2d(128, flow, 3, 1, 1)
+        self.conv = nn.Conv2d(flow + around, HIDDEN - 2, 3, 1, 1)
 
     def forward(self, flow: Tensor, seen: Tensor) -> Tensor:
         seen = torch.relu(self.convc2(torch.relu(self.convc1(seen))))

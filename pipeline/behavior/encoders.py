@@ -15,6 +15,8 @@ NOBODY_M = 100.0
 CLOSE_RANGE_M, EDGE_SHARPNESS = 1.5, 4.0
 """distance around which another's is encoded, metres, and the inverse width, in radii, of the soft edge
 at the radius"""
+APPROACH_SCALE = 1.5
+"""of approach speeds, at most 2 m/s, among the features: they then have the range of distances, +-3"""
 HEADS = 4
 """attention weights of a being, each for its part of the code"""
 LEAST_WEIGHT = 1e-6
@@ -99,7 +101,7 @@ class OthersEncoder(SetEncoder):
         inside = (nearness * EDGE_SHARPNESS).clamp_max(1)
         close = (CLOSE_RANGE_M - distance).clamp_min(-CLOSE_RANGE_M) * (2 * inside)
         coming = -(position.diff(dim=-2) * self.rate_hz * direction[..., 1:, :]).sum(-1).clamp(-2, 2) * (
-            1.5 * inside[..., 1:]
+            APPROACH_SCALE * inside[..., 1:]
         )
         features = torch.cat([seen, moving.clamp(-2, 2), close, coming], dim=-1)
         return self.code_of_set(features, others[..., -1, -1:], inside[..., -1:], keep)

@@ -157,6 +157,8 @@ class MapAttention(nn.Module):
     NUMBERS = HEADS * (MAP_KEY_CHANNELS + 2) + LOCAL * 2
     FAR = 8.0
     """bound of the noisy goal, in scaled units"""
+    FIRST_LOG_VARIANCE = (0.0, -3.0)
+    """logarithms of the first share of the noise's variance in a head's, and of what is added to it"""
     place: Tensor
     power: Tensor
     goal_std: Tensor
@@ -174,7 +176,7 @@ class MapAttention(nn.Module):
             ensemble_size, code_channels, self.HEADS * (MAP_KEY_CHANNELS + self.PLACE)
         )
         self.log_variance = nn.Parameter(
-            torch.tensor([0.0, -3.0]).expand(ensemble_size, 1, self.LOCAL, 2).clone()
+            torch.tensor(self.FIRST_LOG_VARIANCE).expand(ensemble_size, 1, self.LOCAL, 2).clone()
         )
 
     def forward(

@@ -24,6 +24,10 @@ SRGB_SLOPE, SRGB_OFFSET, SRGB_GAMMA, SRGB_KNEE = 12.92, 0.055, 2.4, 0.0031308
 MAX_DEPTH_M = 1000.0
 """depth beyond this is no measurement, metres"""
 MAX_EXR_HEADER_BYTES = 1 << 16
+PNG_CHUNK_BYTES = 12
+"""Length, kind and checksum around what a chunk holds."""
+STARTS_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""JPEG markers, of any coding, that the size of the picture follows."""
 EXPORT_AGAIN = "export the recording again"
 _EXR_DEEP, _EXR_MULTIPART, _EXR_CHANNEL_BYTES, _EXR_ZIP_ROWS = 0x800, 0x1000, 16, 16
 """flags of OpenEXR's version field, bytes after a channel's name, rows of a ZIP block"""
@@ -133,7 +137,7 @@ def _declared_pixels(data: bytes) -> int:
         at, kind = 8, b""
         while kind != b"IEND":  # OpenCV allocates what a chunk declares before it looks for its bytes
             length, kind = struct.unpack_from(">I4s", data, at)
-            at += 12 + length
+            at += PNG_CHUNK_BYTES + length
             if zlib.crc32(data[at - length - 8 : at - 4]) != struct.unpack_from(">I", data, at - 4)[0]:
                 return MAX_PIXELS + 1
         width, height = struct.unpack_from(">2I", data, 16)
@@ -141,7 +145,7 @@ def _declared_pixels(data: bytes) -> int:
     at = 2
     while data[:2] == b"\xff\xd8" and data[at : at + 1] == b"\xff":
         marker, length = struct.unpack_from(">BH", data, at + 1)
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame, of any coding
+        if marker in STARTS_OF_FRAME:
             height, width = struct.unpack_from(">2H", data, at + 5)
             return height * width
         at += 2 + length

@@ -8,6 +8,8 @@ from pipeline.environments.world import AnimalWorld
 
 SIDE_PX, SIDE_M = 400, 8.0
 """Side of a picture in pixels, and of what it shows in metres."""
+NOSE_M = 0.3
+"""Length of the line that points ahead of the animal."""
 GROUND, SOLID = (250, 250, 250), (150, 150, 150)
 PERSON, ANIMAL, PLAN = (85, 168, 104), (59, 110, 165), (221, 132, 82)
 """Colours, RGB."""
@@ -31,7 +33,7 @@ def bird_view(world: AnimalWorld, row: int) -> UInt8[np.ndarray, "400 400 3"]:
     line = np.array([pixel(point) for point in path], np.int32).reshape(-1, 1, 2)
     cv2.polylines(picture, [line], False, PLAN, 1)
     cv2.circle(picture, pixel(animals.goal[row][[0, 2]]), 4, PLAN, -1)
-    nose = root[[0, 2], 3] + 0.3 * root[[0, 2], 2]
+    nose = root[[0, 2], 3] + NOSE_M * root[[0, 2], 2]
     cv2.line(picture, pixel(root[[0, 2], 3]), pixel(nose), ANIMAL, 3)
     cv2.circle(picture, pixel(root[[0, 2], 3]), 6, ANIMAL, -1)
     heading = world.persons.heading[row]

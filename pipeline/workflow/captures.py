@@ -29,7 +29,7 @@ _NEEDED: dict[Flow, tuple[tuple[Role, str], ...]] = {
     ),
     "trajectories": (("session", "one or more tables of its motion, CSV or NPZ"),),
 }
-LONGEST_NAME_BYTES = 200
+SHOWN_LETTERS, LONGEST_NAME_BYTES = 40, 200
 """of a recording: file systems end at 255, and sidecars are named after it"""
 _ANIMAL = re.compile(r"[a-z][a-z0-9-]{0,30}\Z")
 _NAMED = re.compile(r"turnaround_([a-z][a-z0-9-]*)")
@@ -115,7 +115,7 @@ def remarks(
     for name in names:
         data = name.encode(errors="replace")
         if len(data) > LONGEST_NAME_BYTES or data.decode() != name:
-            what = f"the name {name[:40]!r} is longer than {LONGEST_NAME_BYTES} bytes, or no UTF-8"
+            what = f"the name {name[:SHOWN_LETTERS]!r} is longer than {LONGEST_NAME_BYTES} bytes, or no UTF-8"
             raise InputError("CAP-041", what, str(folder), "rename it")
         sidecar = folder / f"{name}{SIDECAR}"
         table = config.read_table(sidecar) if sidecar.is_file() else {}

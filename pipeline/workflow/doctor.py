@@ -22,6 +22,7 @@ LIBRARIES = (
     "torch", "numpy", "scipy", "cv2", "pycolmap", "OpenEXR", "av", "lzfse", "numba", "embreex", "trimesh",
     "kornia", "onnxruntime", "onnxscript", "pygltflib", "skimage", "safetensors", "matplotlib", "jinja2",
 )  # fmt: skip
+OLDEST_PYTHON, TOO_NEW_PYTHON = (3, 11), (3, 14)
 NEEDED_DISK_GB = 10
 NEEDED_MEMORY_GB = 8
 
@@ -37,7 +38,7 @@ class Finding:
 
 def python() -> Finding:
     """Check the interpreter."""
-    good = (3, 11) <= sys.version_info[:2] < (3, 14)
+    good = OLDEST_PYTHON <= sys.version_info[:2] < TOO_NEW_PYTHON
     text = f"{sys.version.split()[0]} (3.11 to 3.13 {'will do' if good else 'is needed'})"
     return Finding("python", "ok" if good else "fail", text)
 

@@ -17,6 +17,7 @@ from stages.annotate import serving, stage
 from stages.annotate.config import Config
 
 ROLES = ("walkthrough", "session", "heldout")
+PORT = 8765
 
 
 def main(arguments: list[str]) -> int:
@@ -28,7 +29,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--clicks", type=Path, required=True, help="file to keep clicks in, captures/<agent>/clicks.json"
     )
-    parser.add_argument("--port", type=int, default=8765, help="port on 127.0.0.1 (default: 8765; 0: any)")
+    parser.add_argument("--port", type=int, default=PORT, help=f"port on 127.0.0.1 (default: {PORT}; 0: any)")
     given = parser.parse_args(arguments)
     try:
         session = stage.run(_inputs(given.build), Config(), given.clicks)

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from pipeline.geometry import cameras, rigid
 from stages.check_captures.sampling import SampledFrame
 
-THROUGH_M = 0.12
-"""a point that another frame saw this far through was not there then, metres"""
+THROUGH_M, THROUGH_SHARE = 0.12, 0.03
+"""a point that another frame saw this far through, metres and share of its depth, was not there then"""
 CLUMP_M2 = (0.006, 0.6)
 """smallest and largest visible surface of an animal, square metres"""
 TWO_APART_M = 0.6
@@ -54,7 +54,7 @@ def _vanished(shot: SampledFrame, others: Sequence[SampledFrame]) -> Bool[np.nda
         inside = (depth > 0.1) & (pixel >= 1).all(-1) & (pixel[:, 0] < width - 1) & (pixel[:, 1] < height - 1)
         column, row = np.floor(pixel[inside]).astype(int).T
         low, high = _range_around(other.depth)
-        margin = THROUGH_M + 0.03 * depth[inside]
+        margin = THROUGH_M + THROUGH_SHARE * depth[inside]
         measured = low[row, column]
         beyond = measured > depth[inside] + margin
         before = high[row, column] <= depth[inside] - margin

@@ -12,6 +12,8 @@ from stages.check_captures.sampling import SampledFrame
 SIDE_PX, POINTS, RATIO, WITHIN_PX = 480, 800, 0.8, 2.0
 LINKED = 25
 """matches on which two views must agree to show the same things"""
+CONFIDENCE = 0.999
+"""of RANSAC, that it has found the geometry of two views"""
 TURNED = 0.9
 """share of these explained by a mere turn of the camera (or one plane) beyond which there is no parallax"""
 
@@ -53,7 +55,7 @@ def _link(
     if len(good) < LINKED:
         return None
     mine, theirs = first[0][good[:, 0]], second[0][good[:, 1]]
-    _, two_views = cv2.findFundamentalMat(mine, theirs, cv2.FM_RANSAC, WITHIN_PX, 0.999)
+    _, two_views = cv2.findFundamentalMat(mine, theirs, cv2.FM_RANSAC, WITHIN_PX, CONFIDENCE)
     _, turn = cv2.findHomography(mine, theirs, cv2.RANSAC, WITHIN_PX)
     if two_views is None or turn is None or two_views.sum() < LINKED:
         return None

@@ -10,6 +10,8 @@ from stages.check_captures.sampling import SampledFrame
 LATER_S = 5.0
 MIN_OVERLAP = 0.3
 MOST_PAIRS = 60
+SAME_DIRECTION, NEAR_M = 0.8, 1.5
+"""Cosine between optical axes, and distance, of cameras that can see the same."""
 
 
 def drift_m(shots: Sequence[SampledFrame]) -> float:
@@ -35,4 +37,4 @@ def drift_m(shots: Sequence[SampledFrame]) -> float:
 def _similar_views(first: SampledFrame, second: SampledFrame) -> bool:
     """Return whether two cameras look into about the same direction from about the same place."""
     relative = first.camera_from_odometry @ second.odometry_from_camera
-    return relative[2, 2] > 0.8 and float(np.linalg.norm(relative[:3, 3])) < 1.5
+    return relative[2, 2] > SAME_DIRECTION and float(np.linalg.norm(relative[:3, 3])) < NEAR_M

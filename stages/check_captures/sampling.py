@@ -13,6 +13,8 @@ from pipeline.recordings import extraction
 from pipeline.recordings.extraction import ExtractionPlan
 from pipeline.recordings.recording import Recording, damaged
 
+SIDE_PX, JPEG_QUALITY = 640, 50
+"""of the pictures, which nobody keeps"""
 DEPTH_SIDE_PX = 192
 """longer side of the sampled depth"""
 BLURRED_SHARE = 0.4
@@ -103,7 +105,7 @@ def sample(recording: Recording, count: int, *, max_depth_m: float) -> Recording
     """Read about ``count`` frames spread over a recording; `InputError` where it cannot be used at all."""
     if recording.depth_size is None:
         return _look_at_pictures(recording, count)
-    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=max_depth_m, max_side_px=640)
+    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=max_depth_m, max_side_px=SIDE_PX)
     rows = evenly(len(plan.chosen), count, rounded=True)
     odometry = None if plan.odometry_from_camera is None else plan.odometry_from_camera[rows]
     sample = replace(
@@ -115,7 +117,7 @@ def sample(recording: Recording, count: int, *, max_depth_m: float) -> Recording
         odometry_from_camera=odometry,
     )
     shots = []
-    frames = extraction.frames(recording, sample, max_depth_m=max_depth_m, jpeg_quality=50)
+    frames = extraction.frames(recording, sample, max_depth_m=max_depth_m, jpeg_quality=JPEG_QUALITY)
     for position, frame in enumerate(frames):
         if frame is not None:
             raw = recording.read_depth(int(recording.index[sample.chosen[position]]))

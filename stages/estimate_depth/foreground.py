@@ -19,8 +19,8 @@ OTHER_TIMES = 24
 """Frames spread over the recording that each one is compared with, and of them so many that see a place."""
 APART_S = 0.7
 """Frames nearer in time than this show the animal at the same place, seconds."""
-SLACK_PX = 2
-"""Pixels of the small picture by which places may be off."""
+SLACK_PX, SOFTNESS_PX = 2, 0.8
+"""Pixels of the small picture by which places may be off, and deviation of the blur that hides less."""
 DIFFERS, MAY_DIFFER = 22.0, 9.0
 """Differences of colours (CIE Lab, 0 to 255 each, summed) beyond the slack that are no noise, and that are
 none beside such."""
@@ -43,7 +43,7 @@ def color_view(color: UInt8[np.ndarray, "height width 3"], view: View) -> ColorV
     """Add colours to a view."""
     small = cv2.resize(color, view.gray.shape[::-1], interpolation=cv2.INTER_AREA)
     lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32)
-    return ColorView(view, cv2.GaussianBlur(lab, (3, 3), 0.8))
+    return ColorView(view, cv2.GaussianBlur(lab, (3, 3), SOFTNESS_PX))
 
 
 def difference(

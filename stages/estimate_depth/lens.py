@@ -24,6 +24,8 @@ LEAST_INLIERS, LEAST_SHARE = 25, 0.25
 """Matches that must agree on a pose, and their share of all, for a frame to be sure of its place."""
 PIXELS_SHARE = 0.008
 """Share of the picture's longer side within which a match agrees: the noise of a map of centimetres."""
+ROUNDS = 30
+"""Evaluations of all residuals at most."""
 LOSS_PX = 1.0
 """Residual from which on a match counts less in the calibration, pixels."""
 RADIAL_SIGMA = 0.05
@@ -158,6 +160,12 @@ def adjusted(lens: Lens, located: Sequence[Located], *, bend: bool = True) -> Le
         sparsity[own[0] : own[-1] + 1, 2 + 6 * number : 8 + 6 * number] = 1
     start = np.r_[1.0, lens.radial, np.zeros(6 * len(located))]
     fitted = scipy.optimize.least_squares(
-        residuals, start, jac_sparsity=sparsity, loss="soft_l1", f_scale=LOSS_PX, x_scale="jac", max_nfev=30
+        residuals,
+        start,
+        jac_sparsity=sparsity,
+        loss="soft_l1",
+        f_scale=LOSS_PX,
+        x_scale="jac",
+        max_nfev=ROUNDS,
     )
     return Lens(float(fitted.x[0] * lens.focal_px), float(fitted.x[1]), lens.size)

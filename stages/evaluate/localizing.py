@@ -18,6 +18,8 @@ from pipeline.localization.localizer import Localizer
 from pipeline.metrics.metrics import Metrics, median
 from pipeline.metrics.pose_errors import PoseErrors
 
+WITHIN_DEG, WITHIN_M = 5, 0.2
+"""The bounds that the metric is named by."""
 RETRIEVAL_STRIDE_PX = 40
 REPROJECTION_PX, PNP_ITERATIONS = 4.0, 2000
 FAILED = "more than half of the frames were not placed"
@@ -44,7 +46,7 @@ def metrics_of(name: str, errors: PoseErrors) -> Metrics:
     metrics = Metrics()
     metrics.put(f"{name}rotation_deg_median", median(errors.degrees), FAILED)
     metrics.put(f"{name}translation_m_median", median(errors.meters), FAILED)
-    within = (errors.degrees <= 5) & (errors.meters <= 0.2)
+    within = (errors.degrees <= WITHIN_DEG) & (errors.meters <= WITHIN_M)
     metrics.put(f"{name}within_5deg_20cm_share", float(within.mean()) if len(within) else np.nan)
     return metrics
 

@@ -7,6 +7,8 @@ from pipeline.data import plots
 from pipeline.metrics.metrics import Metrics
 
 BINS = 10
+DOT_AREAS = (20, 320)
+"""Square points of a dot without frames and of the one with the most."""
 
 
 def reliability_metrics(
@@ -47,6 +49,11 @@ def _drawn(
     figure, axes = plots.panels(1, 1, width_in=4, height_in=4)
     axis, filled = axes[0, 0], count > 0
     axis.plot((0, 1), (0, 1), color=plots.GREY, linewidth=1)
-    axis.scatter(claimed[filled], met[filled], s=20 + 300 * count[filled] / count.max(), color=plots.BLUE)
+    axis.scatter(
+        claimed[filled],
+        met[filled],
+        s=np.interp(count[filled] / count.max(), (0, 1), DOT_AREAS),
+        color=plots.BLUE,
+    )
     axis.set(xlim=(0, 1), ylim=(0, 1), xlabel="confidence", ylabel="share that was right", aspect="equal")
     return plots.pixels(figure)

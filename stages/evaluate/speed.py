@@ -12,6 +12,7 @@ from pipeline.rivals.predictors import Ats
 
 NAMES = ("simulator/plan_50_s", "simulator/plan_few_s")
 REPEATS = 3
+ALL_STEPS, FEW_STEPS = 50, 10
 
 
 def plan_metrics(data: BehaviorData, on_cpu: Ats, seed: int, *, measure: bool) -> Metrics:
@@ -25,8 +26,8 @@ def plan_metrics(data: BehaviorData, on_cpu: Ats, seed: int, *, measure: bool) -
         metrics.skip(NAMES, "not measured: seconds would differ from run to run")
         return metrics
     context, _ = data.windows(np.array([0]))
-    full = replace(on_cpu, sampling=replace(on_cpu.sampling, goal_steps=50, sequence_steps=50))
-    few = replace(on_cpu, sampling=replace(on_cpu.sampling, goal_steps=10, sequence_steps=10))
+    full = replace(on_cpu, sampling=replace(on_cpu.sampling, goal_steps=ALL_STEPS, sequence_steps=ALL_STEPS))
+    few = replace(on_cpu, sampling=replace(on_cpu.sampling, goal_steps=FEW_STEPS, sequence_steps=FEW_STEPS))
     for name, method in zip(NAMES, (full, few), strict=True):
         seconds = []
         with threads.alone():

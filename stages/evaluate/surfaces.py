@@ -13,7 +13,9 @@ from pipeline.geometry import rigid
 from pipeline.geometry.meshes import RayCaster
 from pipeline.metrics.metrics import Metrics, median, percentile
 
-RANGE_M = 5.0
+NEAREST_M, RANGE_M = 0.05, 5.0
+REACHED = 0.99
+"""Share of the way to a point that must be free: the point is part of a surface itself."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +76,10 @@ def seen_by(
     for camera, lens in zip(world_from_camera, intrinsics, strict=True):
         points_camera = rigid.apply(rigid.inverse(camera), points_world)
         pixel = points_camera @ lens.T
-        inside = (points_camera[:, 2] > 0.05) & (points_camera[:, 2] < RANGE_M)
+        inside = (points_camera[:, 2] > NEAREST_M) & (points_camera[:, 2] < RANGE_M)
         pixel = pixel[:, :2] / np.where(inside, points_camera[:, 2], 1)[:, None]
         inside &= ((pixel >= 0) & (pixel < size[::-1])).all(1) & ~seen
         direction = points_world[inside] - camera[:3, 3]
         hit = caster.cast(camera[:3, 3], direction).distance
-        seen[np.flatnonzero(inside)[hit > 0.99]] = True
+        seen[np.flatnonzero(inside)[hit > REACHED]] = True
     return seen

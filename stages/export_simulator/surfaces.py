@@ -14,6 +14,8 @@ _POSITION, _DC, _LOGIT, _LOG_SCALE, _QUATERNION = (slice(0, 3), slice(6, 9), 54,
 """Columns of a Gaussian as PLY files of splats order them: position, normal, spherical harmonics, ..."""
 _LEVEL_M, _UPRIGHT = 0.02, 0.9
 """Thickness of the layers among which the floor is sought; least upward part of a floor's normal."""
+_NEAR_LEVELS = 1.5
+"""The floor is averaged over the lowest level and those that touch it, half thicknesses."""
 _STEPS = 8192.0  # places and sizes are rounded to 0.06 mm: finer digits do not compress
 _BAND_0 = 0.28209479177387814  # the constant spherical harmonic
 
@@ -43,7 +45,7 @@ def floor_height_m(mesh: Mesh, agent_positions_world: Float[np.ndarray, "frame 3
     edges = np.arange(height[level].min() - _LEVEL_M, height[level].max() + 2 * _LEVEL_M, _LEVEL_M)
     share, _ = np.histogram(height[level], edges, weights=area[level])
     lowest = np.flatnonzero(share > 0.25 * share.max())[0]
-    near = level & (np.abs(height - edges[lowest] - _LEVEL_M / 2) < 1.5 * _LEVEL_M)
+    near = level & (np.abs(height - edges[lowest] - _LEVEL_M / 2) < _NEAR_LEVELS * _LEVEL_M)
     return float(np.average(height[near], weights=area[near]))
 
 

@@ -27,6 +27,8 @@ from stages.extract_frames import scaling, structure
 from stages.extract_frames.config import Config, PhotogrammetryConfig
 from stages.extract_frames.structure import Structure
 
+LISTED = 12
+"""lost pictures that the log names at most"""
 LEAST_AGREEING = 2
 """pictures that must confirm a depth; one more makes it trusted"""
 LEAST_MAPPED = 0.3
@@ -218,8 +220,8 @@ def _frame(
 
 def _summary(recording: Recording, rows: np.ndarray, solved: Structure, scale: str) -> str:
     lost = np.setdiff1d(rows, solved.sparse.frame)
-    seconds = ", ".join(f"{recording.timestamp_s[row]:.1f}" for row in lost[:12])
-    left_out = f"; {len(lost)} were not registered, at {seconds}{' ...' if len(lost) > 12 else ''} s"
+    seconds = ", ".join(f"{recording.timestamp_s[row]:.1f}" for row in lost[:LISTED])
+    left_out = f"; {len(lost)} were not registered, at {seconds}{' ...' if len(lost) > LISTED else ''} s"
     split = f", the largest of {solved.models} models" if solved.models > 1 else ""
     relative = "the scale is relative: lengths are no metres"
     metres = relative if scale == extraction.RELATIVE else f"metres from the depth of {scale}"

@@ -22,14 +22,16 @@ LEAST_KEYFRAMES = 8
 """a model with fewer pictures is none"""
 PEAK_THRESHOLD = 0.004
 """SIFT's contrast threshold; plain walls need a low one (COLMAP's default is 0.0067)"""
-VISUAL_WORDS = 256
-"""learned from the recording itself"""
+VISUAL_WORDS, DESCRIPTORS_PER_WORD = 256, 40
+"""learned from so many descriptors of the recording itself"""
 LEAST_PARALLAX_PAIRS = 0.03
 """share of the matched pairs that must show parallax, not a mere rotation or one plane"""
 MOTION_WIDTH_PX = 240
 """width to which pictures are reduced before corners are followed"""
 LOST_STEP = 0.1
 """share of the width by which a picture counts as moved where too few corners survive"""
+MOST_CORNERS, FOLLOWED_PX = 200, (15, 15)
+"""corners of a picture, and the window by which they are found again"""
 LEAST_CORNERS, LEAST_FOLLOWED = 12, 0.4
 """corners in a picture, and share of them found again, below which the tracking is lost"""
 
@@ -63,12 +65,12 @@ class PictureMotion:
 
     @staticmethod
     def _step(before: np.ndarray, after: np.ndarray) -> float:
-        corners = cv2.goodFeaturesToTrack(before, 200, 0.01, 6)
+        corners = cv2.goodFeaturesToTrack(before, MOST_CORNERS, 0.01, 6)
         if corners is None or len(corners) < LEAST_CORNERS:
             return LOST_STEP
         no_guess = np.zeros(0, np.float32)
         moved, found, _ = cv2.calcOpticalFlowPyrLK(
-            before, after, corners, no_guess, winSize=(15, 15), maxLevel=3
+            before, after, corners, no_guess, winSize=FOLLOWED_PX, maxLevel=3
         )
         good = found[:, 0] == 1
         if good.sum() < LEAST_FOLLOWED * len(corners):
@@ -159,7 +161,9 @@ def _bag_of_words_similarity(
 ) -> Float[np.ndarray, "key key"]:
     """Return the cosine of word histograms, words weighted by rarity (Sivic and Zisserman 2003)."""
     everything = np.concatenate(descriptors)
-    sample = everything[np.random.default_rng(seed).permutation(len(everything))[: 40 * words]]
+    sample = everything[
+        np.random.default_rng(seed).permutation(len(everything))[: DESCRIPTORS_PER_WORD * words]
+    ]
     if len(sample) < words:
         return np.zeros((len(descriptors), len(descriptors)))
     cv2.setRNGSeed(seed)

@@ -19,6 +19,8 @@ MOST_LOST = 0.5
 """share of damaged pictures (0..1) beyond which a recording is refused"""
 LEAST_FRAMES = 5
 """frames below which there is no motion to speak of: half a second"""
+BLURRED_SHARE = 0.4
+"""a frame less sharp than this share of the median is blurred"""
 SHEET_FRAMES = 12
 SHEET_HEIGHT_PX = 200
 
@@ -106,7 +108,7 @@ def report_quality(folder: Path, plan: ExtractionPlan, written: WrittenFrames, *
     """Write the stage's own judgement: what was understood, how much of it is usable, a contact sheet."""
     timestamp_s = plan.timestamp_s[written.usable]
     duration_s = float(timestamp_s[-1] - timestamp_s[0])
-    blurred = written.sharpness < 0.4 * max(float(np.median(written.sharpness)), 1e-6)
+    blurred = written.sharpness < BLURRED_SHARE * max(float(np.median(written.sharpness)), 1e-6)
     dropped = float((~written.usable).mean()) - written.lost
     with_poses = float(plan.odometry_from_camera is not None)
     missing = 1 - len(timestamp_s) / max(round(duration_s * rate_hz) + 1, 1)

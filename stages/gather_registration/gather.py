@@ -12,6 +12,7 @@ from pipeline.geometry import views
 
 EDGE_PX, MARGIN_PX = 560, 20
 """Size of the picture of all paths, and what is left free around them."""
+FONT_SCALE = 0.45
 COLORS = ((220, 60, 50), (50, 110, 210), (60, 160, 80), (200, 140, 30), (140, 80, 180), (40, 160, 170))
 
 
@@ -73,5 +74,5 @@ def paths(outcomes: list[SessionOutcome]) -> UInt8[np.ndarray, "height width 3"]
         color, place = COLORS[index % len(COLORS)], (10, 16 * (index + 1))
         overview.draw(cameras[:, :3, 3], color, 1)
         overview.draw(agents[:, :3, 3], color, 3)
-        cv2.putText(image, video, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, color, 1, cv2.LINE_AA)
+        cv2.putText(image, video, place, cv2.FONT_HERSHEY_SIMPLEX, FONT_SCALE, color, 1, cv2.LINE_AA)
     return image

@@ -22,6 +22,7 @@ from stages.report.chapters import Chapter
 LIGHTS = ("none", "ok", "warn", "fail")
 _PICTURE_BYTES = 10_000_000
 _SMALLEST_PX = 160
+_JPEG_QUALITY, _BLURRED_JPEG_QUALITY = 85, 80
 _BLUR_PX = 24
 """what lies within this distance becomes one colour"""
 _STRIP = 2.4
@@ -185,10 +186,11 @@ def _picture(path: Path, caption: str, shrink: float, blurred: bool) -> Embedded
     color = images.read_color(path)
     kind, content = path.suffix[1:], path.read_bytes()
     if blurred:
-        kind, content = "jpeg", images.encode_jpeg(_beyond_recognition(color), 80)
+        kind, content = "jpeg", images.encode_jpeg(_beyond_recognition(color), _BLURRED_JPEG_QUALITY)
     elif shrink > 1:
         size = [max(_SMALLEST_PX, round(length / shrink)) for length in color.shape[1::-1]]
-        kind, content = "jpeg", images.encode_jpeg(cv2.resize(color, size, interpolation=cv2.INTER_AREA), 85)
+        small = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
+        kind, content = "jpeg", images.encode_jpeg(small, _JPEG_QUALITY)
     source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
     return EmbeddedPicture(source, caption, color.shape[1] > _STRIP * color.shape[0])
 

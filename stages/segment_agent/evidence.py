@@ -38,6 +38,12 @@ RECOLORED = 1.0
 DISTRUSTED, DISTRUSTED_BEHIND, DISTRUSTED_MOVING = 0.5, 0.25, 0.6
 """certainty of depth of low confidence or at a step (1 is that of all other depth): on such a surface, where
 no animal is (the sensor may have looked past a tail), and in space that is free at other times"""
+UNKNOWN = 0.05
+"""certainty where nothing is known: what is around it decides"""
+SURE_ROOM = 0.66
+"""share of `ROOM` from which on a point is room beyond doubt"""
+LEAST_SETTLED_PX, LEAST_NOISE = 50, 3.0
+"""pixels without which colours are not compared, and their least noise, grey levels (JPEG)"""
 FEW = 5.0
 """references that must have seen a surface to make it half certain: one or two may have seen the animal"""
 ASKEW_PX = 2
@@ -67,9 +73,9 @@ def judge_motion(references: References) -> Judge:
         doubted = np.where(animal, DISTRUSTED_MOVING, np.where(settled, DISTRUSTED, DISTRUSTED_BEHIND))
         certainty = np.where(settled, seen, 1.0) * np.where(window.trusted, 1.0, doubted)
         log_odds[elsewhere], color[elsewhere] = -ROOM, 0.0
-        certainty[~(animal | settled | elsewhere)] = 0.05
+        certainty[~(animal | settled | elsewhere)] = UNKNOWN
         clear = animal & movers.clearly_moving(votes)
-        room = log_odds <= -0.66 * ROOM
+        room = log_odds <= -SURE_ROOM * ROOM
         return Evidence(log_odds, certainty, animal & window.trusted, clear, room, color)
 
     return judge
@@ -95,9 +101,9 @@ def recolored(
     A shadow or a changed exposure scales all channels alike, and a shadow only darkens. Any colour that the
     surface had within `ASKEW_PX` is no other one: the edges of a texture never lie quite where they were.
     """
-    if settled.sum() < 50:
+    if settled.sum() < LEAST_SETTLED_PX:
         return np.zeros(settled.shape)
-    now = cv2.GaussianBlur(window.color, (5, 5), 1.2).astype(np.float32)
+    now = cv2.GaussianBlur(window.color, (5, 5), free_space.SOFTNESS_PX).astype(np.float32)
     before = votes.color * np.median((now[settled] + 4) / (votes.color[settled] + 4), axis=0)
     scale = np.clip((now * before).sum(-1) / np.maximum((before**2).sum(-1), 1), 0.5, 1.0)
     then, kernel = scale[..., None] * before, np.ones((2 * ASKEW_PX + 1, 2 * ASKEW_PX + 1), np.uint8)
@@ -105,5 +111,5 @@ def recolored(
     low = np.minimum(cv2.erode(np.where(known, then, np.float32(np.inf)), kernel), then)
     high = np.maximum(cv2.dilate(np.where(known, then, np.float32(-np.inf)), kernel), then)
     difference = np.linalg.norm(np.maximum(np.maximum(low - now, now - high), 0), axis=-1)
-    noise = max(float(np.median(difference[settled])), 3.0)
+    noise = max(float(np.median(difference[settled])), LEAST_NOISE)
     return np.where(settled, np.clip(difference / noise - 3, 0, 6), 0)

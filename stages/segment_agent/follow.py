@@ -21,8 +21,10 @@ HEIGHT_PX = 240
 """of the pictures that the mask is carried through: flow is no finer"""
 MOVING, STILL = 4.0, 2.5
 """typical residuals from which on a point moves against the background, and up to which it does not"""
-ROUNDS = 8
-"""of GrabCut"""
+ROUNDS, MODEL_NUMBERS = 8, 65
+"""of GrabCut; its models are five Gaussians of a weight, a mean and a covariance each"""
+CLICK_REACH = 0.2
+"""of the box around a click, as a share of the picture's height"""
 LEAST_MOVING = 0.15
 """share of the hinted box that must move for motion to separate the animal from the rest of the box"""
 
@@ -46,7 +48,7 @@ def cut_out(footage: Footage, hint: Prompt, rng: np.random.Generator) -> Bool[np
     height, width = color.shape[:2]
     x0, y0, x1, y1 = np.array(hint.box_px) * height / footage.clip.color_size[0]
     if min(x1 - x0, y1 - y0) < 4:
-        x0, y0, x1, y1 = x0 - 0.2 * height, y0 - 0.2 * height, x1 + 0.2 * height, y1 + 0.2 * height
+        x0, y0, x1, y1 = np.array([x0, y0, x1, y1]) + CLICK_REACH * height * np.array([-1, -1, 1, 1])
     low = np.clip(np.floor([x0, y0]), 1, [width - 8, height - 8]).astype(int)
     high = np.minimum(np.ceil([x1, y1]).astype(int), [width - 1, height - 1])
     marks = np.full((height, width), cv2.GC_BGD, np.uint8)
@@ -65,7 +67,7 @@ def grab(
 ) -> Bool[np.ndarray, "height width"]:
     """Cut something out of a picture by GrabCut (Rother et al. 2004); ``marks`` are OpenCV's four."""
     cv2.setRNGSeed(int(rng.integers(2**31 - 1)))
-    models, by_mask = np.zeros((2, 1, 65)), cv2.GC_INIT_WITH_MASK
+    models, by_mask = np.zeros((2, 1, MODEL_NUMBERS)), cv2.GC_INIT_WITH_MASK
     found = cv2.grabCut(color, marks.copy(), (0, 0, 0, 0), models[0], models[1], ROUNDS, by_mask)[0]
     return (found == cv2.GC_FGD) | (found == cv2.GC_PR_FGD)
 

@@ -29,6 +29,11 @@ NEAREST_M = 0.1
 """nothing is measured nearer to a depth camera"""
 NOISE_REACH_M = 0.15
 """largest difference that may be noise of a surface seen twice, and not another surface"""
+LEAST_PAIRS, MAD_TO_SIGMA, LEAST_NOISE_M = 200, 1.48, 0.002
+"""differences that a range needs to have its noise measured, a normal deviation in median absolute ones, and
+the least deviation of any sensor"""
+SOFTNESS_PX = 1.2
+"""deviation of the blur before colours are compared"""
 INNER_WIDTH_PX = 320
 """width of a picture of which one pixel around each is looked at, in wider ones more; narrower ones are
 phones', whose confidence marks steps"""
@@ -147,13 +152,13 @@ def measure_noise(
         errors.append(np.abs(measured - z)[near])
     z, error = np.concatenate(ranges), np.concatenate(errors)
     bins = [(z >= low) & (z < low + 0.5) for low in np.arange(0.25, 6, 0.5)]
-    bins = [own for own in bins if own.sum() > 200]
+    bins = [own for own in bins if own.sum() > LEAST_PAIRS]
     if len(bins) < 2:
         return DepthNoise()
     middle = np.array([float(np.median(z[own])) for own in bins])
-    sigma = np.array([1.48 * float(np.median(error[own])) for own in bins])
+    sigma = np.array([MAD_TO_SIGMA * float(np.median(error[own])) for own in bins])
     (constant, quadratic), _ = scipy.optimize.nnls(np.stack([np.ones_like(middle), middle**2], axis=1), sigma)
-    return DepthNoise(max(float(constant), 0.002), float(quadratic))
+    return DepthNoise(max(float(constant), LEAST_NOISE_M), float(quadratic))
 
 
 def _pairs(count: int) -> list[tuple[int, int]]:
@@ -175,7 +180,7 @@ def soft_color(
     color: UInt8[np.ndarray, "height width 3"], size: tuple[int, int]
 ) -> UInt8[np.ndarray, "new_height new_width 3"]:
     """Resize to (height, width) and blur a little, so that colours compare in spite of small pose errors."""
-    return cv2.GaussianBlur(cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA), (5, 5), 1.2)
+    return cv2.GaussianBlur(cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA), (5, 5), SOFTNESS_PX)
 
 
 def vote(

@@ -16,7 +16,8 @@ from pipeline.geometry import viterbi
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.free_space import Votes
 
-HINT_REWARD = 1000.0
+HINT_REWARD, HINT_SLACK_M = 1000.0, 0.2
+"""outweighs everything else; how far beside a candidate a hint may lie"""
 SURE_SHARES = (1.0, 0.3)
 """references that must have seen through a point to learn from it, as a share of those that saw a surface
 there; the second where nothing goes anywhere by the first"""
@@ -24,6 +25,8 @@ TRAVEL_M = 0.2
 """way that something must go by itself to be an animal beyond doubt: what people moved stays where it is"""
 FREE_M = 0.1
 """how far a candidate's centre may jump without motion: another part of the animal is seen"""
+EXCESS_M = 0.3
+"""way beyond the fastest that costs as much as a convincing candidate is worth"""
 LEAST_VOTES, LEAST_SHARE = 2, 0.05
 """references that must have seen through a point, and more as a share of those that saw a surface there"""
 LEAST_AREA_M2, LEAST_PIXELS = 0.003, 6
@@ -199,7 +202,9 @@ def self_moving(
 
 def _meant(candidate: Candidate, hint: Hint) -> bool:
     """Return whether a hint may point at a candidate."""
-    return bool(np.linalg.norm(candidate.centre_world - hint.centre_world) < candidate.radius_m + 0.2)
+    return bool(
+        np.linalg.norm(candidate.centre_world - hint.centre_world) < candidate.radius_m + HINT_SLACK_M
+    )
 
 
 def _score(candidate: Candidate, animal: AnimalConfig) -> float:
@@ -217,6 +222,6 @@ def _transition(
     if before and after:
         first, second = (np.stack([each.centre_world for each in group]) for group in (before, after))
         apart = np.linalg.norm(first[:, None] - second[None], axis=-1)
-        excess = np.maximum(apart - FREE_M - animal.speed_m_s * seconds, 0) / 0.3
+        excess = np.maximum(apart - FREE_M - animal.speed_m_s * seconds, 0) / EXCESS_M
         step[1:, 1:] = -np.minimum(excess, 2 * APPEAR_COST)
     return step

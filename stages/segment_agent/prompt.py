@@ -13,8 +13,9 @@ from pipeline.geometry import cameras, rigid
 from stages.segment_agent.free_space import steady_depth
 from stages.segment_agent.movers import Hint
 
-FORESHORTENED = 1.5
-"""times half its box that an animal may reach: along the line of sight it may be longer"""
+FORESHORTENED, LEAST_BOX_M = 1.5, 0.02
+"""times half its box that an animal may reach: along the line of sight it may be longer; half of a box below
+the second is a click"""
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,11 @@ def place(prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "fram
     x0, y0, x1, y1 = prompt.box_px
     distance = rigid.apply(rigid.inverse(world_from_camera[prompt.frame]), centre[None])[0, 2]
     half_m = max(x1 - x0, y1 - y0) / 2 * distance / clip.intrinsics[prompt.frame, 0, 0]
-    return Hint(prompt.frame, centre, FORESHORTENED * half_m) if half_m > 0.02 else Hint(prompt.frame, centre)
+    return (
+        Hint(prompt.frame, centre, FORESHORTENED * half_m)
+        if half_m > LEAST_BOX_M
+        else Hint(prompt.frame, centre)
+    )
 
 
 def position(

@@ -24,7 +24,14 @@ class Edges:
 
 EDGE = 0.1
 """colour variance (0..1 squared) below which the filter smooths, as its root"""
-BINS = 12
+BINS, TONES = 12, 96
+"""of a histogram along each axis of Lab, and the range of a and b that they divide"""
+LEAST_COLORS, PRIOR, PRIOR_BINS = 50, 0.02, 200
+"""pixels without which there is no palette, and the share of all that every so many unseen bins count as"""
+LEAST_CERTAINTY = 0.05
+"""below, filtered evidence fades"""
+SURE_SHARE, HOLE_SHARE = 0.05, 0.05
+"""share of a part that must be sure, and of the mask up to which a hole is closed"""
 
 
 class Palette:
@@ -42,7 +49,7 @@ class Palette:
     ) -> Float[np.ndarray, "height width"]:
         """Return log p(colour | animal) / p(colour | room), within +-2; ``room`` marks pixels that surely
         show the room."""
-        if self._counts.sum() < 50 or room.sum() < 50:
+        if min(self._counts.sum(), room.sum()) < LEAST_COLORS:
             return np.zeros(color.shape[:2], np.float32)
         counts = np.zeros_like(self._counts)
         np.add.at(counts, _bin(color[room]), 1.0)
@@ -63,7 +70,7 @@ def sharpen(
     guide = cv2.GaussianBlur(color, (3, 3), 0).astype(np.float32) / 255
     both = np.dstack([evidence * certainty, certainty]).astype(np.float32)
     filtered = cv2.ximgproc.guidedFilter(guide, both, edges.radius_px, EDGE**2)
-    return filtered[..., 0] / np.maximum(filtered[..., 1], 0.05)
+    return filtered[..., 0] / np.maximum(filtered[..., 1], LEAST_CERTAINTY)
 
 
 def label(
@@ -72,10 +79,10 @@ def label(
     """Decide 255 / 0 / 128: parts that hold sure pixels stay, holes close, a weak boundary is unknown."""
     inside = (log_odds > 0).astype(np.uint8)
     parts, area = _parts(inside, 8)
-    held = np.bincount(parts[sure], minlength=len(area)) > np.maximum(3, 0.05 * area)
+    held = np.bincount(parts[sure], minlength=len(area)) > np.maximum(3, SURE_SHARE * area)
     held[0] = False
     inside = held[parts].astype(np.uint8)
-    inside = _fill_holes(inside, limit=0.05)
+    inside = _fill_holes(inside, limit=HOLE_SHARE)
     cross = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
     rim = cv2.dilate(inside, cross) != cv2.erode(inside, cross)
     mask = np.where(inside > 0, 255, 0).astype(np.uint8)
@@ -116,7 +123,7 @@ def _bin(color: UInt8[np.ndarray, "pixel 3"]) -> tuple[np.ndarray, np.ndarray, n
     """Lab bins; lightness is coarser than colour so that shade matters less."""
     lab = cv2.cvtColor(np.ascontiguousarray(color.reshape(1, -1, 3)), cv2.COLOR_RGB2LAB)[0].astype(np.int32)
     light = lab[:, 0] * (BINS - 1) // 255
-    tone = np.clip((lab[:, 1:] - 128) * BINS // 96 + BINS // 2, 0, BINS - 1)
+    tone = np.clip((lab[:, 1:] - 128) * BINS // TONES + BINS // 2, 0, BINS - 1)
     return light, tone[:, 0], tone[:, 1]
 
 
@@ -126,4 +133,6 @@ def _density(counts: Float[np.ndarray, "light a b"]) -> Float[np.ndarray, "light
         padded = np.pad(smooth, [(1, 1) if a == axis else (0, 0) for a in range(3)], mode="edge")
         lower, upper = np.delete(padded, [-1, -2], axis), np.delete(padded, [0, 1], axis)
         smooth = 0.5 * smooth + 0.25 * (lower + upper)
-    return (smooth + 0.02 * max(smooth.sum(), 1) / 200) / (smooth.sum() * (1 + 0.02 * smooth.size / 200))
+    return (smooth + PRIOR * max(smooth.sum(), 1) / PRIOR_BINS) / (
+        smooth.sum() * (1 + PRIOR * smooth.size / PRIOR_BINS)
+    )

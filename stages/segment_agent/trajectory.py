@@ -15,6 +15,8 @@ from pipeline.mapping.odometry import align_gravity, chain_alignments, correct_d
 from stages.segment_agent.free_space import steady_depth
 
 DEPTH_STRIDE = 3
+INLIER_M, TRIALS = 0.03, 200
+"""of RANSAC over points that flow brings from one frame to the next"""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ def motion_from_flow(
     second = _lift(clip, frame + 1, (pixel + flow).reshape(-1, 2))
     known = np.isfinite(first[:, 0]) & np.isfinite(second[:, 0])
     first_from_second, _ = ransac_rigid(
-        second[known], first[known], threshold_m=0.03, iterations=200, rng=rng
+        second[known], first[known], threshold_m=INLIER_M, iterations=TRIALS, rng=rng
     )
     return first_from_second
 

@@ -17,7 +17,7 @@ from pipeline.geometry import rigid, subsampling
 from pipeline.geometry.flying_pixels import supported
 from pipeline.geometry.ground import GroundPlane, fit_ground
 from pipeline.mapping.icp import depth_image
-from stages.segment_agent.evidence import Evidence, Judge
+from stages.segment_agent.evidence import UNKNOWN, Evidence, Judge
 from stages.segment_agent.refine import Edges
 from stages.segment_agent.windows import Sphere, Window
 
@@ -37,6 +37,11 @@ LEAST_HITS = 3
 """pictures that must have seen a point in a cell"""
 EDGES = Edges(radius_px=2, unsure=0.4)
 """cells are coarser than evidence of motion"""
+RIM_M, ASTRAY_M = 0.05, 0.15
+"""what may belong to the animal around its cells, and to the ground above the focus; distance of an optical
+axis from the focus from which on it counts less than half"""
+LEVEL, SURE = 0.9, 3.0
+"""least upward part of a level surface's normal; log-odds of what is beyond doubt"""
 LEAST_LEVEL = 200
 """points of level surface lower than the focus without which there is no ground"""
 NEAREST_M = 0.25
@@ -63,7 +68,7 @@ class Cluster:
         """Return a ball around the cells."""
         centres = self.origin + (np.argwhere(self.cells) + 0.5) * self.voxel_m
         middle = (centres.min(0) + centres.max(0)) / 2
-        return Sphere(middle, float(np.linalg.norm(centres - middle, axis=1).max() + 0.05))
+        return Sphere(middle, float(np.linalg.norm(centres - middle, axis=1).max() + RIM_M))
 
 
 def find_standing(
@@ -94,7 +99,7 @@ def surroundings(
 ) -> tuple[Float[np.ndarray, "point 3"], GroundPlane | None]:
     """Return the points that frames see near a focus, and the ground beneath it, if one is seen."""
     points, level = _points_near(clip, world_from_camera, focus)
-    seen = (points[level, 1] < focus[1] + 0.05).sum() >= LEAST_LEVEL
+    seen = (points[level, 1] < focus[1] + RIM_M).sum() >= LEAST_LEVEL
     return points, fit_ground(points[level], focus) if seen else None
 
 
@@ -112,7 +117,7 @@ def meeting_point(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np
             return None
         point = np.linalg.solve(total, np.einsum("f,fij,fj->i", weight, across, centre))
         distance = np.linalg.norm(np.einsum("fij,fj->fi", across, point - centre), axis=1)
-        weight = 1 / (1 + (distance / 0.15) ** 2)
+        weight = 1 / (1 + (distance / ASTRAY_M) ** 2)
     before_m = np.einsum("fi,fi->f", point - centre, forward)
     return point if np.median(before_m) > NEAREST_M else None
 
@@ -148,7 +153,7 @@ def _points_near(clip: Clip, world_from_camera, focus) -> tuple[np.ndarray, np.n
         up = (view.normals.reshape(-1, 3) @ world_from_camera[frame, :3, :3].T)[:, 1]
         near = (view.points.reshape(-1, 3)[:, 2] > 0) & (np.abs(world - focus).max(1) < REACH_M)
         points.append(world[near])
-        level.append(up[near] > 0.9)
+        level.append(up[near] > LEVEL)
     return np.concatenate(points), np.concatenate(level)
 
 
@@ -164,13 +169,13 @@ def judge_standing(cluster: Cluster, ground: GroundPlane, whole: bool = True) ->
         beneath = window.points_world.copy()  # feet: cells begin at the clearance, look one up
         beneath[..., 1] += CLEARANCE_M
         held |= cluster.holds(beneath)
-        log_odds = np.where(held, np.clip((height - FOOT_M) / FOOT_SPREAD_M, -3, 3), -3.0)
+        log_odds = np.where(held, np.clip((height - FOOT_M) / FOOT_SPREAD_M, -SURE, SURE), -SURE)
         log_odds[~known] = 0.0
-        certainty = np.where(known, np.where(window.trusted, 1.0, 0.5), 0.05)
+        certainty = np.where(known, np.where(window.trusted, 1.0, 0.5), UNKNOWN)
         if not whole:
             near = np.linalg.norm(window.points_world - ball.centre_world, axis=-1) < ball.radius_m
             uncertain = near & ~held & (height > CLEARANCE_M)
-            log_odds[uncertain], certainty[uncertain] = 0.0, 0.05
+            log_odds[uncertain], certainty[uncertain] = 0.0, UNKNOWN
         sure = window.trusted & (log_odds > 2)
         return Evidence(log_odds, certainty, sure, sure, log_odds <= -2)
 

@@ -15,6 +15,8 @@ from stages.segment_agent.free_space import steady_depth
 
 STEP_M = 0.05
 """difference of neighbouring depths that is a step and not a slope"""
+NEAREST_M = 0.2
+"""distance at which a ball is drawn that the camera is in"""
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ def rectangle(
     pixel, depth = cameras.project(centre, intrinsics)
     if depth < 0.1:
         return slice(0, 0), slice(0, 0)
-    reach = intrinsics[[0, 1], [0, 1]] * ball.radius_m / max(depth - 0.5 * ball.radius_m, 0.2) + rim_px
+    reach = intrinsics[[0, 1], [0, 1]] * ball.radius_m / max(depth - 0.5 * ball.radius_m, NEAREST_M) + rim_px
     low = np.clip(np.floor(pixel - reach), 0, size[::-1]).astype(int)
     high = np.clip(np.ceil(pixel + reach), 0, size[::-1]).astype(int)
     return slice(low[1], high[1]), slice(low[0], high[0])

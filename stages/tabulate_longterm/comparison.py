@@ -21,6 +21,8 @@ EPISODE_FRAMES = 300
 LENGTHS_S, LENGTH_RUNS = (2, 4, 6), 8
 """Seconds of the longer motions that are compared, the true bodies given every two seconds (Sec. 4.2 of the
 paper), and how many motions there are."""
+ALONG = (0.1, 0.9, 17)
+"""shares of the line that are looked at, and how many: a body may touch something where it starts or ends"""
 BLOCKED_M = 0.06
 """A straight line from start to end that comes nearer than this to anything is not the animal's way."""
 
@@ -115,7 +117,7 @@ def even_runs(count: int, run: int, most: int) -> Int[np.ndarray, "some"]:
 
 def blocked(clips: Clips, dataset: MotionDataset) -> Bool[np.ndarray, "clip"]:
     """Return on which clips the straight line of the root comes nearer than `BLOCKED_M` to anything."""
-    share = torch.linspace(0.1, 0.9, 17)[None, :, None]
+    share = torch.linspace(*ALONG)[None, :, None]
     line = torch.lerp(clips.channels[:, :1, :3], clips.channels[:, -1:, :3], share).double().numpy()
     near = [
         dataset.scenes[scene].distance.at(torch.from_numpy(points))

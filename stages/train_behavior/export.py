@@ -24,6 +24,8 @@ from pipeline.behavior.trajectories import MOST_COMPANIONS, UP
 from pipeline.geometry import rigid
 
 NETWORKS = ("perception", "goal", "path", "body")
+GOLDEN_OBSERVER_M = ((0.5, 0.2), (1.2, 1.2), (1.8, 1.1))
+"""first and last place of the golden plan's observer, who comes up: left, up, ahead"""
 
 
 def write_model(
@@ -145,8 +147,8 @@ def golden_observation(a: Architecture, *, accompanied: bool = False) -> Observa
         number = np.arange(np.prod(shape), dtype=np.float64)
         return (amplitude * np.sin(frequency * number)).reshape(1, *shape).astype(np.float32)
 
-    left, ahead = np.linspace(0.5, 0.2, a.past), np.linspace(1.8, 1.1, a.past)
-    observer = np.stack([left, np.full(a.past, 1.2), ahead], axis=-1)
+    left, up, ahead = (np.linspace(*ends, a.past) for ends in GOLDEN_OBSERVER_M)
+    observer = np.stack([left, up, ahead], axis=-1)
     facing = rigid.look_at(observer, np.zeros(3), UP)
     scene = wave(a.scene_channels, *GRID_SHAPE, amplitude=0.25, frequency=0.01)
     past = wave(a.past * (9 + 6 * a.bones), amplitude=0.1, frequency=0.1)

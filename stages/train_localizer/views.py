@@ -33,6 +33,8 @@ BLUR_PX, LEAST_BLUR_PX, PIXEL_NOISE = 1.0, 0.3, 0.015
 """Largest and least Gaussian blur, pixels, and standard deviation of pixel noise, share of full scale."""
 OCCLUDED_SHARE, OCCLUDER_DEPTH = 0.4, 0.8
 """Share of scene queries with an occluder in front, and its depth over what it hides."""
+OCCLUDER_AXES, OCCLUDER_TURN_DEG = ((12, 4), (14, 7)), 30
+"""Smallest and largest half axes of an occluder, as what the picture's width is divided by; largest turn."""
 LEAST_SEEN, NEAREST_M, NEAREST_QUANTILE, LEAST_FRONT = 0.6, 0.35, 0.05, 0.95
 """A plausible view: share of its pixels with surface, this quantile of its depth beyond this many metres, and
 share of surface seen from its front."""
@@ -137,9 +139,9 @@ def occlude(view: RenderedView, rng: np.random.Generator) -> RenderedView:
     """Put an ellipse of one colour in front, nearer than what it hides."""
     height, width = view.depth.shape
     centre = (int(rng.integers(width // 5, width * 4 // 5)), int(rng.integers(height // 3, height)))
-    axes = (int(rng.integers(width // 12, width // 4)), int(rng.integers(width // 14, width // 7)))
+    axes = tuple(int(rng.integers(width // small, width // large)) for small, large in OCCLUDER_AXES)
     shape = np.zeros(view.depth.shape, np.uint8)
-    cv2.ellipse(shape, centre, axes, float(rng.uniform(-30, 30)), 0, 360, 1, -1)
+    cv2.ellipse(shape, centre, axes, float(rng.uniform(-OCCLUDER_TURN_DEG, OCCLUDER_TURN_DEG)), 0, 360, 1, -1)
     color = np.where(shape[..., None] > 0, rng.integers(0, 255, 3).astype(np.uint8), view.color)
     return replace(view, color=color, depth=np.where(shape > 0, view.depth * OCCLUDER_DEPTH, view.depth))
 
