@@ -59,7 +59,7 @@ class FeatureBasis:
 
     mean: Float[np.ndarray, "channel"]
     components: Float[np.ndarray, "16 channel"]
-    """principal axes, already divided by the square root of their spread"""
+    """principal axes, already divided by the square root of their standard deviation"""
     scale: float
     """median length of projections before they are normalised"""
     explained: Float[np.ndarray, "16"]
@@ -89,7 +89,7 @@ class FeatureBasis:
 def fit_basis(
     raw: Float[np.ndarray, "sample channel"], *, channels: int = CHANNELS, whitening: float = WHITENING
 ) -> FeatureBasis:
-    """Fit principal axes; ``whitening`` 0 keeps each axis's spread, 1 makes all equal.
+    """Fit principal axes; ``whitening`` 0 keeps each axis's variance, 1 makes all equal.
 
     Textureless samples (zero descriptors) are left out.
     """

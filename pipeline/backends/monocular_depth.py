@@ -21,6 +21,8 @@ CHECKPOINTS: dict[Kind, str] = {
 }
 LONGER_PX = 518
 """Longer side that Depth Anything was trained at, pixels."""
+SCALES_OF_DEPTH_PRO = 4
+"""Depth Pro looks at a square of so many patches a side: 1536 pixels of patches of 384."""
 NEAREST_M = 0.05
 """Nearest depth that a metric network is believed, metres."""
 
@@ -63,7 +65,3 @@ class MonocularDepth:
                 return side, side
             case _:
                 assert_never(self._kind)
-
-
-SCALES_OF_DEPTH_PRO = 4
-"""Depth Pro looks at a square of so many patches a side: 1536 pixels of patches of 384."""

@@ -42,6 +42,15 @@ class Video:
     """Whose turnaround it is, in a home of several animals."""
 
 
+def role_of_animal(
+    video: Video | None, otherwise: Literal["turnaround", "session"]
+) -> Literal["turnaround", "session"]:
+    """Return which of the two a recording of the animal is; ``otherwise`` where nothing is known of it."""
+    if video is None:
+        return otherwise
+    return "turnaround" if video.role == "turnaround" else "session"
+
+
 def read(path: Path) -> tuple[Video, ...]:
     """Read `videos.json`. Raises `InputError` ART-003 for anything else."""
     try:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, Num, Shaped, UInt8
+from jaxtyping import Bool, Float, Num, Shaped, UInt8
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -130,11 +130,6 @@ def floor_plan(
         high_m = low_m + np.array(solid.shape) * cell_m
         extent = (low_m[0], high_m[0], high_m[1], low_m[1])
         axis.imshow(solid.T, extent=extent, cmap=cmap, vmax=vmax, alpha=alpha)
-
-
-def sample(count: int, most: int) -> Int[np.ndarray, "chosen"]:
-    """Return up to ``most`` of the indices 0 .. count - 1, evenly spaced, both ends among them."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
 
 
 def resized(

@@ -23,7 +23,7 @@ from pipeline.behavior.support import SUPPORTED, Support, floor_level
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, Trajectory
 from pipeline.core.errors import InputError
 from pipeline.data import npz
-from pipeline.geometry import rigid
+from pipeline.geometry import rigid, subsampling
 from pipeline.workflow import artifact
 
 ARTIFACTS = ("behavior_data", "feature_basis", "scene_template")
@@ -184,7 +184,7 @@ def _surface(home: ReconstructedHome) -> tuple[Float[np.ndarray, "cell 17"], Flo
     volume = home.volume
     length = np.linalg.norm(volume.features.astype(np.float32), axis=0)
     index = np.argwhere((volume.occupancy == 1) & (length > 0))
-    index = index[np.linspace(0, len(index) - 1, min(len(index), MOST_CELLS)).astype(int)]
+    index = index[subsampling.evenly(len(index), MOST_CELLS)]
     at = tuple(index.T)
     place = volume.origin + (index + 0.5) * volume.voxel_m
     look = volume.features[(slice(None), *at)].astype(np.float32) / length[at]
@@ -205,7 +205,7 @@ def set_down(
     scenes, floor = other.scenes(), _floor_places(other)
     for split, count in STARTS.items():
         windows = data.indices(split)
-        some = windows[np.linspace(0, len(windows) - 1, min(len(windows), count)).astype(int)]
+        some = windows[subsampling.evenly(len(windows), count)]
         for window in some.tolist():
             name, start = data.videos[data.video[window]], int(data.start[window])
             moment = _cut(data.trajectories[name], start, data.past, data.future)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from pipeline.geometry import rigid
+from pipeline.geometry import rigid, subsampling
 
 NEIGHBOURS = 4
 """Surface points that a corresponding place takes its weights from."""
@@ -59,7 +59,7 @@ def retarget(
     agent_from_bone: Float[np.ndarray, "frame source_bone 4 4"],
 ) -> Retargeted:
     """Return the motion of ``source`` on the body ``target``."""
-    chosen = np.unique(np.linspace(0, len(target.vertices) - 1, SURFACE_POINTS).astype(int))
+    chosen = subsampling.evenly(len(target.vertices), SURFACE_POINTS)
     part = SkinnedShape(
         target.vertices[chosen].astype(float), target.weights[chosen], target.agent_from_bone_rest
     )

@@ -125,14 +125,15 @@ def rotation_to_6d(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarra
 
 def rotation_from_6d(columns: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 3 3"]:
     """Orthonormalise two columns into a rotation (Zhou et al. 2019, Eq. 15), parallel ones into any."""
-    first = _normalized(columns[..., :3])
+    first = normalized(columns[..., :3])
     second = columns[..., 3:] - (first * columns[..., 3:]).sum(-1, keepdims=True) * first
     parallel = np.linalg.norm(second, axis=-1, keepdims=True) < PARALLEL
-    second = _normalized(np.where(parallel, np.cross(first, np.roll(first, 1, axis=-1) + ANY_OTHER), second))
+    second = normalized(np.where(parallel, np.cross(first, np.roll(first, 1, axis=-1) + ANY_OTHER), second))
     return np.stack([first, second, np.cross(first, second)], axis=-1)
 
 
-def _normalized(vector: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+def normalized(vector: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    """Scale vectors to unit length; zero stays zero."""
     return vector / np.linalg.norm(vector, axis=-1, keepdims=True).clip(1e-9)
 
 
@@ -178,6 +179,6 @@ def look_at(
 
     No target may be straight above or below its camera.
     """
-    forward = _normalized(np.asarray(target, float) - eye)
-    right = _normalized(np.cross(forward, up))
+    forward = normalized(np.asarray(target, float) - eye)
+    right = normalized(np.cross(forward, up))
     return make(np.stack([right, np.cross(forward, right), forward], axis=-1), np.asarray(eye, float))

@@ -1,7 +1,7 @@
-"""Even subsampling of frames and of other sequences: one rule for the whole project."""
+"""Even subsampling of frames and other sequences, and short gaps in them: one rule for the whole project."""
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int
 
 
 def evenly(count: int, most: int, *, rounded: bool = False) -> Int[np.ndarray, "chosen"]:
@@ -11,3 +11,16 @@ def evenly(count: int, most: int, *, rounded: bool = False) -> Int[np.ndarray, "
     """
     places = np.linspace(0, max(count - 1, 0), min(most, count))
     return np.unique((np.round(places) if rounded else places).astype(int))
+
+
+def within_short_gaps(
+    good: Float[np.ndarray, "frame"], grid: Float[np.ndarray, "sample"], max_gap_s: float, near_s: float = 0.0
+) -> Bool[np.ndarray, "sample"]:
+    """Return which times of a grid are good ones, ``near_s`` off at most, or between such at most
+    ``max_gap_s`` apart.
+    """
+    after = np.searchsorted(good, grid, side="left").clip(0, len(good) - 1)
+    before = (np.searchsorted(good, grid, side="right") - 1).clip(0)
+    on_frame = np.minimum(np.abs(good[after] - grid), np.abs(good[before] - grid)) <= near_s
+    between = (good[before] <= grid) & (grid <= good[after]) & (good[after] - good[before] <= max_gap_s)
+    return on_frame | between

@@ -192,7 +192,7 @@ def plan_waypoints(
     root_m = floor.height_m + motion_prior.clearance_m
     stand = [_standing(floor, scene, goal.position_world, motion_prior.clearance_m) for goal in subgoals]
     points = [stand.pop(0) if start is None else _grounded(start[:3, 3], root_m)]
-    headings, marks, clock = [subgoals[0].heading_rad if start is None else _heading(start)], [0], 0.0
+    headings, marks, clock = [subgoals[0].heading_rad if start is None else float(rigid.yaw(start))], [0], 0.0
     for goal, place in zip(subgoals[-len(stand) :], stand, strict=True):
         added = _leg_ends(floor, points[-1], place, root_m, LEG_LENGTH_SLACK * motion_prior.pace_m)
         count = len(added)
@@ -330,7 +330,3 @@ def _poses_along_path(
     vectors = np.zeros((len(turned), 3))
     vectors[:, 1] = turned
     return rigid.make(rigid.rotation_from_vector(vectors), points)
-
-
-def _heading(world_from_agent: Float[np.ndarray, "4 4"]) -> float:
-    return float(np.arctan2(world_from_agent[0, 2], world_from_agent[2, 2]))

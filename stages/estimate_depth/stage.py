@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, assert_never
+from typing import assert_never
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ from pipeline.backends.monocular_depth import MonocularDepth
 from pipeline.core import devices
 from pipeline.core.errors import InputError
 from pipeline.core.progress import log, track
-from pipeline.core.videos import Video
+from pipeline.core.videos import Video, role_of_animal
 from pipeline.data import ply
 from pipeline.data.clips import Clip, Pictures
 from pipeline.data.templates import SceneCameras
@@ -66,7 +66,7 @@ def run(
         color = found.straightened(pictures.color(frame))
         pose, gray = tracked.world_from_camera[frame], views.small_gray(color)
         shown.append(foreground.color_view(color, views.view_of(gray, tracked.lens.intrinsics, pose, caster)))
-    match _role(config, video):
+    match role_of_animal(video, config.role):
         case "turnaround":
             depths = depth.of_turnaround(shown, room, walked)
         case "session":
@@ -84,12 +84,6 @@ def run(
     writing.write(out, pictures, estimated, config.jpeg_quality)
     writing.report_quality(out, pictures, estimated)
     return estimated
-
-
-def _role(config: Config, video: Video | None) -> Literal["turnaround", "session"]:
-    if video is None:
-        return config.role
-    return "turnaround" if video.role == "turnaround" else "session"
 
 
 def _walk_view(walk: Clip, walk_cameras: SceneCameras, frame: int, caster: RayCaster) -> ColorView:

@@ -9,7 +9,7 @@ from jaxtyping import Int
 
 from pipeline.data import images, plots, qa
 from pipeline.data.clips import FRAMES, MAPPED, Pictures
-from pipeline.geometry import cameras
+from pipeline.geometry import cameras, subsampling
 from stages.estimate_depth.depth import FrameDepth
 from stages.estimate_depth.lens import Lens
 from stages.estimate_depth.tracking import Tracked
@@ -81,7 +81,7 @@ def report_quality(folder: Path, pictures: Pictures, estimated: Estimated) -> No
         qa.Check("depth of the map, or confirmed by several views", 100 * float(certain), "%"),
         qa.Check("frames with inferred depth", 100 * float(np.mean([each.inferred for each in depths])), "%"),
     ]
-    shown, size = plots.sample(len(chosen), SHOWN), depths[0].depth.shape
+    shown, size = subsampling.evenly(len(chosen), SHOWN), depths[0].depth.shape
     colors = [plots.resized(pictures.color(int(chosen[number])), size) for number in shown]
     sheet = plots.grid([*colors, *(plots.depth_colors(depths[number].depth) for number in shown)], len(shown))
     qa.write(

@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 
 from pipeline.data import plots, qa
 from pipeline.data.flow import STRIDE_PX, open_confidence, open_flow
+from pipeline.geometry import subsampling
 
 SHOWN_FRAMES = 6
 LEAST_AGREEMENT = {1: 0.6, 2: 0.5, 4: 0.35, 8: 0.2}
@@ -41,7 +42,7 @@ def review(folder: Path, gap: int, color: Callable[[int], UInt8[np.ndarray, "hei
         agreement.append(float(certain.mean()))
         if certain.any():
             speed_px.append(float(np.linalg.norm(flow[certain].astype(np.float32), axis=-1).mean()))
-    shown = plots.sample(len(flows), SHOWN_FRAMES)
+    shown = subsampling.evenly(len(flows), SHOWN_FRAMES)
     columns = [_column(color(int(i)), flows[i], confidences[i]) for i in shown]
     strip = np.concatenate([*columns, _key(len(columns[0]))], axis=1)
     return Review(gap, float(np.mean(agreement)), float(np.mean(speed_px)) if speed_px else 0.0, strip)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData
-from pipeline.data import plots
+from pipeline.geometry import subsampling
 from pipeline.metrics.intervals import Interval, bootstrapped, episodes
 from pipeline.metrics.metrics import Metrics
 from pipeline.metrics.scores import GOAL_SCORES, PLAN_SCORES, SCORES
@@ -53,7 +53,7 @@ def behavior_metrics(data: BehaviorData, ours: Predictor, config: Config) -> Met
         scores = [f"behavior/{method}/{name}" for method in (OURS, *RIVALS) for name in SCORES]
         metrics.skip(["behavior/plan_windows", "behavior/plan_trials", *scores], reason)
         return metrics
-    plans = plots.sample(len(test), config.plan_windows)
+    plans = subsampling.evenly(len(test), config.plan_windows)
     metrics.put("behavior/plan_windows", len(plans))
     metrics.put("behavior/plan_trials", 1)
     episode = episodes(data.start[test], data.video[test], data.past + data.future)

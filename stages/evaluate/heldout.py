@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from skimage.metrics import structural_similarity
 
-from pipeline.data import plots
+from pipeline.geometry import subsampling
 from pipeline.metrics.lpips import Lpips
 from pipeline.metrics.metrics import Metrics
 
@@ -136,7 +136,7 @@ def picture_metrics(name: str, views: Sequence[HeldoutView]) -> Metrics:
 
 def side_by_side(views: Sequence[HeldoutView], count: int = 6) -> UInt8[np.ndarray, "height width 3"]:
     """Put some views beside each other: truth, ours, true depth, our depth."""
-    chosen = [views[index] for index in plots.sample(len(views), count)]
+    chosen = [views[index] for index in subsampling.evenly(len(views), count)]
     columns = [(view.true.color, view.color, _gray(view.true.depth), _gray(view.depth)) for view in chosen]
     height = max(len(column[0]) for column in columns)
     padded = [

@@ -9,10 +9,11 @@ from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import BehaviorData
 from pipeline.core import devices, progress
 from pipeline.core.videos import Video
-from pipeline.data import flow, plots
+from pipeline.data import flow
 from pipeline.data.clips import PEOPLE, Masks
 from pipeline.data.poses import RegisteredPoses
 from pipeline.data.templates import SceneCameras
+from pipeline.geometry import subsampling
 from pipeline.localization import localizer as localizers
 from pipeline.metrics.metrics import Metrics
 from pipeline.metrics.pose_errors import PoseErrors, joined, pose_errors
@@ -146,7 +147,7 @@ def _single_frames(
     """Place single frames by our localizer and by its rivals."""
     cameras = SceneCameras.open(folders.scene_template)
     known = np.flatnonzero(cameras.registered)
-    mapped = known[plots.sample(len(known), MAP_FRAMES)].tolist()
+    mapped = known[subsampling.evenly(len(known), MAP_FRAMES)].tolist()
     ours = localizers.load(folders.scene_localizer)
     sift = localizing.sift_map(walkthrough.clip, cameras.world_from_camera, mapped)
     pictures = localizing.gallery(walkthrough.clip, cameras.world_from_camera, mapped)
@@ -155,7 +156,7 @@ def _single_frames(
     }
     probabilities = []
     for each in sessions:
-        chosen = plots.sample(len(each.clip), config.localizer_frames).tolist()
+        chosen = subsampling.evenly(len(each.clip), config.localizer_frames).tolist()
         masks = Masks.open(folders.masks[each.video.id])
         hidden = [masks[frame] > 0 for frame in chosen]
         answers, probability = localizing.placed_by_localizer(ours, each.clip, chosen, hidden)

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.behavior.trajectories import RATE_HZ, TEST, TRAIN, BehaviorData
-from pipeline.data import plots
-from pipeline.geometry import rigid
+from pipeline.geometry import rigid, subsampling
 from pipeline.longterm.bodies import load_body
 from pipeline.longterm.contacts import find_contact_vertices
 from pipeline.longterm.plausibility import PlausibilityMeter
@@ -44,7 +43,7 @@ def physical_metrics(
     scene = MotionScene.reconstructed(reconstruction, data.trajectories.values()).distance
     contacts = find_contact_vertices(body, learned, [scene] * len(learned))
     meter = PlausibilityMeter(body, contacts, scene)
-    chosen = test[plots.sample(len(test), windows)]
+    chosen = test[subsampling.evenly(len(test), windows)]
     metrics.put("behavior/physical_windows", len(chosen))
     context, future = data.windows(chosen)
     made = ours.sample(context, 1, np.random.default_rng(seed))

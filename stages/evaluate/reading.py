@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.core.videos import Role, Video
-from pipeline.data import motion, plots
+from pipeline.data import motion
 from pipeline.data.clips import FRAMES, Clip, read_source_index
 from pipeline.data.motion import Motion
 from pipeline.data.templates import AgentCameras, SceneCameras
-from pipeline.geometry import rigid
+from pipeline.geometry import rigid, subsampling
 from pipeline.metrics.pose_errors import constant_between
 from stages.evaluate.truth import RecordingTruth
 
@@ -127,7 +127,7 @@ def filmed_together(folders: Reconstructed, phone: Video) -> Int[np.ndarray, "fr
 
 def subsampled(frames: Int[np.ndarray, "frame"], count: int) -> Int[np.ndarray, "chosen"]:
     """Return up to ``count`` of the frames, evenly spread."""
-    return frames[plots.sample(len(frames), count)]
+    return frames[subsampling.evenly(len(frames), count)]
 
 
 def read_motion(folder: Path, id: str) -> Motion | None:

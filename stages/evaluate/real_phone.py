@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.core.videos import Video
-from pipeline.data import plots
 from pipeline.data.clips import Clip, usable_depth
-from pipeline.geometry import rigid
+from pipeline.geometry import rigid, subsampling
 from pipeline.localization import localizer as localizers
 from stages.evaluate import reading
 from stages.evaluate.clicked import Clicked, all_cameras
@@ -42,7 +41,7 @@ def cameras_of(
         return None
     model = localizers.load(folders.scene_localizer)
     votes = []
-    for frame in plots.sample(len(clip), LOCALIZED).tolist():
+    for frame in subsampling.evenly(len(clip), LOCALIZED).tolist():
         answers = model.localize(
             clip.color(frame), clip.depth(frame), clip.depth_intrinsics[frame], clip.intrinsics[frame]
         )

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float
 
 from pipeline.core import devices
-from pipeline.data import gaussian_ply, plots, ply
+from pipeline.data import gaussian_ply, ply
 from pipeline.data.motion import TRACKS, Motion
 from pipeline.data.templates import SkinTable, bones_at_rest
 from pipeline.fields import fields, gaussians
 from pipeline.fields.render import Renderer, render_depth
-from pipeline.geometry import rigid
+from pipeline.geometry import rigid, subsampling
 from pipeline.geometry.meshes import Mesh, RayCaster
 from pipeline.metrics.lpips import Lpips
 from pipeline.metrics.metrics import Metrics
@@ -298,7 +298,7 @@ def _scene_chamfer(
     )
     cameras = frames.cameras(walkthrough.truth)
     pieces = split(true.vertices[true.faces].astype(np.float64), SEEN_M)
-    chosen = plots.sample(len(cameras), CAMERAS_FOR_SEEN)
+    chosen = subsampling.evenly(len(cameras), CAMERAS_FOR_SEEN)
     camera = (cameras[chosen], walkthrough.truth.intrinsics[chosen], walkthrough.clip.color_size)
     seen = TriangleSurface(pieces[surfaces.seen_by(RayCaster(true), pieces.mean(1), *camera)])
     surface = TriangleSurface(ours.vertices[ours.faces].astype(np.float64))

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
 from pipeline.data.glb import Action
-from pipeline.geometry import rigid
+from pipeline.geometry import rigid, subsampling
 from stages.export.reading import Agent
 from stages.export.writing import ExportRecord
 
@@ -41,7 +41,7 @@ def write(folder: Path, agent: Agent) -> ExportRecord:
     """Write `<motion>.flat.bvh` and `<motion>.tree.bvh` for every motion."""
     rest, names = agent.skin.agent_from_bone_rest, list(agent.skin.bone_names)
     recorded = np.concatenate([action.agent_from_bone for action in agent.actions])
-    chosen = np.linspace(0, len(recorded) - 1, min(_FITTED_FRAMES, len(recorded))).astype(int)
+    chosen = subsampling.evenly(len(recorded), _FITTED_FRAMES)
     tree = fitted_tree(recorded[chosen] @ rigid.inverse(rest), rest)
     exact, lost = [], []
     for action in agent.actions:

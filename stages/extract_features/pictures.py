@@ -7,6 +7,7 @@ from jaxtyping import Float, UInt8
 
 from pipeline.data import plots, qa
 from pipeline.data.clips import Clip
+from pipeline.geometry import subsampling
 
 SHOWN_FRAMES = 6
 HEIGHT_PX = 200
@@ -14,7 +15,7 @@ HEIGHT_PX = 200
 
 def report_quality(folder: Path, clip: Clip, features: Float[np.ndarray, "frame height width 16"]) -> None:
     """Write the stage's own judgement."""
-    shown = plots.sample(len(clip), SHOWN_FRAMES)
+    shown = subsampling.evenly(len(clip), SHOWN_FRAMES)
     size = (HEIGHT_PX, max(round(clip.color_size[1] * HEIGHT_PX / clip.color_size[0]), 1))
     images = [clip.color(int(i)) for i in shown] + [as_colors(features[i]) for i in shown]
     sheet = plots.grid([plots.resized(image, size) for image in images], len(shown))

@@ -43,14 +43,10 @@ def bones_from_joints(
         [next((c for c in range(len(parent)) if parent[c] == j), -1) for j in range(len(parent))]
     )
     other = np.where(child >= 0, child, parent)
-    direction = _unit(joints_agent[:, other] - joints_agent)
+    direction = rigid.normalized(joints_agent[:, other] - joints_agent)
     rest = np.tile(np.eye(4), (len(parent), 1, 1))
     rest[:, :3, 3] = np.median(joints_agent, axis=0)
-    return rigid.make(_shortest_turn(_unit(direction.mean(0)), direction), joints_agent), rest
-
-
-def _unit(vector: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-    return vector / np.linalg.norm(vector, axis=-1, keepdims=True).clip(1e-9)
+    return rigid.make(_shortest_turn(rigid.normalized(direction.mean(0)), direction), joints_agent), rest
 
 
 def _shortest_turn(
@@ -61,4 +57,4 @@ def _shortest_turn(
     axis = np.cross(start, end)
     angle = np.arctan2(np.linalg.norm(axis, axis=-1), (start * end).sum(-1))
     known = np.linalg.norm(end, axis=-1) > 0.5
-    return rigid.rotation_from_vector(_unit(axis) * np.where(known, angle, 0.0)[..., None])
+    return rigid.rotation_from_vector(rigid.normalized(axis) * np.where(known, angle, 0.0)[..., None])

@@ -13,7 +13,7 @@ from pipeline.data.clips import Clip, Masks
 from pipeline.data.motion import Motion
 from pipeline.fields.fields import Reconstruction
 from pipeline.fields.render import Renderer
-from pipeline.geometry import cameras, rigid
+from pipeline.geometry import cameras, rigid, subsampling
 
 LONG_SIDE_PX = 320
 """of each drawn picture"""
@@ -70,7 +70,7 @@ def chosen_frames(motion: Motion, number: int) -> list[int]:
         & np.isfinite(motion.world_from_camera).all((1, 2))
         & motion.agent_visible
     )
-    return known[plots.sample(len(known), number)].tolist()
+    return known[subsampling.evenly(len(known), number)].tolist()
 
 
 def compare(

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.core.progress import log
 from pipeline.data.clips import Clip
-from pipeline.geometry import rigid
+from pipeline.geometry import rigid, subsampling
 from stages.segment_agent import free_space, movers
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.free_space import References
@@ -190,12 +190,10 @@ def _bridged(
     axis: Float[np.ndarray, "frame 2"], timestamp_s: Float[np.ndarray, "frame"]
 ) -> Float[np.ndarray, "frame 2"]:
     """Cross short gaps of a track, in which a person stood still or in front of nothing that was seen."""
-    seen = np.flatnonzero(np.isfinite(axis[:, 0]))
+    seen = np.isfinite(axis[:, 0])
     filled = np.stack([np.interp(timestamp_s, timestamp_s[seen], axis[seen, k]) for k in range(2)], axis=-1)
-    after = np.clip(np.searchsorted(seen, np.arange(len(axis))), 1, len(seen) - 1)
-    gap_s = timestamp_s[seen[after]] - timestamp_s[seen[after - 1]]
-    inside = (np.arange(len(axis)) >= seen[0]) & (np.arange(len(axis)) <= seen[-1])
-    return np.where((inside & (gap_s <= movers.ABSENT_S))[:, None], filled, axis)
+    short = subsampling.within_short_gaps(timestamp_s[seen], timestamp_s, movers.ABSENT_S)
+    return np.where(short[:, None], filled, axis)
 
 
 def hide(

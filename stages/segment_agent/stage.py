@@ -3,14 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, assert_never
+from typing import assert_never
 
 import numpy as np
 
 from pipeline.core import devices
 from pipeline.core.errors import InputError
 from pipeline.core.progress import log, track
-from pipeline.core.videos import Video
+from pipeline.core.videos import Video, role_of_animal
 from pipeline.data.clips import Clip
 from stages.segment_agent import pictures, prompt, several, writing
 from stages.segment_agent.config import Config
@@ -48,7 +48,7 @@ def run(
 
     Raises InputError MSK-006 for what says nothing of several animals.
     """
-    if inputs.identities is not None and _role(config, video) == "session":
+    if inputs.identities is not None and role_of_animal(video, config.role) == "session":
         return _run_of_several(inputs, inputs.identities, config, out, videos)
     clip = Clip.open(inputs.frames)
     hint = None if inputs.prompt is None else prompt.parse(inputs.prompt, clip)
@@ -58,7 +58,7 @@ def run(
             if clip.odometry_from_camera is None:
                 log("no usable odometry: the motion comes from depth and flow, which drifts more")
             rng = np.random.default_rng(config.seed)
-            found = segment(clip, inputs.flow, _role(config, video), hint, config, rng)
+            found = segment(clip, inputs.flow, role_of_animal(video, config.role), hint, config, rng)
             masks = found.masks
             if found.path is not None:
                 residual_m = found.path.residual_m
@@ -98,9 +98,3 @@ def _run_of_several(
     assert found.path is not None, "sessions of several animals have depth"
     pictures.report_quality(out, clip, summary, found.path.residual_m, found.strangers)
     return summary
-
-
-def _role(config: Config, video: Video | None) -> Literal["turnaround", "session"]:
-    if video is None:
-        return config.role
-    return "turnaround" if video.role == "turnaround" else "session"

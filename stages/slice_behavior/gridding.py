@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.behavior.trajectories import RATE_HZ, Trajectory
-from pipeline.geometry import rigid
+from pipeline.geometry import rigid, subsampling
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def trajectory_from_motion(
     agent = rigid.smoothed(agent, smooth_s * rate_hz)
     bone = [rigid.interpolate(good, motion.agent_from_bone[trusted, b], grid) for b in range(bones)]
     camera = rigid.interpolate(good, motion.world_from_camera[trusted], grid)
-    valid = within_short_gaps(good, grid, max_gap_s, rate_hz)
+    valid = subsampling.within_short_gaps(good, grid, max_gap_s, 0.5 / rate_hz)
     return Trajectory(grid, agent, np.stack(bone, 1).astype(np.float32), camera, valid, companions)
 
 
@@ -76,23 +76,8 @@ def resampled(
     for number in range(companions.shape[1]):
         known = np.isfinite(companions[:, number]).all(-1)
         if known.any():
-            here = within_short_gaps(time[known], grid, max_gap_s, rate_hz)
+            here = subsampling.within_short_gaps(time[known], grid, max_gap_s, 0.5 / rate_hz)
             being = companions[known, number]
             for channel in range(being.shape[1]):
                 found[here, number, channel] = np.interp(grid[here], time[known], being[:, channel])
     return found
-
-
-def within_short_gaps(
-    good: Float[np.ndarray, "frame"],
-    grid: Float[np.ndarray, "sample"],
-    max_gap_s: float,
-    rate_hz: float = RATE_HZ,
-) -> Bool[np.ndarray, "sample"]:
-    """Return which grid times are on good times, or between such at most ``max_gap_s`` apart."""
-    near = 0.5 / rate_hz
-    after = np.searchsorted(good, grid, side="left").clip(0, len(good) - 1)
-    before = (np.searchsorted(good, grid, side="right") - 1).clip(0)
-    on_frame = np.minimum(np.abs(good[after] - grid), np.abs(good[before] - grid)) <= near
-    between = (good[before] <= grid) & (grid <= good[after]) & (good[after] - good[before] <= max_gap_s)
-    return on_frame | between

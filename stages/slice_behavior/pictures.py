@@ -9,6 +9,7 @@ from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData
 from pipeline.data import plots
 from pipeline.data.qa import Check, Picture, captioned
+from pipeline.geometry import subsampling
 
 MOVED_M = 0.15
 VISIT_M = 0.1
@@ -47,7 +48,7 @@ def checks(data: BehaviorData) -> list[Check]:
 
 def some(windows: Int[np.ndarray, "window"]) -> Int[np.ndarray, "chosen"]:
     """Return evenly chosen windows, all where they are few."""
-    return windows[np.linspace(0, len(windows) - 1, min(len(windows), MOST_WINDOWS)).astype(int)]
+    return windows[subsampling.evenly(len(windows), MOST_WINDOWS)]
 
 
 def visitation(

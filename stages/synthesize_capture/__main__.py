@@ -1,4 +1,4 @@
-"""Film the built-in world: a furnished room with a cat that minds people, as Record3D recordings.
+"""Film the built-in world: a furnished room with a cat that reacts to people, as Record3D recordings.
 
 Writes `recordings/` (walk-through, turnaround, sessions, a second phone for one session) and, apart
 from them, `truth/`, which only `evaluate` may read. No real animal is needed to run the whole flow.

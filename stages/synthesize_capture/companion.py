@@ -32,13 +32,13 @@ PLANNED_S = 0.4
 APART_M, PUSH_M_S = 0.62, 1.2
 """Centres of two bodies on the floor are no nearer, and how fast they get out of each other's way."""
 MINDED_M = 1.0
-"""The cat minds a dog that comes nearer."""
+"""The cat reacts to a dog that comes nearer."""
 FOCUS_PERIOD_S, BOTH_M = 9.0, 1.5
 """The phone goes from one animal to the other and back in this time; both are filmed when so near."""
 
 
 class Companion(Policy):
-    """A dog's mind: it stays on the floor and goes by where the other animal is."""
+    """A dog's decisions: it stays on the floor and goes by where the other animal is."""
 
     def __init__(self, floor: Floor, places: tuple[Place, ...], position: Ground, rng: np.random.Generator):
         low = tuple(place for place in places if place.position[1] < 0.1)
@@ -90,8 +90,8 @@ class Companion(Policy):
 def live(
     seconds: float, animals: list[Policy], people: Sequence[SeenWalker], others: Sequence[SeenWalker]
 ) -> None:
-    """Move the animals on by one step, given people and animals as they notice them now: of people, they mind
-    the nearest.
+    """Move the animals on by one step, given people and animals as they notice them now: of people, they
+    react to the nearest.
     """
     match animals:
         case [animal]:
@@ -115,7 +115,7 @@ def _nearest(animal: Policy, people: Sequence[SeenWalker]) -> SeenWalker:
 
 
 def _minded(cat: Policy, person: SeenWalker, dog: SeenWalker) -> SeenWalker:
-    """Return whom the cat minds: the dog when it is near and nearer than the person."""
+    """Return whom the cat reacts to: the dog when it is near and nearer than the person."""
     apart = [float(np.linalg.norm(each.position - cat.walker.position)) for each in (person, dog)]
     return dog if apart[1] < min(MINDED_M, apart[0]) else person
 

@@ -1,4 +1,4 @@
-"""What the animal decides: a goal-driven cat that minds the person with the phone.
+"""What the animal decides: a goal-driven cat that reacts to the person with the phone.
 
 It runs away when someone walks up to it, comes near when someone stands still or leaves, and
 otherwise visits its favourite places, sits, lies and looks. Someone far away changes nothing.
@@ -44,7 +44,7 @@ class Leap:
 
 
 class Policy:
-    """The animal's mind and its body's course over the floor."""
+    """The animal's decisions and its way over the floor."""
 
     def __init__(self, floor: Floor, places: tuple[Place, ...], position: Ground, rng: np.random.Generator):
         self.rng, self.places = rng, places
@@ -198,7 +198,7 @@ class Policy:
         self.walker.speed = 0.0
 
     def _faces(self, seen: SeenWalker) -> float | None:
-        """Return what it turns to at rest: out from a perch, towards a person that it minds, or nothing."""
+        """Return what it turns to at rest: out from a perch, towards a person that it notices, or nothing."""
         if self.perch is not None:
             return self.perch.yaw
         if self.reason == "own" or self.distance > NOTICE_M or self.posture[:2].max() > 0.3:

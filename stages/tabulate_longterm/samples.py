@@ -13,6 +13,7 @@ from pipeline.behavior.planning import Sampler, TorchNetworks, observe
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import FUTURE, RATE_HZ, TRAIN, BehaviorData
 from pipeline.core import progress
+from pipeline.geometry import subsampling
 from pipeline.longterm.journeys import LongTermWorld, refine_at_rate
 from pipeline.longterm.short_motions import BodyMotion
 from pipeline.metrics.intervals import bootstrapped, episodes, names_of
@@ -37,7 +38,7 @@ def figures(
     windows = np.flatnonzero(data.split != TRAIN)
     windows = windows if len(windows) else np.flatnonzero(data.split == TRAIN)
     count = min(config.samples, len(windows))
-    windows = windows[np.unique(np.linspace(0, len(windows) - 1, count).astype(int))]
+    windows = windows[subsampling.evenly(len(windows), count)]
     both = rows(source.world, data, windows, model, behavior_data, config, device)
     episode = episodes(data.start[windows], data.video[windows], FUTURE)
     found: dict[str, float | None] = {"longterm_samples/windows": float(len(windows))}

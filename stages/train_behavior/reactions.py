@@ -1,4 +1,4 @@
-"""Does the animal mind the observer? The same noise under observers that come close, are far, or absent.
+"""Does the animal react to the observer? The same noise under observers that come close, are far, or absent.
 
 The observer walks up to the animal from one side, from the other side, stands beyond the radius of
 perception, and is dropped; everything else, scene, past and noise, is the same.
@@ -15,7 +15,7 @@ from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.planning import Observation, Sampler, observe
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import PAST, RATE_HZ, TRAIN, UP, BehaviorData
-from pipeline.geometry import rigid
+from pipeline.geometry import rigid, subsampling
 
 SAMPLES = 16
 CLOSE_M, WALK_M_S = 0.8, 1.0
@@ -55,7 +55,7 @@ def moments(
 ) -> SampledMoments:
     """Choose training windows and encode what the animal perceives in them."""
     train = data.indices(TRAIN)
-    context, _ = data.windows(train[np.linspace(0, len(train) - 1, min(count, len(train))).astype(int)])
+    context, _ = data.windows(train[subsampling.evenly(len(train), count)])
     observation = observe(context, scenes, data.agent_from_bone_rest, architecture.ego)
     number = scenes.number(context.video, len(context))
     frame = world_from_ego(context.world_from_agent[:, -1], architecture.ego)

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip
+from pipeline.geometry import subsampling
 from stages.segment_agent.config import FoundationConfig
 from stages.segment_agent.painting import Mask
 from stages.segment_agent.prompt import Prompt
@@ -46,7 +47,7 @@ def segment(clip: Clip, hint: Prompt | None, options: FoundationConfig, device: 
 def _find(clip: Clip, detector: GroundingDino, options: FoundationConfig) -> tuple[int, Float[np.ndarray, 4]]:
     """Return the frame and box of the most certain detection."""
     best: tuple[float, int, np.ndarray] | None = None
-    for frame in np.unique(np.linspace(0, len(clip) - 1, LOOKED_AT).round().astype(int)).tolist():
+    for frame in subsampling.evenly(len(clip), LOOKED_AT, rounded=True).tolist():
         found = detector.find(clip.color(frame), options.description, options.threshold)
         if len(found.score) and (best is None or found.score[0] > best[0]):
             best = (float(found.score[0]), frame, found.boxes_px[0])

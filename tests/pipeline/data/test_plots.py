@@ -34,13 +34,6 @@ def test_depth_is_yellow_when_near_violet_when_far_and_black_when_unknown():
     assert not unknown.any()
 
 
-@pytest.mark.parametrize(
-    ("count", "most", "chosen"), [(10, 4, [0, 3, 6, 9]), (3, 8, [0, 1, 2]), (1, 5, [0]), (0, 5, [])]
-)
-def test_a_sample_is_even_and_never_more_than_there_is(count, most, chosen):
-    assert plots.sample(count, most).tolist() == chosen
-
-
 def test_a_running_mean_keeps_the_level_and_halves_noise():
     noise = np.random.default_rng(0).normal(5, 1, 1000)
     means = plots.running_mean(noise)
