@@ -36,32 +36,22 @@ def parse(path: Path, clip: Clip) -> Prompt:
         table = tomllib.loads(path.read_text())
         unknown = table.keys() - {"frame", "time_s", "box", "click"}
         if unknown or ("frame" in table) == ("time_s" in table) or ("box" in table) == ("click" in table):
-            raise ValueError(
-                f"either frame or time_s, either box or click, and nothing else: {', '.join(table)}"
-            )
+            given = ", ".join(table)
+            raise ValueError(f"either frame or time_s, either box or click, and nothing else: {given}")
         passed_s = clip.timestamp_s - clip.timestamp_s[0]
-        if "frame" in table:
-            frame = int(table["frame"])
-        else:
-            frame = int(np.abs(passed_s - float(table["time_s"])).argmin())
+        nearest = np.abs(passed_s - float(table.get("time_s", 0))).argmin()
+        frame = int(table.get("frame", nearest))
         if "time_s" in table and not -0.5 <= float(table["time_s"]) <= passed_s[-1] + 0.5:
             raise ValueError(f"time_s = {table['time_s']} of a recording of {passed_s[-1]:.1f} s")
         box = np.array(table["box"] if "box" in table else table["click"] * 2, float)
         x0, y0, x1, y1 = (box * np.tile(clip.color_size[::-1], 2) if box.max() <= 1 else box).tolist()
-        if not (
-            0 <= frame < len(clip)
-            and 0 <= x0 <= x1 <= clip.color_size[1]
-            and 0 <= y0 <= y1 <= clip.color_size[0]
-        ):
+        height, width = clip.color_size
+        if not (0 <= frame < len(clip) and 0 <= x0 <= x1 <= width and 0 <= y0 <= y1 <= height):
             raise ValueError(f"frame {frame}, box {box.tolist()} is not inside the recording")
     except (OSError, KeyError, ValueError, TypeError, OverflowError, RecursionError) as error:
-        raise InputError(
-            "MSK-001",
-            f"not a usable hint: {error}",
-            str(path),
-            "give `frame = 12` or `time_s = 1.2`, and `box = [x0, y0, x1, y1]` or `click = [x, y]` in pixels "
-            "or in shares of the picture",
-        ) from error
+        places = "`box = [x0, y0, x1, y1]` or `click = [x, y]` in pixels or in shares of the picture"
+        remedy = f"give `frame = 12` or `time_s = 1.2`, and {places}"
+        raise InputError("MSK-001", f"not a usable hint: {error}", str(path), remedy) from error
     return Prompt(frame, (x0, y0, x1, y1))
 
 
@@ -91,12 +81,9 @@ def position(
     low, high = np.maximum(np.floor(centre - half), 0).astype(int), np.ceil(centre + half).astype(int)
     depth = steady_depth(clip, prompt.frame)[low[1] : high[1] + 1, low[0] : high[0] + 1]
     if not (depth > 0).any():
-        raise InputError(
-            "MSK-002",
-            "the hint lies where depth is unknown",
-            f"frame {prompt.frame}",
-            "point at another part of the animal or another frame",
-        )
+        what = "the hint lies where depth is unknown"
+        remedy = "point at another part of the animal or another frame"
+        raise InputError("MSK-002", what, f"frame {prompt.frame}", remedy)
     z = float(np.quantile(depth[depth > 0], 0.3))
     point_camera = cameras.unproject(centre / scale, clip.intrinsics[prompt.frame]) * z
     return rigid.apply(world_from_camera[prompt.frame], point_camera[None])[0]

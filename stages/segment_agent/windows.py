@@ -101,9 +101,8 @@ def cut(
     at = np.floor(grid * [clip.depth_size[1] / size[1], clip.depth_size[0] / size[0]]).astype(int)
     z = unblurred(clip.depth(frame))[at[..., 1], at[..., 0]]
     trusted = steady_depth(clip, frame)[at[..., 1], at[..., 0]] > 0
-    points = rigid.apply(
-        world_from_camera, (cameras.unproject(grid, intrinsics) * z[..., None]).reshape(-1, 3)
-    ).reshape(*z.shape, 3)
+    points_camera = cameras.unproject(grid, intrinsics) * z[..., None]
+    points = rigid.apply(world_from_camera, points_camera.reshape(-1, 3)).reshape(*z.shape, 3)
     points[z == 0] = np.nan
     return Window(rows, columns, np.ascontiguousarray(color[rows, columns]), points, trusted)
 

@@ -35,12 +35,8 @@ def write(folder: Path, masks: Iterable[Mask], count: int, pictures: int = 12) -
         summary.area.append(float((mask.labels == 255).mean()))
         if frame in shown:
             summary.shown[frame] = mask.labels
-    npz.save(
-        folder / "masks.npz",
-        visible=np.array(summary.visible),
-        confidence=np.array(summary.confidence, np.float32),
-        area=np.array(summary.area, np.float32),
-    )
+    confidence, area = (np.array(each, np.float32) for each in (summary.confidence, summary.area))
+    npz.save(folder / "masks.npz", visible=np.array(summary.visible), confidence=confidence, area=area)
     return summary
 
 
@@ -48,9 +44,5 @@ def write_people(folder: Path, clip: Clip, found: Segmentation) -> None:
     """Write ``people.npz`` of a session with depth."""
     if found.walkers is not None and found.path is not None:
         feet_camera = found.walkers.feet_in_camera(found.path.world_from_camera)
-        PEOPLE.save(
-            folder / "people.npz",
-            timestamp_s=clip.timestamp_s,
-            feet_camera=feet_camera,
-            height_m=found.walkers.height_m,
-        )
+        time_s, height_m = clip.timestamp_s, found.walkers.height_m
+        PEOPLE.save(folder / "people.npz", timestamp_s=time_s, feet_camera=feet_camera, height_m=height_m)
