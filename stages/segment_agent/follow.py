@@ -5,45 +5,43 @@ much does. `propagation` carries this mask through the recording.
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from stages.segment_agent.config import LearningConfig
-from stages.segment_agent.footage import Footage
+from stages.segment_agent.footage import MOVING, STILL, Footage
 from stages.segment_agent.painting import Mask
 from stages.segment_agent.prompt import Prompt
-from stages.segment_agent.propagation import propagate
+from stages.segment_agent.propagation import CERTAIN, SURE, propagate
 
 HEIGHT_PX = 240
 """of the pictures that the mask is carried through: flow is no finer"""
-MOVING, STILL = 4.0, 2.5
-"""typical residuals from which on a point moves against the background, and up to which it does not"""
 ROUNDS, MODEL_NUMBERS = 8, 65
 """of GrabCut; its models are five Gaussians of a weight, a mean and a covariance each"""
 CLICK_REACH = 0.2
 """of the box around a click, as a share of the picture's height"""
-LEAST_MOVING = 0.15
-"""share of the hinted box that must move for motion to separate the animal from the rest of the box"""
+MOTION_GAPS, LEAST_MOVING = (4, 8), 0.15
+"""frames over which motion is measured in the hinted frame, and share of the box that must move for motion to
+separate the animal from the rest of the box"""
 
 
 def follow(
     footage: Footage, hint: Prompt, learning: LearningConfig, rng: np.random.Generator
 ) -> Iterator[Mask]:
     """Return one mask per frame at color resolution."""
-    hinted = cut_out(footage, hint, rng)
-    coarse = replace(footage, height_px=min(HEIGHT_PX, footage.height_px))
-    carried = propagate(coarse, hint.frame, _resized(hinted, coarse.size), learning, rng)
-    for frame, log_odds in enumerate(carried):
+    coarse = Footage(footage.clip, footage.flow, min(HEIGHT_PX, footage.height_px))
+    first = cut_out(footage, hint, rng)
+    first = cv2.resize(first, coarse.size[::-1], interpolation=cv2.INTER_AREA)
+    for log_odds in propagate(coarse, hint.frame, first, learning, rng):
         inside = cv2.resize(log_odds, footage.clip.color_size[::-1], interpolation=cv2.INTER_LINEAR) > 0
-        mask = _resized(hinted, footage.clip.color_size) if frame == hint.frame else inside
-        yield Mask(np.where(mask, 255, 0).astype(np.uint8), bool(mask.any()), 0.5)
+        yield Mask(np.where(inside, 255, 0).astype(np.uint8), bool(inside.any()), 0.5)
 
 
-def cut_out(footage: Footage, hint: Prompt, rng: np.random.Generator) -> Bool[np.ndarray, "height width"]:
-    """Cut the animal out of the hinted frame; a click stands for a box around it."""
+def cut_out(footage: Footage, hint: Prompt, rng: np.random.Generator) -> Float[np.ndarray, "height width"]:
+    """Cut the animal out of the hinted frame: log-odds, -`SURE` outside of the box; a click stands for a box
+    around it."""
     color = footage.color(hint.frame)
     height, width = color.shape[:2]
     x0, y0, x1, y1 = np.array(hint.box_px) * height / footage.clip.color_size[0]
@@ -51,13 +49,14 @@ def cut_out(footage: Footage, hint: Prompt, rng: np.random.Generator) -> Bool[np
         x0, y0, x1, y1 = np.array([x0, y0, x1, y1]) + CLICK_REACH * height * np.array([-1, -1, 1, 1])
     low = np.clip(np.floor([x0, y0]), 1, [width - 8, height - 8]).astype(int)
     high = np.minimum(np.ceil([x1, y1]).astype(int), [width - 1, height - 1])
-    marks = np.full((height, width), cv2.GC_BGD, np.uint8)
-    boxed = np.s_[low[1] : high[1], low[0] : high[0]]
-    moves = footage.residual(hint.frame)[boxed]
-    still = (moves < STILL) & ((moves > MOVING).mean() > LEAST_MOVING)
-    marks[boxed] = np.where(still, cv2.GC_PR_BGD, cv2.GC_PR_FGD)
+    boxed = np.zeros((height, width), bool)
+    boxed[low[1] : high[1], low[0] : high[0]] = True
+    residual = footage.residual(hint.frame, *MOTION_GAPS)
+    still = (residual < STILL) & ((residual[boxed] > MOVING).mean() > LEAST_MOVING)
+    marks = np.where(boxed, np.where(still, cv2.GC_PR_BGD, cv2.GC_PR_FGD), cv2.GC_BGD).astype(np.uint8)
     inside = grab(color, marks, rng)
-    return inside if inside.any() else marks != cv2.GC_BGD
+    inside = inside if inside.any() else boxed
+    return np.where(inside, SURE, np.where(boxed, -(CERTAIN + SURE) / 2, -SURE)).astype(np.float32)
 
 
 def grab(
@@ -70,9 +69,3 @@ def grab(
     models, by_mask = np.zeros((2, 1, MODEL_NUMBERS)), cv2.GC_INIT_WITH_MASK
     found = cv2.grabCut(color, marks.copy(), (0, 0, 0, 0), models[0], models[1], ROUNDS, by_mask)[0]
     return (found == cv2.GC_FGD) | (found == cv2.GC_PR_FGD)
-
-
-def _resized(
-    mask: Bool[np.ndarray, "height width"], size: tuple[int, int]
-) -> Bool[np.ndarray, "rows columns"]:
-    return cv2.resize(mask.astype(np.uint8) * 255, size[::-1], interpolation=cv2.INTER_LINEAR) > 127

@@ -1,6 +1,6 @@
 """Pictures, flow and motion against the background of a recording without depth, at working size."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -8,13 +8,18 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipeline.data.clips import Clip
-from pipeline.data.flow import open_confidence, open_flow
+from pipeline.data.flow import GAPS, open_confidence, open_flow
 from stages.segment_agent.windows import working_picture, working_size
 
-MOTION_GAPS = (4, 8)
-"""frames over which motion against the background is measured"""
-SPARSE_PX, INLIER_PX = 8, 2.0
-"""distance of the pixels that the background's homography is fitted to, and how far they may miss it"""
+SPARSE_PX, INLIER_PX, AGREED = 8, 2.0, 0.3
+"""distance of the pixels that the background's homography is fitted to, how far they may miss it, and the
+least confidence of their flow"""
+MOVING, STILL = 4.0, 2.5
+"""typical residuals from which on a point moves against the background, and up to which it does not"""
+REACH_PX, OUTLINE_PX = 16, 3
+"""how far from where it is presumed an animal is looked for, and flow blurs its outline; working pixels"""
+LEAST_MOVING = 0.3
+"""share of a region that must move for motion to separate the animal from the rest"""
 LEAST_TYPICAL_PX = 0.5
 """typical residual that counts as noise of the flow"""
 
@@ -26,6 +31,7 @@ class Footage:
     clip: Clip
     flow: Path
     height_px: int
+    _residuals: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -50,24 +56,48 @@ class Footage:
         table = open_confidence(self.flow, abs(other - frame), backward=other < frame)
         return self._resized(table[min(frame, other)]).astype(np.float32) / 255
 
-    def residual(self, frame: int) -> Float[np.ndarray, "height width"]:
-        """Return how far a point moves against the background, in typical residuals; mean over
-        `MOTION_GAPS` in both directions of time.
+    def residual(self, frame: int, *gaps: int) -> Float[np.ndarray, "height width"]:
+        """Return how far a point moves against the background over so many frames, in typical residuals; mean
+        over both directions of time.
 
         The background moves as most of the picture does, by a homography.
         """
         pixel, parts = pixels(self.size), []
-        for other in (frame + way * gap for gap in MOTION_GAPS for way in (-1, 1)):
+        for other in (frame + way * gap for gap in gaps for way in (-1, 1)):
             moved = self.to(frame, other)
             if moved is None:
                 continue
-            sparse, apart = (part[::SPARSE_PX, ::SPARSE_PX].reshape(-1, 2) for part in (pixel, moved))
-            matrix, _ = cv2.findHomography(sparse, sparse + apart, cv2.RHO, INLIER_PX)
+            agreed = self.confidence(frame, other)[::SPARSE_PX, ::SPARSE_PX] > AGREED
+            sparse, apart = (part[::SPARSE_PX, ::SPARSE_PX][agreed] for part in (pixel, moved))
+            few = len(sparse) < 4
+            matrix = None if few else cv2.findHomography(sparse, sparse + apart, cv2.RHO, INLIER_PX)[0]
             if matrix is not None:
                 expected = cv2.perspectiveTransform(pixel.reshape(1, -1, 2), matrix).reshape(pixel.shape)
                 error = np.linalg.norm(expected - pixel - moved, axis=-1)
                 parts.append(error / max(float(np.median(error)), LEAST_TYPICAL_PX))
         return np.mean(parts, axis=0) if parts else np.zeros(self.size, np.float32)
+
+    def moving(
+        self, frame: int, inside: Bool[np.ndarray, "height width"]
+    ) -> Float[np.ndarray, "height width"]:
+        """Return 1 near ``inside`` where a point moves against the background about as the mover in it does,
+        -1 where it does not; 0 between, and everywhere if little of it moves or much of the rest, as water.
+
+        Flow blurs outlines, the more, the longer the gap: the shortest counts over which enough moves.
+        """
+        far = ~grown(inside, REACH_PX)
+        for gap in GAPS:
+            if (frame, gap) not in self._residuals:
+                small = np.minimum(self.residual(frame, gap), np.finfo(np.float16).max)
+                self._residuals[frame, gap] = small.astype(np.float16)
+            residual = self._residuals[frame, gap]
+            moves = residual[inside & (residual > MOVING)]
+            if len(moves) > LEAST_MOVING * inside.sum():
+                level = float(np.median(moves))
+                moving = ~grown(residual < max(MOVING, level / 2), OUTLINE_PX)
+                alone = moving[far].sum() < LEAST_MOVING / 2 * far.sum()
+                return (moving.astype(np.float32) - (residual < max(STILL, level / 4))) * (alone & ~far)
+        return np.zeros(self.size, np.float32)
 
     def _resized(self, image: np.ndarray) -> np.ndarray:
         return cv2.resize(image, self.size[::-1], interpolation=cv2.INTER_LINEAR)

@@ -1,10 +1,11 @@
 """Carry the mask of one frame through a recording without depth.
 
 The log-odds of all pixels of all frames are a mean field (Krahenbuhl and Koltun 2011), updated frame by
-frame, forward and back. The unary is what the network of `appearance` makes of the colors. Messages come from
-the frames 1, 2, 4 and 8 before and after along the flow, as far as its two directions agree, and from
-neighbors in the picture up to its edges (domain transform, Gastal and Oliveira 2011). The network learns from
-the one mask, then once more from all frames.
+frame, forward and back. The unary is what the network of `appearance` makes of the colors, and whether a
+point moves against the background. Messages come from the frames 1, 2, 4 and 8 before and after along the
+flow, as far as its two directions agree, and from neighbors in the picture up to its edges (domain transform,
+Gastal and Oliveira 2011). The network learns from the one mask, then from all frames where motion does not
+contradict. It corrects the first mask, too, within the hinted box.
 """
 
 from dataclasses import replace
@@ -17,24 +18,23 @@ from pipeline.data.flow import GAPS
 from pipeline.geometry import subsampling
 from stages.segment_agent.appearance import Example, learn
 from stages.segment_agent.config import LearningConfig
-from stages.segment_agent.footage import Footage, grown, pixels
+from stages.segment_agent.footage import REACH_PX, Footage, grown, pixels
 
 SURE, LEAST = 4.0, 0.5
 """largest and smallest log-odds of a pixel; the largest of the network's judgement too"""
-MESSAGE, SMOOTHING = 0.6, 4.0
-"""weights of messages in time (log-odds) and in the picture (-1..1)"""
+MESSAGE, MOTION, SMOOTHING = 0.6, 1.0, 4.0
+"""weights of messages in time (log-odds), of motion (-1..1), and of messages in the picture (-1..1)"""
 DOUBT = 0.15
 """confidence of flow that is worth half a message"""
 SPATIAL_PX, EDGE = 10.0, 25.0
 """reach of messages in the picture, working pixels as all here, and the change of color (of 255) that stops
 them"""
-REACH_PX, CONNECTED = 16, 0.1
-"""how far from the carried mask the animal is looked for; share of what its main part holds of that mask that
-another part must hold to stay"""
+CONNECTED = 0.1
+"""share of what its main part holds of the carried mask that another part must hold to stay"""
 CERTAIN, HINTED_SHARE = 2.0, 0.17
 """log-odds from which on a pixel is learned from; share of the hinted frame among the examples"""
-CROP_PX, STEPS = 112, (80, 160)
-"""side of the crops that are learned from; training steps on the hinted frame, and on all"""
+CROP_PX, STEPS = 112, (80, 120, 120)
+"""side of the crops that are learned from; training steps on the hinted frame, on all, and again"""
 
 LogOdds = Float[np.ndarray, "height width"]
 Labels = list[LogOdds | None]
@@ -42,55 +42,53 @@ Labels = list[LogOdds | None]
 
 
 def propagate(
-    footage: Footage,
-    hinted: int,
-    mask: Bool[np.ndarray, "height width"],
-    learning: LearningConfig,
-    rng: np.random.Generator,
+    footage: Footage, hinted: int, first: LogOdds, learning: LearningConfig, rng: np.random.Generator
 ) -> list[LogOdds]:
-    """Return log-odds of the animal in all frames from its mask in one."""
+    """Return log-odds of the animal in all frames from ``first`` in one, -`SURE` where it cannot be."""
     frames = range(len(footage.clip))
     found: Labels = [None for _ in frames]
-    found[hinted] = np.where(mask, SURE, -SURE).astype(np.float16)
+    found[hinted], possible = first, first > LEAST - SURE
     forward = [*frames[hinted + 1 :], *frames[:hinted][::-1]]
-    for steps, order in zip(STEPS, (forward, forward[::-1] + forward), strict=True):
+    for turn, steps in enumerate(STEPS):
         shown, options = examples(footage, found, hinted, learning.examples), replace(learning, steps=steps)
         network = learn(shown, replace(options, crop_px=CROP_PX), rng, least_px=1, scaled=0.0)
         assert network is not None, "the hinted frame shows the animal"
         judged = [network.log_odds(footage.color(frame)).astype(np.float16) for frame in frames]
-        for frame in order:
+        judged[hinted][~possible] = -np.inf
+        for frame in [*(forward[::-1] if turn else []), *forward, hinted]:
             found[frame] = updated(footage, frame, judged[frame], found)
     return [each.astype(np.float32) for each in found if each is not None]
 
 
 def examples(footage: Footage, found: Labels, hinted: int, count: int) -> list[Example]:
-    """Label so many frames, evenly chosen, as far as they are sure; the hinted one is repeated."""
+    """Label so many frames, evenly chosen, as far as they are sure and motion does not contradict; the hinted
+    one is repeated."""
     chosen = subsampling.evenly(len(found), count, rounded=True).tolist()
     shown = []
     for frame in (hinted, *(each for each in chosen if each != hinted)):
         log_odds = found[frame]
         if log_odds is not None:
-            labels = np.where(np.abs(log_odds) < CERTAIN, 128, np.where(log_odds > 0, 255, 0))
+            sure = (np.abs(log_odds) >= CERTAIN) & (log_odds * footage.moving(frame, log_odds > 0) >= 0)
+            labels = np.where(sure, np.where(log_odds > 0, 255, 0), 128)
             shown.append(Example(footage.color(frame), labels.astype(np.uint8)))
     return shown[:1] * max(1, round(HINTED_SHARE * len(chosen))) + shown[1:]
 
 
 def updated(footage: Footage, frame: int, judged: LogOdds, found: Labels) -> LogOdds:
-    """Update one frame from what the network makes of it and from messages; only what is connected with the
-    carried mask stays."""
+    """Update one frame from what the network makes of it, motion and messages; only what is connected with
+    the carried mask stays."""
     carried = message(footage, frame, found)
-    log_odds = np.clip(judged, -SURE, SURE).astype(np.float32) + MESSAGE * carried
     seen = bool((carried > 0).any())
-    near = grown(carried > 0, REACH_PX) | (not seen)
-    log_odds[~near] = -SURE
+    near = (grown(carried > 0, REACH_PX) | (not seen)) & (judged != -np.inf)
+    log_odds = np.clip(judged, -SURE, SURE).astype(np.float32) + MESSAGE * carried
+    log_odds = np.where(near, log_odds + MOTION * footage.moving(frame, carried > 0), -SURE)
     around = cv2.ximgproc.dtFilter(
         footage.color(frame), np.tanh(log_odds / 2), SPATIAL_PX, EDGE, mode=cv2.ximgproc.DTF_RF
     )
     log_odds = np.where(near, log_odds + SMOOTHING * around, -SURE)
     inside = connected(log_odds > 0, carried > 0 if seen else log_odds > 0)
-    return np.where(inside, np.clip(log_odds, LEAST, SURE), np.clip(log_odds, -SURE, -LEAST)).astype(
-        np.float16
-    )
+    low, high = np.where(inside, LEAST, -SURE), np.where(inside, SURE, -LEAST)
+    return np.clip(log_odds, low, high).astype(np.float16)
 
 
 def message(footage: Footage, frame: int, found: Labels) -> LogOdds:
@@ -102,14 +100,10 @@ def message(footage: Footage, frame: int, found: Labels) -> LogOdds:
         moved = None if labels is None else footage.to(frame, other)
         if labels is None or moved is None:
             continue
-        confidence, at = footage.confidence(frame, other), pixels(size) + moved
-        total += confidence * cv2.remap(
-            labels.astype(np.float32),
-            at[..., 0],
-            at[..., 1],
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
+        confidence, labels = footage.confidence(frame, other), labels.astype(np.float32)
+        x, y = np.moveaxis(pixels(size) + moved, -1, 0)
+        brought = cv2.remap(labels, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        total += confidence * brought
         weight += confidence
     return total / weight
 

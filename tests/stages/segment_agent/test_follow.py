@@ -9,10 +9,10 @@ from pipeline.data import images, npz
 from pipeline.data.clips import Clip
 from pipeline.data.flow import GAPS
 from stages.segment_agent.config import LearningConfig
-from stages.segment_agent.follow import cut_out, follow
-from stages.segment_agent.footage import MOTION_GAPS, Footage
+from stages.segment_agent.follow import MOTION_GAPS, cut_out, follow
+from stages.segment_agent.footage import Footage
 from stages.segment_agent.prompt import Prompt
-from stages.segment_agent.propagation import SURE, Labels, connected, message
+from stages.segment_agent.propagation import SURE, Labels, connected, examples, message
 
 SIZE = (120, 160)
 CELLS = (30, 40)
@@ -59,7 +59,7 @@ def test_motion_tells_the_animal_from_what_else_is_in_its_box(tmp_path):
     frames = MOTION_GAPS[0] + 1
     step = 1.5 * animal[..., None] * np.array([1, 0])
     footage = _footage(tmp_path, frames * [noisy], frames * [step])
-    found = cut_out(footage, Prompt(0, (40, 30, 120, 90)), rng)
+    found = cut_out(footage, Prompt(0, (40, 30, 120, 90)), rng) > 0
     assert (found & animal).sum() > 0.95 * (found | animal).sum()
 
 
@@ -98,6 +98,17 @@ def test_labels_come_along_the_flow(walk):
     there = message(footage, 8, found)
     assert (there > 0)[masks[8]].mean() > 0.9 and (there < 0)[~masks[0] & ~masks[8]].mean() > 0.9
     assert not message(footage, 3, found).any(), "no flow is stored over three frames"
+
+
+def test_motion_speaks_for_what_moves_and_against_what_does_not(walk):
+    footage, masks = walk
+    inside = masks[4].copy()
+    inside[84:94, 40:80] = True
+    moving = footage.moving(4, inside)
+    assert (moving[masks[4]] > 0).mean() > 0.6 and (moving[masks[4]] < 0).mean() < 0.1
+    assert (moving[84:94, 40:80] < 0).mean() > 0.9
+    labels = examples(footage, [None, None, None, None, np.where(inside, SURE, -SURE)], 4, 5)[0].labels
+    assert (labels[84:94, 40:80] == 128).mean() > 0.9 and (labels[masks[4]] == 255).mean() > 0.6
 
 
 def test_parts_apart_from_the_animal_are_left_out():
