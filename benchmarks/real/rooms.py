@@ -101,7 +101,7 @@ def registered(
     made: SceneTemplate, walk: Clip, localizer: Localizer, session: Clip, masks: Masks
 ) -> Float[np.ndarray, "frame 4 4"]:
     """Register the second half; NaN where it is rejected."""
-    cameras = np.where(made.registered[:, None, None], made.world_from_camera, np.nan)
+    cameras = np.where((made.registered & made.keyframe)[:, None, None], made.world_from_camera, np.nan)
     maps = registration.Maps(made.mesh, made.mesh, localizer, localizer, walk=Walk(walk, cameras))
     rng = np.random.default_rng(EVERY_FRAME.seed)
     result = registration.register(session, masks, maps, EVERY_FRAME, rng)

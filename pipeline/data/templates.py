@@ -14,6 +14,7 @@ SCENE_CAMERAS = FileSchema.of(
     "world_from_camera [frame 4 4] f8",
     "intrinsics [frame 3 3] f8",
     "registered [frame] bool",
+    "keyframe [frame] bool",
 )
 AGENT_CAMERAS = FileSchema.of(
     "agent_template/cameras.npz",
@@ -41,6 +42,8 @@ class SceneCameras:
     intrinsics: Float[np.ndarray, "frame 3 3"]
     """colour pixels"""
     registered: Bool[np.ndarray, "frame"]
+    keyframe: Bool[np.ndarray, "frame"]
+    """optimized together; the others were aligned to the surface from these"""
 
     @classmethod
     def open(cls, scene_template: Path) -> "SceneCameras":
@@ -55,6 +58,11 @@ class SceneCameras:
     def world_from_registered(self) -> Float[np.ndarray, "frame 4 4"]:
         """`world_from_camera`, NaN where the frame was not registered."""
         return np.where(self.registered[:, None, None], self.world_from_camera, np.nan)
+
+    @property
+    def world_from_keyframe(self) -> Float[np.ndarray, "frame 4 4"]:
+        """`world_from_camera`, NaN where the frame was not registered or is no keyframe."""
+        return np.where(self.keyframe[:, None, None], self.world_from_registered, np.nan)
 
 
 @dataclass(frozen=True)

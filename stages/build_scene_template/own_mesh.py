@@ -60,7 +60,7 @@ def build(
         registered=np.nan_to_num(gap, nan=np.inf) < REGISTERED_WITHIN_M,
         gap_m=gap,
         start=anchor.InitialTrajectory(poses, "odometry", "", np.arange(len(clip)), None, None, {}),
-        keyframes=len(clip),
+        keyframe=np.ones(len(clip), bool),
         reprojection_px=None,
         gravity=gravity,
         floor_m=floor_height(own),

@@ -74,7 +74,7 @@ def checks(template: SceneTemplate) -> list[Check]:
     ]
     if template.own_mesh:
         return surface
-    registered = len(start.registered) / template.keyframes
+    registered = len(start.registered) / int(template.keyframe.sum())
     odometry = None if start.odometry_scale is None else abs(start.odometry_scale - 1)
     return [
         Check("keyframes registered by COLMAP", registered, "share", 0.8, 0.0, "higher"),
@@ -107,7 +107,7 @@ def world(template: SceneTemplate) -> dict:
         "colmap_refuted": start.reason or None,
         "bounds": [low.round(4).tolist(), high.round(4).tolist()],
         "floor": round(template.floor_m, 4),
-        "keyframes": template.keyframes,
+        "keyframes": int(template.keyframe.sum()),
         "keyframes_registered": len(start.registered),
         "reprojection_px": template.reprojection_px,
         "scale_spread": start.scale_deviation,

@@ -43,7 +43,8 @@ def run(inputs: Inputs, config: Config, out: Path) -> template.SceneTemplate:
     normals = made.mesh.vertex_normals()
     ply.write_ply(out / "mesh.ply", made.mesh, nx=normals[:, 0], ny=normals[:, 1], nz=normals[:, 2])
     write_vertex_features(out, made.features.astype(np.float16))
-    SceneCameras(clip.timestamp_s, made.world_from_camera, clip.intrinsics, made.registered).write(out)
+    cameras = made.world_from_camera, clip.intrinsics, made.registered, made.keyframe
+    SceneCameras(clip.timestamp_s, *cameras).write(out)
     (out / "world.json").write_text(json.dumps(pictures.world(made), indent=1) + "\n")
     template.write_model(sparse, made.world_from_camera, out / "colmap")
     qa.write(

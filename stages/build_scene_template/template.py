@@ -35,7 +35,8 @@ class SceneTemplate:
     gap_m: Float[np.ndarray, "frame"]
     """Median distance of each frame's depth from the surface."""
     start: anchor.InitialTrajectory
-    keyframes: int
+    keyframe: Bool[np.ndarray, "frame"]
+    """Frames whose cameras were optimized together."""
     reprojection_px: float | None
     gravity: str
     floor_m: float
@@ -81,7 +82,7 @@ def build(
         registered=np.nan_to_num(gap, nan=np.inf) < REGISTERED_WITHIN_M,
         gap_m=gap,
         start=start,
-        keyframes=len(frames),
+        keyframe=np.isin(np.arange(len(clip)), frames),
         reprojection_px=None if sparse is None else sparse.reprojection_px,
         gravity=gravity,
         floor_m=floor_height(mesh),

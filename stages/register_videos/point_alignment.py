@@ -33,11 +33,11 @@ depth."""
 
 @dataclass(frozen=True)
 class Walk:
-    """The walk-through and its cameras."""
+    """The walk-through and the cameras of its keyframes, which are more exact than those between them."""
 
     clip: Clip
     world_from_camera: Float[np.ndarray, "frame 4 4"]
-    """NaN where a frame is not registered."""
+    """NaN where a frame is not registered or no keyframe."""
 
 
 class WalkTerm:

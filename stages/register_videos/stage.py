@@ -49,7 +49,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") ->
         scene_localizer=localizers.load(inputs.scene_localizer, device),
         agent_localizer=localizers.load(inputs.agent_localizer, device),
         scene_features=scene_features,
-        walk=Walk(Clip.open(next(iter(inputs.walk.values()))), walk.world_from_registered),
+        walk=Walk(Clip.open(next(iter(inputs.walk.values()))), walk.world_from_keyframe),
     )
     rng = np.random.default_rng(config.seed)
     result = registration.register(clip, masks, maps, config, rng, features)

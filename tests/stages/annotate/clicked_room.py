@@ -67,9 +67,9 @@ def build(folder: Path) -> Room:
         folder / "scene_template", stage="build_scene_template", config={}, inputs={}
     ) as out:
         registered = np.ones(len(walkthrough), bool)
-        SceneCameras(walkthrough.timestamp_s, walkthrough.truth, walkthrough.intrinsics, registered).write(
-            out
-        )
+        SceneCameras(
+            walkthrough.timestamp_s, walkthrough.truth, walkthrough.intrinsics, registered, registered
+        ).write(out)
     rest = {"sha256": None, "synchronized_with": None, "offset_s": 0.0}
     videos = [
         {"id": "v000", "file": WALKTHROUGH, "role": "walkthrough", "split": "none", **rest},

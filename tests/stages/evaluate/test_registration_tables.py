@@ -45,7 +45,7 @@ def capture(tmp_path):
         )
         if video.role == "walkthrough":
             lens = np.repeat(np.eye(3)[None], count, axis=0)
-            SceneCameras(np.arange(count) * 0.5, cameras, lens, np.ones(count, bool)).write(
+            SceneCameras(np.arange(count) * 0.5, cameras, lens, *np.ones((2, count), bool)).write(
                 tmp_path / "template"
             )
             continue
