@@ -20,6 +20,7 @@ from benchmarks.real.table import Row
 from pipeline.core.progress import log
 from pipeline.data import images
 from pipeline.data.flow import GAPS, open_confidence, open_flow
+from stages.estimate_flow.estimation import TOLERANCE_PX
 
 Points = Float[np.ndarray, "point 2"]
 """x, y, pixels"""
@@ -37,8 +38,6 @@ FARNEBACK = (0.5, 5, 15, 3, 7, 1.5, 0)
 """Ratio of the pyramid, its levels, window, iterations, neighbourhood and smoothing of the polynomial, flags."""
 LEAST_CONFIDENCE = 1 / 255
 """what a stored 0 counts, that paths through it still differ"""
-TOLERANCE_PX = 1.5
-"""forward-backward error at which the confidence of DIS is 1/e, as for ours"""
 
 
 def chained(step: Step) -> Carry:
@@ -76,8 +75,13 @@ def most_certain(step: CertainStep) -> Carry:
 
 def sampled(image: np.ndarray, points: Points) -> np.ndarray:
     """Read an image between its pixels."""
-    x, y = points.T.astype(np.float32)[:, None]
-    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
+    return sampled_densely(image, points[None])[0]
+
+
+def sampled_densely(image: np.ndarray, at: Dense) -> np.ndarray:
+    """Read an image between its pixels, at a picture of places."""
+    x, y = np.moveaxis(at.astype(np.float32), -1, 0)
+    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def errors(carry: Carry, sequence: DavisSequence) -> Float[np.ndarray, "joint"]:
@@ -111,10 +115,7 @@ def both_ways(step: Step) -> CertainStep:
     def judged(first: int, last: int) -> tuple[Dense, Float[np.ndarray, "height width"]]:
         there, back = step(first, last), step(last, first)
         x, y = np.meshgrid(*(np.arange(side) for side in there.shape[1::-1]))
-        at = (there + np.stack([x, y], axis=-1)).astype(np.float32)
-        missed = there + cv2.remap(
-            back, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
+        missed = there + sampled_densely(back, there + np.stack([x, y], axis=-1))
         return there, np.exp(-np.linalg.norm(missed, axis=-1) / TOLERANCE_PX).astype(np.float32)
 
     return judged
