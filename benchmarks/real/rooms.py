@@ -21,6 +21,7 @@ from pipeline.backends.descriptors import Describer
 from pipeline.core.progress import log
 from pipeline.data import images, npz
 from pipeline.data.clips import Clip, Masks, read_source_index
+from pipeline.data.templates import SceneCameras
 from pipeline.localization.localizer import Localizer
 from pipeline.metrics.pose_errors import PoseErrors, pose_errors
 from stages.build_scene_template import template
@@ -101,7 +102,8 @@ def registered(
     made: SceneTemplate, walk: Clip, localizer: Localizer, session: Clip, masks: Masks
 ) -> Float[np.ndarray, "frame 4 4"]:
     """Register the second half; NaN where it is rejected."""
-    cameras = np.where((made.registered & made.keyframe)[:, None, None], made.world_from_camera, np.nan)
+    found = made.world_from_camera, walk.intrinsics, made.registered, made.keyframe
+    cameras = SceneCameras(walk.timestamp_s, *found).world_from_keyframe
     maps = registration.Maps(made.mesh, made.mesh, localizer, localizer, walk=Walk(walk, cameras))
     rng = np.random.default_rng(EVERY_FRAME.seed)
     result = registration.register(session, masks, maps, EVERY_FRAME, rng)
