@@ -50,12 +50,14 @@ def test_another_table_is_refused(tmp_path, arrays):
 
 
 def test_frames_without_registration_have_no_pose(tmp_path):
-    registered = np.array([True, False, True])
-    SceneCameras(np.arange(3.0), poses(3), np.repeat(np.eye(3)[None], 3, axis=0), registered).write(tmp_path)
+    registered, keyframe = np.array([True, False, True]), np.array([False, True, True])
+    intrinsics = np.repeat(np.eye(3)[None], 3, axis=0)
+    SceneCameras(np.arange(3.0), poses(3), intrinsics, registered, keyframe).write(tmp_path)
     cameras = SceneCameras.open(tmp_path)
     assert (np.isfinite(cameras.world_from_registered).all((1, 2)) == registered).all()
+    assert (np.isfinite(cameras.world_from_keyframe).all((1, 2)) == (registered & keyframe)).all()
     assert np.isfinite(cameras.world_from_camera).all()
-    AgentCameras(np.arange(3.0), poses(3), np.repeat(np.eye(3)[None], 3, axis=0), registered).write(tmp_path)
+    AgentCameras(np.arange(3.0), poses(3), intrinsics, registered).write(tmp_path)
     assert (np.isnan(AgentCameras.open(tmp_path).agent_from_registered).all((1, 2)) == ~registered).all()
     assert RegisteredPoses.open(tmp_path) is None, "a recording that was refused has no poses"
 

@@ -66,7 +66,8 @@ def write_map(folder: Path, room: Mesh, path: np.ndarray) -> None:
     folder.mkdir(parents=True)
     ply.write_ply(folder / "mesh.ply", room)
     intrinsics = np.repeat(INTRINSICS[None], len(path), axis=0)
-    SceneCameras(np.arange(len(path)) * 0.1, path, intrinsics, np.ones(len(path), bool)).write(folder)
+    every = np.ones(len(path), bool)
+    SceneCameras(np.arange(len(path)) * 0.1, path, intrinsics, every, every).write(folder)
 
 
 def write_pictures(folder: Path, room: Mesh, path: np.ndarray, agent: np.ndarray):
