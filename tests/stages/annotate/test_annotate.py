@@ -89,8 +89,8 @@ def test_seven_clicks_in_a_browser_measure_registration(room, tmp_path):
             )
             click(page, "reference", pair.reference.pixel)
             page.wait_for_function(f"document.querySelectorAll('#pairs li').length == {number}")
-        page.wait_for_function("document.getElementById('told').textContent.includes('mm left')")
-        assert "7 of 7" in page.inner_text("#told")
+        page.wait_for_function("document.getElementById('status').textContent.includes('mm left')")
+        assert "7 of 7" in page.inner_text("#status")
         browser.close()
     assert wrong == []
     kept = clicks.read(path)

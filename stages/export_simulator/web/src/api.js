@@ -92,8 +92,8 @@ export function api(simulator) {
           cells: piece.cells.length,
           by: mover.by.get(piece) ?? [0, 0],
         })),
-        occupancy: Array.from(arranged(own, own.told?.moves ?? []).occupancy),
-        allowed: Array.from(own.told?.allowed ?? own.allowed),
+        occupancy: Array.from(arranged(own, own.arrangement?.moves ?? []).occupancy),
+        allowed: Array.from(own.arrangement?.allowed ?? own.allowed),
         triangles: room.mesh.geometry.index.count / 3,
         held: mover.held && { by: mover.held.by },
       };

@@ -26,7 +26,7 @@ export function aroundPerson(path, start, person, clearance, clear = (point) => 
     const share = gap > step ? step / gap : 1;
     let next = [here[0] + share * (target[0] - here[0]), target[1], here[2] + share * (target[2] - here[2])];
     if (crosses(here, next, person, reach)) {
-      next = clear(slid(here, target, step, person, reach));
+      next = clear(alongCircle(here, target, step, person, reach));
       if (crosses(here, next, person, reach)) next = [here[0], target[1], here[2]];
     }
     here = next;
@@ -43,7 +43,7 @@ function crosses(from, to, person, reach) {
 }
 
 // The next point along the circle around the person, on the side of the target, a step further.
-function slid(here, target, step, person, reach) {
+function alongCircle(here, target, step, person, reach) {
   const angle = Math.atan2(here[2] - person[1], here[0] - person[0]);
   const goalAngle = Math.atan2(target[2] - person[1], target[0] - person[0]);
   const turn = Math.atan2(Math.sin(goalAngle - angle), Math.cos(goalAngle - angle));

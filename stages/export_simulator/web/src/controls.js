@@ -74,7 +74,7 @@ export class Controls {
     } else if (key === 'r') this.on.reset();
     else if (key === 'h' || key === '?') this.on.how();
     else if (key === 'c') this.on.call();
-    else if (key === 'l') this.on.tell();
+    else if (key === 'l') this.on.announce();
     else if (key === 'n') this.on.next();
     else if (key in TOOLS) this.on.hold(TOOLS[key]);
     else if (key === 'z') this.on.undo();

@@ -152,7 +152,7 @@ class Simulator {
       hold: (tool) => this.hold(tool),
       next: () => this.selectNext(),
       how: panel.howTo,
-      tell: () => panel.say(this.whereabouts()),
+      announce: () => panel.say(this.whereabouts()),
       ...this.mover.hands,
       stroke: (points) => this.selected.overlays.ask(points),
       drawn: (points) => this.follow(points),

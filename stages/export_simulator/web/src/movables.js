@@ -103,14 +103,17 @@ export class Movables {
     }
     for (const { piece } of moves) {
       const places = this.furniture.around(piece).map((column) => grid.columnCenter(column));
-      const torn = places.filter(([x, z]) =>
+      const uncovered = places.filter(([x, z]) =>
         PROBES.some(([dx, dz]) => !this.seesFloor(x + dx * grid.voxel, z + dz * grid.voxel)),
       );
-      if (!torn.length) continue;
-      const holes = torn.filter(([x, z]) => !this.seesFloor(x, z));
+      if (!uncovered.length) continue;
+      const holes = uncovered.filter(([x, z]) => !this.seesFloor(x, z));
       const square = new THREE.PlaneGeometry(grid.voxel, grid.voxel).rotateX(-Math.PI / 2);
-      const material = new THREE.MeshBasicMaterial({ color: this.floorColor(torn) });
-      this.patch.add(sheet(square, material, torn, floor - BELOW_M), filledFloor(holes, grid.voxel, floor));
+      const material = new THREE.MeshBasicMaterial({ color: this.floorColor(uncovered) });
+      this.patch.add(
+        sheet(square, material, uncovered, floor - BELOW_M),
+        filledFloor(holes, grid.voxel, floor),
+      );
     }
   }
 

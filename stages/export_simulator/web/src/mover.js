@@ -225,17 +225,18 @@ export class Mover {
     const standing = Math.floor((resident.contract.agent.standing_m - grid.origin[1]) / grid.voxel);
     const band = [level, Math.max(level, standing) + 1];
     const { volume } = resident.contract;
-    own.told = { animal: resident.index, moves: same, allowed, band };
+    own.arrangement = { animal: resident.index, moves: same, allowed, band };
     resident.rearranged(
       new Support(volume, allowed),
       same.length ? new Detour(volume, allowed, same, band) : null,
     );
-    this.home.planner?.furnish(own.told);
+    this.home.planner?.furnish(own.arrangement);
   }
 
   // For a planner that was not there yet.
   inform() {
-    for (const { told } of this.homes) if (told?.moves.length) this.home.planner.furnish(told);
+    for (const { arrangement } of this.homes)
+      if (arrangement?.moves.length) this.home.planner.furnish(arrangement);
   }
 
   // Whether moved furniture stands where a person would.

@@ -36,7 +36,7 @@ export class Sampler {
     this.clearance = clearanceOf(this.contract.agent_from_bone_rest);
   }
 
-  // The code with everything that is kept, and the one without the observer, in which companions stay.
+  // The code with every condition, and the one without the observer, in which companions stay.
   async codes(observation, keep, interactivity) {
     const rows = this.contract.past_frames;
     const count = observation.others.length / (10 * rows);
@@ -146,7 +146,7 @@ export class Sampler {
     );
   }
 
-  // Scaled strides, led to where the animal may be.
+  // Scaled strides, moved to where the animal may be.
   pathsCleared(frame, start, scaled) {
     const {
       contract: { scaling, path_encoding: encoding, rate_hz: rate },
@@ -356,11 +356,11 @@ export class Sampler {
     const egoFromWorld = inverse(frame);
     const [from, clear] = [apply(frame, start), (place) => (perceived ? this.senses.cleared(place) : place)];
     const wanted = places.map((place) => apply(frame, place));
-    const led = bodies.reduceRight(
+    const avoiding = bodies.reduceRight(
       (path, body) => aroundPerson(path, from, body, this.clearance, clear),
       (detour?.lead(wanted, from) ?? wanted).map(clear),
     );
-    const around = detour?.halted(led, from) ?? led;
+    const around = detour?.halted(avoiding, from) ?? avoiding;
     const world = perceived
       ? this.senses.support.follow(
           around,
