@@ -1,4 +1,4 @@
-"""SIFT points with depth: described in the picture, lifted to camera axes, matched between frames."""
+"""SIFT points: described in the picture, lifted to camera axes by depth, matched between pictures."""
 
 from dataclasses import dataclass
 
@@ -16,42 +16,60 @@ PEAK_THRESHOLD = 0.04
 
 
 @dataclass(frozen=True)
+class Keypoints:
+    """Keypoints of one picture."""
+
+    pixel: Float[np.ndarray, "point 2"]
+    """centres at +0.5"""
+    descriptors: Float[np.ndarray, "point 128"]
+    """RootSIFT (Arandjelovic and Zisserman 2012)."""
+
+
+@dataclass(frozen=True)
 class SiftPoints:
     """Points of one frame that have depth."""
 
     descriptors: Float[np.ndarray, "point 128"]
-    """RootSIFT (Arandjelovic and Zisserman 2012)."""
     points_camera: Float[np.ndarray, "point 3"]
 
 
-def sift_points(
+def describe(
     gray: UInt8[np.ndarray, "height width"],
-    intrinsics: Float[np.ndarray, "3 3"],
-    depth: Float[np.ndarray, "depth_height depth_width"],
-    depth_intrinsics: Float[np.ndarray, "3 3"],
-    most: int,
+    most: int = 0,
     peak_threshold: float = PEAK_THRESHOLD,
     usable: UInt8[np.ndarray, "height width"] | None = None,
-) -> SiftPoints:
-    """Describe the ``most`` strongest points of a picture, where it is ``usable``, and keep those with depth,
-    metres; plain walls need a low contrast threshold.
+) -> Keypoints:
+    """Describe the ``most`` strongest points of a picture (0: all), where it is ``usable``; plain walls need
+    a low contrast threshold.
     """
     # Otherwise OpenCV's points lie a quarter of a pixel to the lower right.
     sift = cv2.SIFT.create(most, contrastThreshold=peak_threshold, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(gray, usable)
     if not keypoints:
-        return SiftPoints(np.zeros((0, 128), np.float32), np.zeros((0, 3)))
-    ray = cameras.unproject(np.array([point.pt for point in keypoints]) + 0.5, intrinsics)
-    z = cameras.read_depth(depth, depth_intrinsics, ray)
+        return Keypoints(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), LEAST_NORM))
-    return SiftPoints(rooted[z > 0], (ray * z[:, None])[z > 0])
+    return Keypoints(np.array([point.pt for point in keypoints]) + 0.5, rooted.astype(np.float32))
 
 
-def matches(first: SiftPoints, second: SiftPoints) -> Int[np.ndarray, "match 2"]:
+def lift(
+    keypoints: Keypoints,
+    intrinsics: Float[np.ndarray, "3 3"],
+    depth: Float[np.ndarray, "depth_height depth_width"],
+    depth_intrinsics: Float[np.ndarray, "3 3"],
+) -> SiftPoints:
+    """Lift the keypoints of a picture that have depth, metres."""
+    ray = cameras.unproject(keypoints.pixel, intrinsics)
+    z = cameras.read_depth(depth, depth_intrinsics, ray)
+    return SiftPoints(keypoints.descriptors[z > 0], (ray * z[:, None])[z > 0])
+
+
+def matches(
+    first: Float[np.ndarray, "first 128"], second: Float[np.ndarray, "second 128"]
+) -> Int[np.ndarray, "match 2"]:
     """Return index pairs (first, second) of distinctive descriptors by the ratio test."""
-    if not len(first.descriptors) or len(second.descriptors) < 2:
+    if not len(first) or len(second) < 2:
         return np.zeros((0, 2), int)
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first, second, k=2)
     return np.array(
         [(a.queryIdx, a.trainIdx) for a, b in pairs if a.distance < RATIO * b.distance], int
     ).reshape(-1, 2)

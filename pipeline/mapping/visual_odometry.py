@@ -154,10 +154,10 @@ def _motion_from_sift(first, second, rng):
 
     def points(frame: FlowFrame) -> sift.SiftPoints:
         intrinsics, depth = frame.intrinsics, frame.points_camera[..., 2]
-        return sift.sift_points(frame.gray, intrinsics, depth, intrinsics, SIFT_FEATURES)
+        return sift.lift(sift.describe(frame.gray, SIFT_FEATURES), intrinsics, depth, intrinsics)
 
     first, second = points(first), points(second)
-    pairs = sift.matches(first, second)
+    pairs = sift.matches(first.descriptors, second.descriptors)
     source, target = second.points_camera[pairs[:, 1]], first.points_camera[pairs[:, 0]]
     return align.ransac_rigid(source, target, threshold_m=AGREE_M, iterations=RANSAC_TRIPLETS, rng=rng)[0]
 

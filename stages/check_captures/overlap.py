@@ -32,7 +32,8 @@ def describe(shots: Sequence[SampledFrame]) -> list[DescribedFrame]:
     """Describe frames; those with too few points are left out."""
     found = []
     for shot in shots:
-        points = sift.sift_points(shot.gray, shot.intrinsics, shot.depth, shot.depth_intrinsics, POINTS)
+        keypoints = sift.describe(shot.gray, POINTS)
+        points = sift.lift(keypoints, shot.intrinsics, shot.depth, shot.depth_intrinsics)
         if len(points.points_camera) >= LEAST:
             found.append(DescribedFrame(shot, points))
     return found
@@ -62,7 +63,7 @@ def _best_place(
     """Return where one frame puts its odometry in the walk-through's, None where no frame of that fits."""
     best, place = LEAST - 1, None
     for known in walkthrough:
-        mine, theirs = sift.matches(frame.points, known.points).T
+        mine, theirs = sift.matches(frame.points.descriptors, known.points.descriptors).T
         if len(mine) <= best:
             continue
         matched = (frame.points.points_camera[mine], known.points.points_camera[theirs])

@@ -15,29 +15,19 @@ from pipeline.data.clips import Clip
 from pipeline.data.templates import SceneCameras
 from pipeline.geometry import cameras, subsampling
 from pipeline.geometry.meshes import RayCaster
+from pipeline.mapping import sift
+from pipeline.mapping.sift import Keypoints
 
 KEYFRAMES, POINTS = 80, 1200
 """Pictures of the walk-through that are described, and keypoints of every picture, at most."""
 PEAK_THRESHOLD = 0.02
 """SIFT's contrast threshold; plain walls need a low one (OpenCV's default is 0.04)."""
-RATIO = 0.8
-"""Ratio test: the best match must be this much nearer than the second (Lowe 2004)."""
 RETRIEVED = 6
 """Keyframes that a picture is matched with: those that hold the most of its nearest descriptors."""
 TREES, CHECKS = 4, 32
 """k-d trees over all descriptors, and leaves that are searched in them."""
 INDEX_KDTREE = 1
 """FLANN's name for randomized k-d trees."""
-LEAST_NORM = 1e-6
-
-
-@dataclass(frozen=True)
-class Keypoints:
-    """Keypoints of one picture."""
-
-    pixel: Float[np.ndarray, "point 2"]
-    descriptors: Float[np.ndarray, "point 128"]
-    """RootSIFT (Arandjelovic and Zisserman 2012)."""
 
 
 @dataclass(frozen=True)
@@ -49,22 +39,8 @@ class Matches:
 
 
 def describe(color: UInt8[np.ndarray, "height width 3"]) -> Keypoints:
-    """Find and describe the strongest keypoints of a picture; pixel centres at +0.5."""
-    sift = cv2.SIFT.create(POINTS, contrastThreshold=PEAK_THRESHOLD)
-    found, descriptors = sift.detectAndCompute(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), None)
-    if not found:
-        return Keypoints(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
-    rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), LEAST_NORM))
-    return Keypoints(np.array([point.pt for point in found]) + 0.5, rooted.astype(np.float32))
-
-
-def match(first: Keypoints, second: Keypoints) -> Int[np.ndarray, "match 2"]:
-    """Return index pairs of distinctive descriptors by the ratio test."""
-    if len(first.pixel) == 0 or len(second.pixel) < 2:
-        return np.zeros((0, 2), int)
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
-    good = [(a.queryIdx, a.trainIdx) for a, b in pairs if a.distance < RATIO * b.distance]
-    return np.array(good, int).reshape(-1, 2)
+    """Find and describe the strongest keypoints of a picture."""
+    return sift.describe(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), POINTS, PEAK_THRESHOLD)
 
 
 class Landmarks:
@@ -87,7 +63,7 @@ class Landmarks:
         pixel, points = [], []
         for keyframe in np.argsort(-held, kind="stable")[:RETRIEVED]:
             known, points_world = self.keyframes[keyframe]
-            mine, theirs = match(keypoints, known).T
+            mine, theirs = sift.matches(keypoints.descriptors, known.descriptors).T
             pixel.append(keypoints.pixel[mine])
             points.append(points_world[theirs])
         return Matches(np.concatenate(pixel), np.concatenate(points))

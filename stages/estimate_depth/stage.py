@@ -18,10 +18,10 @@ from pipeline.data.clips import Clip, Pictures
 from pipeline.data.templates import SceneCameras
 from pipeline.geometry import cameras
 from pipeline.geometry.meshes import RayCaster
+from pipeline.mapping.sift import Keypoints
 from stages.estimate_depth import depth, foreground, landmarks, lens, monocular, tracking, views, writing
 from stages.estimate_depth.config import Config
 from stages.estimate_depth.foreground import ColorView
-from stages.estimate_depth.landmarks import Keypoints
 from stages.estimate_depth.lens import Lens
 from stages.estimate_depth.tracking import MapViews, Tracked, TrackingInput
 

@@ -14,10 +14,12 @@ from jaxtyping import Bool, Float, UInt8
 from pipeline.core.progress import log, track
 from pipeline.geometry import cameras, rigid, subsampling
 from pipeline.geometry.meshes import RayCaster
+from pipeline.mapping import sift
 from pipeline.mapping.pose_optimization import MAP, Correspondences, optimize_poses
+from pipeline.mapping.sift import Keypoints
 from stages.estimate_depth import landmarks, views
 from stages.estimate_depth import lens as lenses
-from stages.estimate_depth.landmarks import Keypoints, Matches
+from stages.estimate_depth.landmarks import Matches
 from stages.estimate_depth.lens import Lens, Located, locate
 from stages.estimate_depth.views import View
 
@@ -153,7 +155,7 @@ def _guesses(frame, other, footage: TrackingInput, poses, room: MapViews, seed) 
     if 0 <= beyond < len(poses) and np.isfinite(poses[beyond, 0, 0]):
         yield poses[other] @ rigid.inverse(poses[beyond]) @ poses[other]
     own, theirs = footage.keypoints[frame], footage.keypoints[other]
-    mine, yours = landmarks.match(own, theirs).T
+    mine, yours = sift.matches(own.descriptors, theirs.descriptors).T
     points = landmarks.on_surface(theirs.pixel[yours], footage.lens.intrinsics, poses[other], room.caster)
     hit = np.isfinite(points[:, 0])
     found = locate(Matches(own.pixel[mine[hit]], points[hit]), footage.lens, seed)

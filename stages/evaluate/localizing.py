@@ -13,8 +13,9 @@ from jaxtyping import Bool, Float
 
 from pipeline.backends.daisy import describe
 from pipeline.data.clips import Clip
-from pipeline.geometry import cameras, rigid
+from pipeline.geometry import rigid
 from pipeline.localization.localizer import Localizer
+from pipeline.mapping import sift
 from pipeline.metrics.metrics import Metrics, median
 from pipeline.metrics.pose_errors import PoseErrors
 
@@ -70,14 +71,10 @@ def sift_map(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], fram
     """Lift the SIFT points of walk-through frames by their depth."""
     descriptors, points = [], []
     for frame in frames:
-        pixel, described = _sift(clip.color(frame))
-        ray = cameras.unproject(pixel, clip.intrinsics[frame])
-        in_depth, _ = cameras.project(ray, clip.depth_intrinsics[frame])
-        depth = clip.depth(frame)
-        column, row = np.clip(np.floor(in_depth).astype(int), 0, np.array(depth.shape[::-1]) - 1).T
-        z = depth[row, column]
-        points.append(rigid.apply(world_from_camera[frame], ray * z[:, None])[z > 0])
-        descriptors.append(described[z > 0])
+        lenses = clip.intrinsics[frame], clip.depth(frame), clip.depth_intrinsics[frame]
+        lifted = sift.lift(_sift(clip.color(frame)), *lenses)
+        points.append(rigid.apply(world_from_camera[frame], lifted.points_camera))
+        descriptors.append(lifted.descriptors)
     return SiftMap(np.concatenate(descriptors), np.concatenate(points))
 
 
@@ -85,15 +82,16 @@ def placed_by_sift(known: SiftMap, clip: Clip, frames: Sequence[int]) -> Float[n
     """Match each frame's SIFT points to the map and solve PnP with RANSAC; NaN where that fails."""
     matcher, found = cv2.BFMatcher(cv2.NORM_L2), []
     for frame in frames:
-        pixel, described = _sift(clip.color(frame))
+        keypoints = _sift(clip.color(frame))
         found.append(np.full((4, 4), np.nan))
-        if len(described) < 8:
+        if len(keypoints.pixel) < 8:
             continue
-        points = known.points_world[[match.trainIdx for match in matcher.match(described, known.descriptors)]]
+        nearest = matcher.match(keypoints.descriptors, known.descriptors)
+        points = known.points_world[[match.trainIdx for match in nearest]]
         cv2.setRNGSeed(0)
         ok, turn, shift, inliers = cv2.solvePnPRansac(
             points,
-            pixel,
+            keypoints.pixel,
             clip.intrinsics[frame],
             None,
             iterationsCount=PNP_ITERATIONS,
@@ -121,7 +119,5 @@ def _whole(color: np.ndarray) -> Float[np.ndarray, "channel"]:
     return raw / max(float(np.linalg.norm(raw)), 1e-6)
 
 
-def _sift(color: np.ndarray) -> tuple[Float[np.ndarray, "point 2"], Float[np.ndarray, "point 128"]]:
-    keypoints, described = cv2.SIFT.create().detectAndCompute(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), None)
-    pixel = np.array([keypoint.pt for keypoint in keypoints], float).reshape(-1, 2) + 0.5
-    return pixel, np.zeros((0, 128), np.float32) if described is None else described
+def _sift(color: np.ndarray) -> sift.Keypoints:
+    return sift.describe(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY))

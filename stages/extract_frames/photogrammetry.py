@@ -170,7 +170,7 @@ def _unit_m(
     """Return metres per unit of the model, and the id of the recording that gave them, or `relative`."""
     gray = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]
     mapped = [
-        sift.sift_points(picture, solved.intrinsics, each, view.intrinsics, scaling.POINTS)
+        sift.lift(sift.describe(picture, scaling.POINTS), solved.intrinsics, each, view.intrinsics)
         for picture, view, each in zip(gray, views, depth, strict=True)
         if measured
     ]

@@ -59,12 +59,12 @@ def _described(recording: Recording) -> Iterator[SiftPoints]:
     for row, frame in zip(rows, frames, strict=True):
         if frame is not None:
             gray, lens = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), plan.depth_intrinsics[row]
-            yield sift.sift_points(gray, plan.intrinsics[row], frame.depth, lens, POINTS)
+            yield sift.lift(sift.describe(gray, POINTS), plan.intrinsics[row], frame.depth, lens)
 
 
 def _scale(known: SiftPoints, frame: SiftPoints, seed: int) -> float | None:
     """Return metres per unit by one pair of frames, None where too few points agree."""
-    mine, theirs = sift.matches(frame, known).T
+    mine, theirs = sift.matches(frame.descriptors, known.descriptors).T
     if len(mine) < LEAST_POINTS:
         return None
     source, target = known.points_camera[theirs], frame.points_camera[mine]

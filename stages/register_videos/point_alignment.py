@@ -66,7 +66,7 @@ class WalkTerm:
             for key in np.argsort(-np.array(seen), kind="stable")[:MATCHED]:
                 if seen[key] > LEAST_SHARED:
                     other = len(clip) + int(key)
-                    pairs = sift.matches(points[frame], points[other])
+                    pairs = sift.matches(points[frame].descriptors, points[other].descriptors)
                     mine, theirs = pairs.T
                     met = rigid.apply(rigid.inverse(poses[frame]) @ poses[other], local[other][theirs])
                     off_px = cameras.project(met, pinholes[frame])[0] - pixels[frame][mine]
@@ -91,7 +91,7 @@ def _points(clip, frame, agent=None) -> sift.SiftPoints:
     gray, depth = cv2.cvtColor(clip.color(frame), cv2.COLOR_RGB2GRAY), usable_depth(clip, frame)
     free = None if agent is None else cv2.erode((~agent).astype(np.uint8), np.ones((MASK_MARGIN_PX,) * 2))
     lenses = clip.intrinsics[frame], depth, clip.depth_intrinsics[frame]
-    return sift.sift_points(gray, *lenses, POINTS, PEAK_THRESHOLD, free)
+    return sift.lift(sift.describe(gray, POINTS, PEAK_THRESHOLD, free), *lenses)
 
 
 def _seen(points_world, world_from_camera, intrinsics, size) -> float:
