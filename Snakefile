@@ -1,5 +1,5 @@
 # The same flow on another engine, one rule per artifact. What there is to do, pipeline/workflow/plan.py writes to
-# build/<agent>/plan/jobs/, one small file per job; an artifact is published by pipeline/workflow/run.py.
+# build/<agent>/plan/dag.json, one job per line; an artifact is published by pipeline/workflow/run.py.
 #   snakemake --cores 2 --config agent=cat                       (profile: profiles/default)
 #   snakemake --config agents=[luna,cat] --workflow-profile profiles/slurm
 #   snakemake --config homes=homes.tsv --workflow-profile profiles/slurm  (a table with the columns agent and, if needed, variant)

@@ -25,6 +25,8 @@ RUNTIME_FACTOR = 4
 """How much slower than the measured machine a node may be."""
 MEMORY_GROWTH = 1.5
 """Memory of each attempt, relative to the one before."""
+_known: dict[tuple[str, str], dict[str, Any]] = {}
+"""Planned jobs that this process has read, by home and id."""
 HOME = r"[a-z0-9][a-z0-9_-]*(?:/(?:variants|animals)/[a-z0-9][a-z0-9_-]*)?"
 """The homes that a rule's output may belong to."""
 
@@ -55,12 +57,14 @@ def plan(homes: list[str]) -> None:
 
 
 def targets(homes: list[str]) -> list[str]:
-    """Return the stamps of everything that a build of these homes makes."""
-    found: dict[str, None] = {}
-    for home in homes:
-        planned = json.loads((jobs.Home.parse(home).plan / "dag.json").read_text())
-        found |= dict.fromkeys(job["stamp"] for job in planned if not job["on_demand"])
-    return list(found)
+    """Return the stamps that a build of these homes asks for: all that no other of its jobs waits for."""
+    wanted: dict[str, None] = {}
+    for home in map(jobs.Home.parse, homes):
+        for job in json.loads(jobs.listing(home).read_text()):
+            _known[job["home"], job["id"]] = job
+            wanted |= {} if job["on_demand"] else {job["stamp"]: None}
+    waited_for = {each for job in _known.values() if job["stamp"] in wanted for each in job["after"]}
+    return [stamp for stamp in wanted if stamp not in waited_for]
 
 
 def output(node: dag.Node) -> str:
@@ -112,13 +116,10 @@ def _id(node: dag.Node, wildcards: Any) -> str:
     return job_pattern(node).replace("{part}", getattr(wildcards, "part", ""))
 
 
-@functools.cache
 def _job(home: str, id: str) -> dict[str, Any]:
-    path = jobs.job_file(home, id)
-    try:
-        return json.loads(path.read_text())
-    except FileNotFoundError:
-        raise InputError("RUN-001", f"has no job {id!r}", home, f"see {path.parent}") from None
+    if (home, id) not in _known:
+        _known[home, id] = jobs.planned(jobs.Home.parse(home), id)
+    return _known[home, id]
 
 
 @functools.cache

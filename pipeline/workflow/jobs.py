@@ -3,6 +3,9 @@
 Standard library only, nothing is written here: `plan` writes it down, `run` does the jobs.
 """
 
+import functools
+import json
+import mmap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -44,7 +47,7 @@ class Home:
         name = name if self.animal is None else f"{name}/animals/{self.animal}"
         return f"{name}/tables" if self.tables else name
 
-    @property
+    @functools.cached_property
     def folder(self) -> Path:
         """Return where its artifacts stand."""
         return Path("build", str(self).removesuffix("/tables"))
@@ -54,7 +57,7 @@ class Home:
         """Return where its plan stands."""
         return Path("build", str(self), "plan")
 
-    @property
+    @functools.cached_property
     def base(self) -> "Home":
         """Return the agent's own home."""
         return Home(self.agent)
@@ -228,9 +231,25 @@ def deciding_videos(plan: Plan, node: Node) -> list[Video]:
     return [video for video in plan.videos if (video.role, video.split) in deciding]
 
 
-def job_file(home: str, job_id: str) -> Path:
-    """Return the file that holds one job, for `run` and other engines."""
-    return Path("build", home, "plan", "jobs", f"{job_id}.json")
+def listing(home: Home) -> Path:
+    """Return the file that holds the jobs of a plan, one per line."""
+    return home.plan / "dag.json"
+
+
+def planned(home: Home, job_id: str) -> dict[str, Any]:
+    """Return a planned job: of thousands its line alone is read. Raises RUN-001."""
+    path = listing(home)
+    try:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
+            start = text.find(f'\n{{"id": {json.dumps(job_id)},'.encode()) + 1
+            if start:
+                return json.loads(text[start : text.find(b"\n", start)].rstrip(b","))
+    except FileNotFoundError:
+        raise InputError("RUN-001", "is not planned yet", str(home), f"run `make {home}`") from None
+    except (ValueError, RecursionError) as error:
+        remedy = f"delete {path}, and run `make {home}`"
+        raise InputError("RUN-001", "holds no planned jobs", str(path), remedy) from error
+    raise InputError("RUN-001", f"has no job {job_id!r}", str(home), f"see {path}")
 
 
 def redo_mark(home: str, job_id: str) -> Path:
@@ -345,4 +364,4 @@ def _inputs(plan: Plan, need: Need, node: Node, part: Video | Trial | None) -> I
     several = [video for video in plan.videos if need.wants(video, source.roles)]
     for video in [part] if isinstance(part, Video) and not need.roles else several:
         made = dag.folder_of(need.artifact, video)
-        yield Input(f"{made}/{video.id}", str(plan.home_of(made).folder / made / video.id), need.part)
+        yield Input(f"{made}/{video.id}", f"{plan.home_of(made).folder}/{made}/{video.id}", need.part)

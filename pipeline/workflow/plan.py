@@ -29,9 +29,8 @@ from pipeline.workflow.jobs import (
     Plan,
     deciding_videos,
     followed,
-    job_file,
     jobs,
-    lock_file,
+    listing,
     redo_mark,
     touched_by,
     with_animals,
@@ -75,7 +74,7 @@ def read(home: Home, cache: sources.Cache) -> Plan:
     return with_animals(Plan(home, videos, not names, changed, touched, flow, trials))
 
 
-def write(plan: Plan, cache: sources.Cache) -> None:
+def write(plan: Plan, cache: sources.Cache, code: sources.Cache) -> None:
     """Write the plan's files, each only if it changed."""
     all_jobs = jobs(plan)
     base = plan.home.base.plan
@@ -90,19 +89,17 @@ def write(plan: Plan, cache: sources.Cache) -> None:
         _write(base / "keys" / name, _json({"sha256": digest}))
     for each in (plan, *plan.animals):
         for name, trial in {(job.artifact, job.trial) for job in all_jobs if job.home == str(each.home)}:
-            _write_key(each, cache, name, trial)
-    for job in all_jobs:  # there from the start, so that a job that fails leaves no trace
-        lock_file(job.home, job.id).parent.mkdir(parents=True, exist_ok=True)
-        lock_file(job.home, job.id).touch()
-    after, homes = followed(all_jobs), {str(each.home) for each in (plan, *plan.animals)}
+            _write_key(each, code, name, trial)
+    after, lines = followed(all_jobs), []
     for number, job in enumerate(all_jobs, start=1):
-        if job.home in homes:
-            one = job.as_dict() | {"place": f"{number} of {len(all_jobs)}", "after": after[job.stamp]}
-            _write(job_file(job.home, job.id), json.dumps(one, sort_keys=True) + "\n")
-    _write_dag(plan.home, all_jobs)
+        place = {"place": f"{number} of {len(all_jobs)}", "after": after[job.stamp]}
+        lines.append((job.home, json.dumps(job.as_dict() | place)))
+    for each in (plan, *plan.animals):
+        homes = {home for home, _ in lines} if each is plan else {str(plan.home), str(each.home)}
+        its = ",\n".join(line for home, line in lines if home in homes)
+        _write(listing(each.home), f"[\n{its}\n]\n")
     for each in plan.animals:
         _write(each.home.plan / "videos.json", _json([asdict(video) for video in each.videos]))
-        _write_dag(each.home, [job for job in all_jobs if job.home in (str(plan.home), str(each.home))])
     _write(plan.home.plan / "rules.mk", _rules(plan, all_jobs, after))
     stamps.remove_outdated(all_jobs)
 
@@ -118,17 +115,12 @@ def _further_files(plan: Plan) -> Iterator[tuple[str, Path]]:
                 yield f"{name}.{video.id}.json", file
 
 
-def _write_dag(home: Home, its_jobs: Sequence[Job]) -> None:
-    lines = [json.dumps(job.as_dict(), sort_keys=True) for job in its_jobs]
-    _write(home.plan / "dag.json", "[\n" + ",\n".join(lines) + "\n]\n")
-
-
 def _write(path: Path, text: str) -> None:
     """Write one of the plan's many files; the disk is flushed once, after all of them."""
     artifact.write_if_changed(path, text, sync=False)
 
 
-def _write_key(plan: Plan, cache: sources.Cache, name: str, trial: str | None) -> None:
+def _write_key(plan: Plan, code: sources.Cache, name: str, trial: str | None) -> None:
     """Write the table of one artifact, or of one trial of it, and what decides it beside its inputs."""
     node, table = dag.NODES[name], plan.tables[name]
     overlay = next((each.overlay for each in plan.trials if each.id == trial), {})
@@ -139,7 +131,7 @@ def _write_key(plan: Plan, cache: sources.Cache, name: str, trial: str | None) -
     key = {
         "stage": node.stage,
         "version": node.version,
-        "code": sources.digest(node.stage, cache),
+        "code": sources.digest(node.stage, code),
         "table": table,
         "videos": [
             [v.id, v.role, v.split, v.synchronized_with, v.offset_s, *([v.animal] if v.animal else [])]
@@ -153,7 +145,7 @@ def _write_key(plan: Plan, cache: sources.Cache, name: str, trial: str | None) -
 
 def mark_redo(home: Home, name: str) -> None:
     """Have the artifact `name` of `home` made again by the next build, although nothing changed."""
-    known = json.loads((home.plan / "dag.json").read_text())
+    known = json.loads(listing(home).read_text())
     marked = [job for job in known if job["artifact"] == name]
     if not marked:
         raise InputError("REC-007", f"no artifact {name!r}", str(home), f"artifacts: {', '.join(dag.NODES)}")
@@ -170,7 +162,7 @@ def inputs(home: Home, names: Sequence[str], *, together: bool = False) -> str:
     animals = [str(each.animal) for each in _animal_homes(home.base)]
     if home.animal and home.animal not in animals:
         raise InputError("REC-007", "no such animal", str(home), f"animals: {', '.join(animals) or 'one'}")
-    known = {job["artifact"]: Path(job["out"]) for job in json.loads((home.plan / "dag.json").read_text())}
+    known = {job["artifact"]: Path(job["out"]) for job in json.loads(listing(home).read_text())}
     unknown = [name for name in names if name not in known]
     if unknown:
         remedy = f"artifacts: {', '.join(known)}"
@@ -247,31 +239,21 @@ def _json(value: Any) -> str:
     return json.dumps(value, indent=1, sort_keys=True) + "\n"
 
 
-def _cache(home: Home) -> sources.Cache:
+def _read_before(path: Path) -> dict[str, Any]:
     """Return what earlier runs of the planner read; lost, it only costs time."""
-    known: dict[str, Any] = {}
-    for path in (CODE_CACHE, home.plan / "cache.json"):
-        try:
-            read_before = json.loads(path.read_text())
-        except (FileNotFoundError, ValueError):
-            continue
-        known |= read_before if sources.fits(read_before) else {}
-    return sources.Cache(known)
+    try:
+        known = json.loads(path.read_text())
+    except (FileNotFoundError, ValueError):
+        return {}
+    return known if sources.fits(known) else {}
 
 
-def _keep(cache: sources.Cache, home: Home) -> None:
-    """Write down what was read: of the code for all homes, of recordings for theirs."""
-    of_code = {path: entry for path, entry in cache.fresh.items() if Path(path).is_relative_to(sources.CODE)}
-    of_home = {path: entry for path, entry in cache.fresh.items() if path not in of_code}
-    with artifact.held(CODE_CACHE.with_suffix(".lock")):
-        _write(CODE_CACHE, json.dumps(of_code, sort_keys=True))
-    _write(home.plan / "cache.json", json.dumps(of_home, sort_keys=True))
-
-
-def _read_marks(home: Home) -> str:
+def _read_marks(home: Home, code: sources.Cache) -> str:
     """Hash name, size and time of all that a plan is made from."""
-    code = (f"{sources.CODE}/{folder}" for folder in ("pipeline", "stages"))
-    return artifact.digest_of([*map(sources.marks, (*code, "agents", f"captures/{home.agent}"))])
+    recipe = Path("agents", f"{home.agent}.toml")
+    own = [sources.mark(recipe)] if recipe.is_file() else []
+    folders = ("agents/variants", f"captures/{home.agent}")
+    return artifact.digest_of([code.marks, own, *map(sources.marks, folders)])
 
 
 def _written_marks(home: Home) -> str:
@@ -279,7 +261,7 @@ def _written_marks(home: Home) -> str:
     found = []
     animals = (each.plan for each in _animal_homes(home.base))
     for plan in dict.fromkeys((home.base.plan, home.plan, *animals)):
-        names = "dag.json rules.mk videos.json ids.json cache.json jobs keys configs redo".split()
+        names = "dag.json rules.mk videos.json ids.json cache.json keys configs redo".split()
         paths = [plan / name for name in names]
         found += [[str(path), path.stat().st_mtime_ns] for path in paths if path.exists()]
     return artifact.digest_of(found)
@@ -291,12 +273,12 @@ def _animal_homes(base: Home) -> list[Home]:
     return [replace(base, animal=path.parent.name) for path in found]
 
 
-def _plan(home: Home, cache: sources.Cache) -> None:
+def _plan(home: Home, code: sources.Cache) -> None:
     """Plan `home`, and its agent, unless nothing that a plan is made from has changed."""
     home = home.base if home.animal else home
     for each in dict.fromkeys((home.base, home, *_animal_homes(home.base))):
         stamps.remove_impossible(each)
-    read_marks, state = _read_marks(home), home.plan / "state.json"
+    read_marks, state = _read_marks(home, code), home.plan / "state.json"
     try:
         before = json.loads(state.read_text())
         if before["read"] == read_marks and before["written"] == _written_marks(home):
@@ -304,12 +286,13 @@ def _plan(home: Home, cache: sources.Cache) -> None:
             return
     except (FileNotFoundError, ValueError, KeyError, TypeError):
         pass
-    cache.known |= _cache(home).known
+    code.known = code.known or _read_before(CODE_CACHE)
+    cache = sources.Cache(_read_before(home.plan / "cache.json"))
     planned = [read(each, cache) for each in dict.fromkeys((home.base, home))]
     with artifact.held(home.base.folder / "plan.lock"):
         for plan in planned:
-            write(plan, cache)
-        _keep(cache, home)
+            write(plan, cache, code)
+        _write(home.plan / "cache.json", json.dumps(cache.fresh, sort_keys=True))
         artifact.sync_disk(home.plan)
         messages = _messages(planned[0], home)
         print(*messages, sep="\n", end="\n" if messages else "", flush=True)
@@ -336,9 +319,13 @@ def main(arguments: list[str]) -> int:
     """Run the command line of the planner; returns its exit code."""
     match arguments:
         case ["plan", *homes] if homes:
-            cache = sources.Cache()
+            marks = [sources.marks(f"{sources.CODE}/{folder}") for folder in ("pipeline", "stages")]
+            code = sources.Cache(marks=artifact.digest_of(marks))
             for home in map(Home.parse, homes):
-                _plan(home, cache)
+                _plan(home, code)
+            if code.fresh:
+                with artifact.held(CODE_CACHE.with_suffix(".lock")):
+                    _write(CODE_CACHE, json.dumps(code.fresh, sort_keys=True))
         case ["redo", home, name]:
             mark_redo(Home.parse(home), name)
         case ["inputs" | "together" as kind, home, *names]:

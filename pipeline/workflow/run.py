@@ -71,7 +71,7 @@ def run(home: str, job_id: str, engine: Engine = Engine()) -> int:
 
 def _run(home: str, job_id: str, engine: Engine) -> int | None:
     """Do it once; None where its key changed while it was done, so that it has no stamp."""
-    job = _job(home, job_id)
+    job = jobs.planned(jobs.Home.parse(home), job_id)
     out, stamp = Path(job["out"]), Path(job["stamp"])
     resume = Path("build", job["home"], "resume", job_id)
     redo = jobs.redo_mark(job["home"], job_id)
@@ -103,26 +103,9 @@ def _run(home: str, job_id: str, engine: Engine) -> int | None:
 def _key_now(home: str, job_id: str) -> str | None:
     """Return the key of a job as its plan and inputs stand now; None where they are broken."""
     try:
-        return _key(_job(home, job_id))
+        return _key(jobs.planned(jobs.Home.parse(home), job_id))
     except (InputError, FileNotFoundError):
         return None
-
-
-def _job(home: str, job_id: str) -> dict[str, Any]:
-    """Return a planned job of `home`, or of the agent whose variant `home` is."""
-    parsed = jobs.Home.parse(home)
-    paths = [jobs.job_file(str(each), job_id) for each in dict.fromkeys((parsed, parsed.base))]
-    for path in paths:
-        try:
-            return json.loads(path.read_text())
-        except FileNotFoundError:
-            continue
-        except (ValueError, RecursionError) as error:
-            remedy = f"delete {path.parent}, and run `make {home}`"
-            raise InputError("RUN-001", "is no planned job", str(path), remedy) from error
-    if not parsed.plan.is_dir():
-        raise InputError("RUN-001", "is not planned yet", home, f"run `make {home}`")
-    raise InputError("RUN-001", f"has no job {job_id!r}", home, f"see {paths[0].parent}")
 
 
 def _record(job: dict[str, Any]) -> Path:

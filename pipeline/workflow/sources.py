@@ -50,14 +50,15 @@ class Cache:
     fresh: dict[str, Any] = field(default_factory=dict)
     digests: dict[str, str] = field(default_factory=dict)
     """Of stages, as far as this process computed them."""
+    marks: str = ""
+    """Hash of name, size and times of all code, taken before any is read."""
 
     def get(self, path: Path, read: Any) -> Any:
         """Return `read(path)`, a value of plain JSON types, or what it was last time."""
-        stat = path.stat()
-        mark = [READER, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns]
+        mark_now = [READER, *mark(path)]
         entry = self.fresh.get(str(path)) or self.known.get(str(path))
-        if entry is None or entry["mark"] != mark:
-            entry = {"mark": mark, "value": read(path)}
+        if entry is None or entry["mark"] != mark_now:
+            entry = {"mark": mark_now, "value": read(path)}
         self.fresh[str(path)] = entry
         return entry["value"]
 
@@ -90,6 +91,12 @@ def digest(stage: str, cache: Cache) -> str:
         waiting += source.imports
     cache.digests[stage] = artifact.digest_of([seen, _assets(Path("stages", *stage.split(".")), cache)])
     return cache.digests[stage]
+
+
+def mark(path: Path) -> list[int]:
+    """Return size and times of a file."""
+    stat = path.stat()
+    return [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns]
 
 
 def marks(folder: str, *, follow: bool = True) -> list[list[Any]]:

@@ -6,6 +6,7 @@ never goes back: every stamp gets a later time than all before. Standard library
 """
 
 import contextlib
+import functools
 import os
 import time
 from collections.abc import Iterator, Sequence
@@ -35,11 +36,11 @@ def text(keys: Sequence[str]) -> str:
 
 def remove_outdated(jobs: Sequence[Job]) -> None:
     """Remove the stamps of jobs whose key files have changed since."""
-    digests = {key: artifact.digest_of_file(Path(key)) for job in jobs for key in job.keys}
+    digest_of = functools.cache(lambda key: artifact.digest_of_file(Path(key)))
     for job in jobs:
-        expected = artifact.digest_of([digests[key] for key in job.keys]) + "\n"
         with contextlib.suppress(FileNotFoundError):
-            if Path(job.stamp).read_text(errors="replace") != expected:
+            stamped = Path(job.stamp).read_text(errors="replace")
+            if stamped != artifact.digest_of(list(map(digest_of, job.keys))) + "\n":
                 Path(job.stamp).unlink()
 
 

@@ -17,7 +17,8 @@ from tests.pipeline.workflow import checkout
 def house(tmp_path, monkeypatch):
     made = checkout.create(tmp_path)
     monkeypatch.chdir(tmp_path)
-    for cached in (engine._job, engine._frames, engine._frames_in):
+    engine._known.clear()
+    for cached in (engine._frames, engine._frames_in):
         cached.cache_clear()
     return made
 

@@ -321,9 +321,9 @@ def test_every_run_of_a_job_has_its_log(house):
     assert len(list(logs.glob("behavior.*.log"))) == run.LOGS_KEPT
 
 
-@pytest.mark.parametrize("text", ["", "{", "[" * 5000])
+@pytest.mark.parametrize("text", ["", "{", '[\n{"id": "behavior", "x": ' + "[" * 5000])
 def test_a_broken_plan_is_refused(house, text):
-    (house.folder / "build/toy/plan/jobs/behavior.json").write_text(text)
+    (house.folder / "build/toy/plan/dag.json").write_text(text)
     failed = house.python("pipeline.workflow.run", "toy", "behavior")
     assert failed.returncode == 2
     assert failed.stderr.startswith("error: RUN-001")
