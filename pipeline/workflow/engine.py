@@ -1,6 +1,6 @@
 """What the Snakefile knows of the flow: homes, targets, and per rule its inputs and resources.
 
-The process that the user starts plans; jobs elsewhere only read their small file. Standard library only.
+The process that the user starts plans; jobs elsewhere only read their line. Standard library only.
 """
 
 import csv
