@@ -11,30 +11,18 @@ import pytest
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import BehaviorNets
 from pipeline.behavior.perception import FeatureVolume
-from pipeline.behavior.planning import Sampler, TorchNetworks
-from pipeline.behavior.scenes import Scenes
 from pipeline.core.errors import InputError
-from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.floor import PersonFloor, to_local, to_world
-from pipeline.environments.homes import Habitat
 from pipeline.environments.rewards import REWARDS, StepOutcome
 from pipeline.environments.world import AnimalWorld
 from stages.train_behavior.export import write_contract
 from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
+from tests.pipeline.environments.small_world import QUICK, small_world
 from tests.pipeline.environments.test_other_home import write
 from tests.stages.simulate.test_simulator import scaling
 
 gymnasium = pytest.importorskip("gymnasium")
 pytest.importorskip("pettingzoo")
-
-QUICK = EnvironmentConfig(goal_steps=2, sequence_steps=2, candidates=1, start_m=(0.8, 1.5))
-
-
-def small_world(config=QUICK):
-    volume = room()
-    sampler = Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling())
-    scenes = Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int))
-    return AnimalWorld(sampler, Habitat.of_one_home(wandering(), scenes), "yaw", config)
 
 
 @pytest.fixture(scope="module")

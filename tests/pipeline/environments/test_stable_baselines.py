@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.pipeline.environments.test_environments import QUICK, small_world
+from tests.pipeline.environments.small_world import QUICK, small_world
 
 pytest.importorskip("stable_baselines3")
 
