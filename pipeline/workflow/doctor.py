@@ -109,10 +109,13 @@ def disk() -> Finding:
 
 
 def browser() -> Finding:
-    """Look for the browser that the page test drives; builds do without."""
-    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    missing = "none: the page test cannot run; remedy: apt-get install chromium"
-    return Finding("browser", "ok" if found else "warn", found or missing)
+    """Look for the browser that the page test drives, and what its driver links; builds do without."""
+    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), "")
+    missing = [] if found else ["chromium"]
+    if sys.platform == "linux" and ctypes.util.find_library("atomic") is None:
+        missing.append("libatomic1")
+    remedy = f"the page test cannot run; remedy: apt-get install {' '.join(missing)}"
+    return Finding("browser", "warn" if missing else "ok", remedy if missing else found)
 
 
 def recordings() -> Finding:
