@@ -7,6 +7,7 @@ modules and ONNX sessions can satisfy.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -166,6 +167,10 @@ class PlanCondition:
         less = tuple(code[some] for code in self.less)
         return PlanCondition(self.full[some], less, self.start[some], constraint)
 
+    def on_support(self, goal: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
+        """Move goals in metres to where the agent may rest."""
+        return goal if self.constraint is None else self.constraint.goals_on_support(goal, self.start)
+
     def constrained(
         self, path: Float[np.ndarray, "plan frame 3"], rate_hz: float
     ) -> Float[np.ndarray, "plan frame 3"]:
@@ -253,9 +258,8 @@ class Sampler:
             return lambda x, t: self.networks.goal(x, _filled(len(x), t), code)
 
         denoisers = [denoise(code[:: codes.count]) for code in (codes.full, *codes.less)]
-        shape, steps = (len(codes.full), 3), sampling.goal_steps
-        x = self._drawn(denoisers, shape, sampling, steps, rng, lambda x: self.goals_out_of_solid(codes, x))
-        return self.scaling.goal(x)
+        x = self._drawn(denoisers, (len(codes.full), 3), sampling, sampling.goal_steps, rng)
+        return codes.on_support(self.scaling.goal(x))
 
     def paths(
         self,
@@ -292,16 +296,12 @@ class Sampler:
             )
 
         towards = [denoise(codes.full, float(sampling.goal)), *map(denoise, codes.less)]
-        shape = len(goal), PATH_CHANNELS, self.scaling.path_std.shape[1]
-        path = self._drawn(
-            towards,
-            shape,
+        correct, spread = partial(self.paths_out_of_solid, codes), sampling.path_noise_std
+        shape, drawn = (
+            (len(goal), PATH_CHANNELS, self.scaling.path_std.shape[1]),
             replace(sampling, method="ddim"),
-            sampling.sequence_steps,
-            rng,
-            lambda x: self.paths_out_of_solid(codes, x),
-            sampling.path_noise_std,
         )
+        path = self._drawn(towards, shape, drawn, sampling.sequence_steps, rng, correct, spread)
         return self.finished_paths(codes, path, goal, sampling)
 
     def bodies(
@@ -324,15 +324,6 @@ class Sampler:
         drawn, spread = replace(sampling, method="ddim"), sampling.body_noise_std
         body = self._drawn(along, shape, drawn, sampling.sequence_steps, rng, spread=spread)
         return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
-
-    def goals_out_of_solid(
-        self, codes: PlanCondition, scaled: Float[np.ndarray, "plan 3"]
-    ) -> Float[np.ndarray, "plan 3"]:
-        """Move scaled goals to where the agent may rest."""
-        if codes.constraint is None:
-            return scaled
-        out_of_solid = codes.constraint.out_of_solid(self.scaling.goal(scaled)[:, None])[:, 0]
-        return self.scaling.scaled_goal(codes.constraint.goals_on_support(out_of_solid))
 
     def paths_out_of_solid(
         self, codes: PlanCondition, scaled: Float[np.ndarray, "plan 4 frame"]

@@ -21,6 +21,8 @@ from pipeline.geometry import rigid
 
 INSET_SHARE = 0.01
 """how far inside an allowed voxel a point is put, in edges of the voxel"""
+TURNS_RAD = np.arange(1, 18) // 2 * (-1) ** np.arange(1, 18) * np.pi / 16
+"""turns by which a goal gets out of something solid, the least first, up to a right angle either way"""
 
 
 @dataclass(frozen=True)
@@ -163,10 +165,21 @@ class SceneConstraint:
         moved = self.scenes.out_of_solid(rigid.apply(frame, points_ego), video)
         return rigid.apply(rigid.inverse(frame), moved)
 
-    def goals_on_support(self, goals_ego: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
-        """Put goals on what carries an agent that rests there."""
+    def goals_on_support(
+        self, goals_ego: Float[np.ndarray, "plan 3"], start_ego: Float[np.ndarray, "plan 3"]
+    ) -> Float[np.ndarray, "plan 3"]:
+        """Put goals on what carries an agent that rests there, those in something solid out of it: turned
+        about ``start_ego`` as little as possible, for moved to the nearest place flights come to nothing.
+        """
         frame, video = self._of_plans(len(goals_ego))
-        goals = rigid.apply(frame, goals_ego[:, None])
+        start, goals = rigid.apply(frame, start_ego[:, None]), rigid.apply(frame, goals_ego[:, None])
+        moved, (x, y, z) = self.scenes.out_of_solid(goals, video), np.moveaxis(goals - start, -1, 0)
+        angle = np.where((moved - goals)[..., 0] * z >= (moved - goals)[..., 2] * x, 1, -1) * TURNS_RAD
+        cosine, sine = np.cos(angle), np.sin(angle)
+        turned = start + np.stack([cosine * x + sine * z, y + 0 * sine, cosine * z - sine * x], axis=-1)
+        solid = self.scenes.inside_solid(turned, video)
+        first = np.take_along_axis(turned, solid.argmin(1)[:, None, None], axis=1)
+        goals = np.where(np.asarray(solid.all(1))[:, None, None], moved, first)
         goals[..., 1] = self.scenes.support_heights(goals, np.zeros(goals.shape[:-1], bool), video)
         return rigid.apply(rigid.inverse(frame), goals)[:, 0]
 

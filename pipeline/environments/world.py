@@ -66,13 +66,9 @@ class AnimalWorld:
         """``habitat`` is where they live; ``camera`` is what `rgbd` is seen with."""
         self.habitat, self.config, self.camera = habitat, config, camera
         data, scenes = habitat.data, habitat.scenes
-        sampling = PlanSamplingConfig(
-            method="ddim",
-            goal_steps=config.goal_steps,
-            sequence_steps=config.sequence_steps,
-            guidance=config.guidance,
-            max_path_draws=1,
-        )
+        # of samplers in few steps, the one that keeps the spread of goals
+        few = "ddpm_large", config.goal_steps, config.sequence_steps, config.guidance
+        sampling = PlanSamplingConfig(*few, max_path_draws=1)
         rest, chaining = data.agent_from_bone_rest, ReplanningConfig(candidates=config.candidates)
         self.animals = AnimalBatch(sampler, scenes, rest, ego, sampling=sampling, chaining=chaining)
         tracks = [data.trajectories[name] for name in data.videos]

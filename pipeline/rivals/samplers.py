@@ -70,7 +70,7 @@ class GaussianSampler(Sampler):
         self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan 3"]:
         """Draw goals in the ego frame, metres."""
-        return self.scaling.goal(self.goals_out_of_solid(codes, self._drawn_from(self._goal(codes), rng)))
+        return codes.on_support(self.scaling.goal(self._drawn_from(self._goal(codes), rng)))
 
     def draw_paths(
         self,

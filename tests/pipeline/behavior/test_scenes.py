@@ -46,7 +46,7 @@ def test_goals_rest_and_paths_tread_on_what_carries_in_every_agents_own_frame():
     ground, rng = SceneConstraint(scenes, world_from_ego, None), np.random.default_rng(0)
     plans = np.repeat(world_from_ego, 3, axis=0)
     goals = rng.normal(0, 0.2, (6, 3))
-    world = rigid.apply(plans, ground.goals_on_support(goals)[:, None])[:, 0]
+    world = rigid.apply(plans, ground.goals_on_support(goals, np.zeros((6, 3)))[:, None])[:, 0]
     free = rigid.apply(plans, goals[:, None])[:, 0]
     np.testing.assert_allclose(world[:, [0, 2]], free[:, [0, 2]], atol=1e-9)
     np.testing.assert_allclose(world[:, 1], free[:, 1].clip(0.15, 0.2), atol=1e-9)
@@ -55,3 +55,16 @@ def test_goals_rest_and_paths_tread_on_what_carries_in_every_agents_own_frame():
     assert (on_support[:, :, 1] >= 0.15 - 1e-9).all() and (
         on_support[:, 5:, 1] <= 0.2 + 1e-9
     ).all()  # it begins in the air
+
+
+def test_goals_in_walls_are_turned_to_free_places_as_far_away():
+    scenes = Scenes.of(room())  # 4 m by 4 m about the origin
+    start = np.tile([1.5, 0.3, 0.0], (2, 1))
+    goals = start + np.array([[1.0, 0.0, 0.1], [9.0, 0.0, 0.0]])
+    wall, outside = SceneConstraint(scenes, np.eye(4)[None], None).goals_on_support(goals, start)
+    assert not scenes.inside_solid(np.stack([wall, outside])[:, None], None).any()
+    assert np.isclose(np.linalg.norm(wall - start[0]), np.hypot(1.0, 0.1))
+    assert wall[2] > 0.1, "to the side that is nearer"
+    np.testing.assert_allclose(
+        outside, [2.0, 0.3, 0.0], atol=0.01
+    )  # nowhere is as far away: the nearest place

@@ -101,3 +101,25 @@ def test_page_and_python_clear_the_same_points(free):
     same = (mine == other).all(-1)
     np.testing.assert_allclose(theirs[same], ours[same], atol=1e-12)
     assert same.mean() > 0.7
+
+
+@needs_node
+def test_page_and_python_turn_the_same_goals_out_of_solid():
+    rng = np.random.default_rng(2)
+    allowed = rng.random((30, 5, 30)) < 0.3
+    occupancy, origin = (~allowed).astype(np.uint8), np.array([-1.5, 0, -1.5])
+    scene = FeatureVolume(np.zeros((1, *occupancy.shape), np.float32), occupancy, origin, 0.1)
+    start = rng.uniform([-0.5, 0, -0.5], [0.5, 0.5, 0.5], (60, 3))
+    goals = rng.uniform([-1.5, 0, -1.5], [1.5, 0.5, 1.5], (60, 3))
+    scenes = Scenes((scene,), (allowed,), np.zeros(1, int))
+    ours = SceneConstraint(scenes, np.tile(np.eye(4), (60, 1, 1)), None).goals_on_support(goals, start)
+    theirs = asked_of_the_page(
+        "senses.turnedFree(path[0], path[1])",
+        volume={"shape": [1, *occupancy.shape], "origin": origin.tolist(), "voxel_m": 0.1},
+        marks=allowed.ravel().astype(int).tolist(),
+        paths=np.stack([goals, start], axis=1).tolist(),
+    )
+    as_far = np.isclose(*(np.linalg.norm(end - start, axis=1) for end in (ours, goals)))
+    assert as_far.mean() > 0.9 and not scenes.inside_solid(ours[:, None], None).any()
+    assert (np.linalg.norm(ours - goals, axis=1)[as_far] > 0.01).any()
+    np.testing.assert_allclose(theirs[as_far], ours[as_far], atol=1e-12)

@@ -60,16 +60,12 @@ export class Sampler {
   }
 
   // Scaled goals, `count` of them, three numbers each.
-  goals(codes, count, { noise, steps, interactivity, method, draw, frame }) {
+  async goals(codes, count, { noise, steps, interactivity, method, draw, frame }) {
     const denoise = (code) => (x, t) =>
       this.networks.goal({ x: [x, [count, 3]], ...this.step(count, t, code) });
-    return this.run(denoise(codes.full), denoise(codes.withoutObserver), noise, {
-      method,
-      count: steps,
-      draw,
-      interactivity,
-      correct: frame && ((clean) => this.goalsCleared(frame, clean)),
-    });
+    const options = { method, count: steps, draw, interactivity };
+    const drawn = await this.run(denoise(codes.full), denoise(codes.withoutObserver), noise, options);
+    return frame ? this.goalsCleared(frame, codes.start, drawn) : drawn;
   }
 
   // Scaled paths [3, frames] towards scaled goals, and others for those that miss it although guidance
@@ -134,11 +130,11 @@ export class Sampler {
   }
 
   // Scaled goals, moved to where the animal may rest, on what carries it.
-  goalsCleared(frame, scaled) {
-    const egoFromWorld = inverse(frame);
+  goalsCleared(frame, start, scaled) {
+    const [egoFromWorld, from] = [inverse(frame), apply(frame, start)];
     return Float32Array.from(
       this.goalsInWorld(frame, scaled).flatMap((goal) => {
-        const [x, y, z] = this.senses.cleared(goal);
+        const [x, y, z] = this.senses.turnedFree(goal, from);
         return Array.from(
           this.scaled(apply(egoFromWorld, [x, this.senses.support.carried([x, y, z], false), z])),
         );

@@ -25,6 +25,7 @@ const UPRIGHT = 0.2;
 const [PERSON, ANIMAL] = [0, 1]; // kinds of others
 const ABSENT_M = 1000; // where somebody is put who is not there
 const ROOT_CHANNELS = 6;
+const TURNS = 8; // by which goals get out of something solid, up to a right angle either way
 const WITHIN = 0.01; // how far inside an allowed voxel a point is put, in edges of the voxel
 
 export class Senses {
@@ -150,6 +151,19 @@ export class Senses {
       const low = origin[axis] + (index + WITHIN) * voxel;
       return Math.min(low + (1 - 2 * WITHIN) * voxel, Math.max(low, point[axis]));
     });
+  }
+
+  // A goal, turned about where the animal is, as little as possible, to where the root may be; else cleared.
+  turnedFree(goal, start) {
+    const [cleared, [x, y, z]] = [this.cleared(goal), goal.map((value, axis) => value - start[axis])];
+    const nearer = (cleared[0] - goal[0]) * z >= (cleared[2] - goal[2]) * x ? 1 : -1;
+    for (let turns = 0; turns <= 2 * TURNS; turns++) {
+      const angle = (nearer * Math.ceil(turns / 2) * (turns % 2 ? 1 : -1) * Math.PI) / 2 / TURNS;
+      const [cosine, sine] = [Math.cos(angle), Math.sin(angle)];
+      const turned = [cosine * x + sine * z, y, cosine * z - sine * x].map((value, axis) => start[axis] + value);
+      if (this.allows(turned)) return turned;
+    }
+    return cleared;
   }
 
   pastChannels(egoFromWorld, rows) {
