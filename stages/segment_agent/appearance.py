@@ -9,6 +9,7 @@ of any size.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -48,43 +49,38 @@ CONTRAST, BRIGHTNESS = 0.2, 0.15
 
 @dataclass(frozen=True)
 class Example:
-    """A picture at working resolution and its labels: 255 animal, 0 not, 128 unknown."""
+    """A picture at working resolution, its colours first, and its labels: 255 animal, 0 not, 128 unknown."""
 
-    color: UInt8[np.ndarray, "height width 3"]
+    color: UInt8[np.ndarray, "height width channel"]
     labels: UInt8[np.ndarray, "height width"]
 
 
 class Appearance(nn.Module):
     """A U-shaped convolutional network of 80,000 weights from colours to log-odds of showing the animal."""
 
-    def __init__(self, widths: tuple[int, int, int, int] = (16, 24, 32, 48)) -> None:
+    def __init__(self, widths: tuple[int, int, int, int] = (16, 24, 32, 48), channels: int = 3) -> None:
         super().__init__()
         first, second, third, fourth = widths
-        self.down = nn.ModuleList(
-            [
-                _block(3, first, 2),
-                nn.Sequential(_block(first, second, 2), _block(second, second)),
-                nn.Sequential(_block(second, third, 2), _block(third, third)),
-                nn.Sequential(_block(third, fourth, 2), _block(fourth, fourth)),
-            ]
-        )
+        self.down = nn.ModuleList([_block(channels, first, 2)])
+        self.down.extend(nn.Sequential(_block(a, b, 2), _block(b, b)) for a, b in pairwise(widths))
         self.up = nn.ModuleList(
             [_block(fourth + third, third), _block(third + second, second), _block(second + first, first)]
         )
         self.out = nn.Sequential(nn.Conv2d(first, 4, 3, 1, 1), nn.PixelShuffle(2))
 
-    def forward(self, color: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch height width"]:
+    def forward(
+        self, color: Float[Tensor, "batch channel height width"]
+    ) -> Float[Tensor, "batch height width"]:
         """Return log-odds of pictures whose colours are -1..1 and whose sides are multiples of 16."""
         return GAIN * self.out(self.trunk(color))[:, 0]
 
     def trunk(
-        self, color: Float[Tensor, "batch 3 height width"]
+        self, color: Float[Tensor, "batch channel height width"]
     ) -> Float[Tensor, "batch channel row column"]:
         """Return what the last layer sees, at half the resolution."""
-        levels = []
+        levels = [color]
         for down in self.down:
-            color = down(color)
-            levels.append(color)
+            levels.append(down(levels[-1]))
         deep = levels.pop()
         for up in self.up:
             level = levels.pop()
@@ -102,7 +98,7 @@ class Appearance(nn.Module):
         return found[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
 
     @torch.no_grad()
-    def log_odds(self, color: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:
+    def log_odds(self, color: UInt8[np.ndarray, "height width channel"]) -> Float[np.ndarray, "height width"]:
         """Judge every pixel of a picture at working resolution, within +-8."""
         height, width = color.shape[:2]
         found = self.eval()(aligned(color))[0, :height, :width]
@@ -130,7 +126,7 @@ def learn(
     showing += room
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**31)))
-        network = Appearance()
+        network = Appearance(channels=showing[0].color.shape[-1])
     optimizer = torch.optim.AdamW(network.parameters(), RATE, weight_decay=WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=options.steps)
     mistakes = None
@@ -236,18 +232,19 @@ def _crop(
     color, labels = np.pad(color, [*short, (0, 0)], mode="edge"), np.pad(labels, short, constant_values=128)
     if rng.random() < 0.5:
         color, labels = color[:, ::-1], labels[:, ::-1]
-    shown = normalized(color) * (1 + CONTRAST * rng.normal()) + BRIGHTNESS * rng.normal()
-    return shown.float(), torch.from_numpy(labels.copy())
+    shown = normalized(color)
+    shown[:3] = shown[:3] * (1 + CONTRAST * rng.normal()) + BRIGHTNESS * rng.normal()
+    return shown, torch.from_numpy(labels.copy())
 
 
-def aligned(color: UInt8[np.ndarray, "height width 3"]) -> Float[Tensor, "1 3 row column"]:
+def aligned(color: UInt8[np.ndarray, "height width channel"]) -> Float[Tensor, "1 channel row column"]:
     """Return a picture as the networks take it: colours -1..1, widened to sides that are multiples of 16."""
     height, width = color.shape[:2]
     padded = np.pad(color, [(0, -height % ALIGNED_PX), (0, -width % ALIGNED_PX), (0, 0)], mode="edge")
     return normalized(padded)[None]
 
 
-def normalized(color: UInt8[np.ndarray, "height width 3"]) -> Float[Tensor, "3 height width"]:
+def normalized(color: UInt8[np.ndarray, "height width channel"]) -> Float[Tensor, "channel height width"]:
     """Return colours as -1..1, channels first."""
     return torch.from_numpy(np.ascontiguousarray(color.transpose(2, 0, 1))).float() / 127.5 - 1
 

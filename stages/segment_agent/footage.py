@@ -22,6 +22,8 @@ LEAST_MOVING = 0.3
 """share of a region that must move for motion to separate the animal from the rest"""
 LEAST_TYPICAL_PX = 0.5
 """typical residual that counts as noise of the flow"""
+SHOWN_GAPS, SHOWN_LOG = (1, 4), 60.0
+"""gaps over which a network is shown motion; 8-bit levels of log(1 + residual), for up to 70 residuals"""
 
 
 @dataclass(frozen=True)
@@ -87,10 +89,7 @@ class Footage:
         """
         far = ~grown(inside, REACH_PX)
         for gap in GAPS:
-            if (frame, gap) not in self._residuals:
-                small = np.minimum(self.residual(frame, gap), np.finfo(np.float16).max)
-                self._residuals[frame, gap] = small.astype(np.float16)
-            residual = self._residuals[frame, gap]
+            residual = self._residual_over(frame, gap)
             moves = residual[inside & (residual > MOVING)]
             if len(moves) > LEAST_MOVING * inside.sum():
                 level = float(np.median(moves))
@@ -98,6 +97,18 @@ class Footage:
                 alone = moving[far].sum() < LEAST_MOVING / 2 * far.sum()
                 return (moving.astype(np.float32) - (residual < max(STILL, level / 4))) * (alone & ~far)
         return np.zeros(self.size, np.float32)
+
+    def with_motion(self, frame: int) -> UInt8[np.ndarray, "height width 5"]:
+        """Return a working picture and how far points move against the background as two more channels."""
+        residual = np.stack([self._residual_over(frame, gap) for gap in SHOWN_GAPS], -1)
+        shown = np.minimum(SHOWN_LOG * np.log1p(residual.astype(np.float32)), 255)
+        return np.concatenate([self.color(frame), shown.astype(np.uint8)], -1)
+
+    def _residual_over(self, frame: int, gap: int) -> np.ndarray:
+        if (frame, gap) not in self._residuals:
+            small = np.minimum(self.residual(frame, gap), np.finfo(np.float16).max)
+            self._residuals[frame, gap] = small.astype(np.float16)
+        return self._residuals[frame, gap]
 
     def _resized(self, image: np.ndarray) -> np.ndarray:
         return cv2.resize(image, self.size[::-1], interpolation=cv2.INTER_LINEAR)

@@ -1,7 +1,7 @@
 """A user's hint where the animal is: a box or a click in one frame, read from `<recording>.prompt.toml`."""
 
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -62,11 +62,8 @@ def place(prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "fram
     x0, y0, x1, y1 = prompt.box_px
     distance = rigid.apply(rigid.inverse(world_from_camera[prompt.frame]), centre[None])[0, 2]
     half_m = max(x1 - x0, y1 - y0) / 2 * distance / clip.intrinsics[prompt.frame, 0, 0]
-    return (
-        Hint(prompt.frame, centre, FORESHORTENED * half_m)
-        if half_m > LEAST_BOX_M
-        else Hint(prompt.frame, centre)
-    )
+    hint = Hint(prompt.frame, centre)
+    return replace(hint, reach_m=FORESHORTENED * half_m) if half_m > LEAST_BOX_M else hint
 
 
 def position(

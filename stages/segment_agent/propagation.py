@@ -1,18 +1,19 @@
 """Carry the mask of one frame through a recording without depth.
 
 The log-odds of all pixels of all frames are a mean field (Krahenbuhl and Koltun 2011), updated frame by
-frame, forward and back. The unary is what the network of `appearance` makes of the colors, and whether a
-point moves against the background. Messages come from the frames 1, 2, 4 and 8 before and after along the
-flow, as far as its two directions agree, and from neighbors in the picture up to its edges (domain transform,
-Gastal and Oliveira 2011). The network learns from the one mask, then from all frames where motion does not
-contradict. It corrects the first mask, too, within the hinted box.
+frame, forward and back. The unary is the mean of two networks of `appearance`, of which one sees motion
+against the background beside the colors. Messages come from the frames 1, 2, 4 and 8 before and after along
+the flow, as far as its two directions agree, and from neighbors in the picture up to its edges (domain
+transform, Gastal and Oliveira 2011). The networks learn from the one mask, then from all frames where motion
+does not contradict. They correct the first mask, too, within the hinted box.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from pipeline.data.flow import GAPS
 from pipeline.geometry import subsampling
@@ -22,8 +23,8 @@ from stages.segment_agent.footage import REACH_PX, Footage, grown, pixels
 
 SURE, LEAST = 4.0, 0.5
 """largest and smallest log-odds of a pixel; the largest of the network's judgement too"""
-MESSAGE, MOTION, SMOOTHING = 0.6, 1.0, 4.0
-"""weights of messages in time (log-odds), of motion (-1..1), and of messages in the picture (-1..1)"""
+MESSAGE, SMOOTHING = 0.6, 4.0
+"""weights of messages in time (log-odds) and in the picture (-1..1)"""
 DOUBT = 0.15
 """confidence of flow that is worth half a message"""
 SPATIAL_PX, EDGE = 10.0, 25.0
@@ -39,6 +40,7 @@ CROP_PX, STEPS = 112, (80, 120, 120)
 LogOdds = Float[np.ndarray, "height width"]
 Labels = list[LogOdds | None]
 """log-odds by frame; None where nothing is known yet"""
+Picture = Callable[[int], UInt8[np.ndarray, "height width channel"]]
 
 
 def propagate(
@@ -50,19 +52,23 @@ def propagate(
     found[hinted], possible = first, first > LEAST - SURE
     forward = [*frames[hinted + 1 :], *frames[:hinted][::-1]]
     for turn, steps in enumerate(STEPS):
-        shown, options = examples(footage, found, hinted, learning.examples), replace(learning, steps=steps)
-        network = learn(shown, replace(options, crop_px=CROP_PX), rng, least_px=1, scaled=0.0)
-        assert network is not None, "the hinted frame shows the animal"
-        judged = [network.log_odds(footage.color(frame)).astype(np.float16) for frame in frames]
+        options = replace(learning, steps=steps, crop_px=CROP_PX)
+        judged = np.zeros((len(frames), *footage.size), np.float16)
+        for picture in (footage.color, footage.with_motion):
+            shown = examples(footage, found, hinted, learning.examples, picture)
+            network = learn(shown, options, rng, least_px=1, scaled=0.0)
+            assert network is not None, "the hinted frame shows the animal"
+            for frame in frames:
+                judged[frame] += network.log_odds(picture(frame)) / 2
         judged[hinted][~possible] = -np.inf
         for frame in [*(forward[::-1] if turn else []), *forward, hinted]:
             found[frame] = updated(footage, frame, judged[frame], found)
     return [each.astype(np.float32) for each in found if each is not None]
 
 
-def examples(footage: Footage, found: Labels, hinted: int, count: int) -> list[Example]:
-    """Label so many frames, evenly chosen, as far as they are sure and motion does not contradict; the hinted
-    one is repeated."""
+def examples(footage: Footage, found: Labels, hinted: int, count: int, picture: Picture) -> list[Example]:
+    """Label so many pictures of frames, evenly chosen, as far as they are sure and motion does not
+    contradict; the hinted one is repeated."""
     chosen = subsampling.evenly(len(found), count, rounded=True).tolist()
     shown = []
     for frame in (hinted, *(each for each in chosen if each != hinted)):
@@ -70,18 +76,18 @@ def examples(footage: Footage, found: Labels, hinted: int, count: int) -> list[E
         if log_odds is not None:
             sure = (np.abs(log_odds) >= CERTAIN) & (log_odds * footage.moving(frame, log_odds > 0) >= 0)
             labels = np.where(sure, np.where(log_odds > 0, 255, 0), 128)
-            shown.append(Example(footage.color(frame), labels.astype(np.uint8)))
+            shown.append(Example(picture(frame), labels.astype(np.uint8)))
     return shown[:1] * max(1, round(HINTED_SHARE * len(chosen))) + shown[1:]
 
 
 def updated(footage: Footage, frame: int, judged: LogOdds, found: Labels) -> LogOdds:
-    """Update one frame from what the network makes of it, motion and messages; only what is connected with
-    the carried mask stays."""
+    """Update one frame from what the networks make of it and messages; only what is connected with the
+    carried mask stays."""
     carried = message(footage, frame, found)
     seen = bool((carried > 0).any())
     near = (grown(carried > 0, REACH_PX) | (not seen)) & (judged != -np.inf)
     log_odds = np.clip(judged, -SURE, SURE).astype(np.float32) + MESSAGE * carried
-    log_odds = np.where(near, log_odds + MOTION * footage.moving(frame, carried > 0), -SURE)
+    log_odds = np.where(near, log_odds, -SURE)
     around = cv2.ximgproc.dtFilter(
         footage.color(frame), np.tanh(log_odds / 2), SPATIAL_PX, EDGE, mode=cv2.ximgproc.DTF_RF
     )

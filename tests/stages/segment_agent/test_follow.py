@@ -107,7 +107,9 @@ def test_motion_speaks_for_what_moves_and_against_what_does_not(walk):
     moving = footage.moving(4, inside)
     assert (moving[masks[4]] > 0).mean() > 0.6 and (moving[masks[4]] < 0).mean() < 0.1
     assert (moving[84:94, 40:80] < 0).mean() > 0.9
-    labels = examples(footage, [None, None, None, None, np.where(inside, SURE, -SURE)], 4, 5)[0].labels
+    labels = examples(
+        footage, [None, None, None, None, np.where(inside, SURE, -SURE)], 4, 5, footage.with_motion
+    )[0].labels
     assert (labels[84:94, 40:80] == 128).mean() > 0.9 and (labels[masks[4]] == 255).mean() > 0.6
 
 
