@@ -1,6 +1,4 @@
-"""No path leads through somebody's body: paths are led around it, or wait. `avoidance.js` of the page does so
-too.
-"""
+"""No path leads through a body: paths go around it, or wait. `avoidance.js` of the page does so too."""
 
 from collections.abc import Callable
 

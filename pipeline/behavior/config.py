@@ -4,14 +4,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 Ego = Literal["yaw", "full", "world"]
-"""Ego frame: the root's heading, its full rotation as in the paper, or, as an ablation, the world's axes and
-origin."""
+"""Ego frame: the root's heading, its full rotation as in the paper, or, as an ablation, the world's axes."""
 Family = Literal["diffusion", "gaussian", "one_stage"]
-"""What is learned: goal, path and body by diffusion; each as a Gaussian; path and body at once without a
-goal."""
+"""What is learned: goal, path and body by diffusion; each as a Gaussian; path and body without a goal."""
 Control = Literal["unet", "concatenation"]
-"""How goal and path condition a UNet: through a second UNet (ControlNet), or as one more part of the
-perception code."""
+"""How goal and path condition a UNet: by a second UNet (ControlNet), or as a part of perception."""
 SceneEncoder = Literal["pillars", "volume", "none"]
 """2.5-D encoder with height in channels, the six 3-D convolutions of the paper, or no encoder, for
 trajectories without a map."""

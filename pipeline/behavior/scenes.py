@@ -158,9 +158,7 @@ class SceneConstraint:
     def out_of_solid(
         self, points_ego: Float[np.ndarray, "plan point 3"]
     ) -> Float[np.ndarray, "plan point 3"]:
-        """Move points out of what is solid; as many plans per agent as there are, those of an
-        agent together.
-        """
+        """Move points out of what is solid; as many plans per agent as there are, an agent's together."""
         frame, video = self._of_plans(len(points_ego))
         moved = self.scenes.out_of_solid(rigid.apply(frame, points_ego), video)
         return rigid.apply(rigid.inverse(frame), moved)
@@ -189,9 +187,7 @@ class SceneConstraint:
         start_ego: Float[np.ndarray, "plan 3"],
         rate_hz: float = RATE_HZ,
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Put paths, which begin a frame after ``start_ego``, on what carries the agent; steps
-        become jumps.
-        """
+        """Put paths, which begin a frame after ``start_ego``, on what carries the agent; steps are jumps."""
         frame, video = self._of_plans(len(path_ego))
         start, path = rigid.apply(frame, start_ego[:, None]), rigid.apply(frame, path_ego)
         step = np.diff(path[..., [0, 2]], axis=1, prepend=start[..., [0, 2]])

@@ -31,8 +31,7 @@ SOFTNESS_M = (0.003, 0.006)
 """range of the density's scale beta: sharper ones lose the gradient between samples, softer ones blur thin
 limbs and give everything a rim, which is rendered between it and what lies behind"""
 START_SOFTNESS_M, START_RANGE_M = 0.1, (0.004, 0.2)
-"""beta and its range where rendering alone has to find surfaces: samples lie about a decimetre apart at
-first"""
+"""beta and its range where rendering alone finds surfaces: samples are a decimetre apart at first"""
 START_SATURATION = 0.9
 """share of the truncation that an untrained distance stays below: at 1 its tanh has no gradient"""
 START_LOG_BETA = -5.1
@@ -68,8 +67,7 @@ class FieldShape:
     truncation_m: float | None = None
     """signed distances saturate here; None = never"""
     encoding: Literal["grid", "mlp"] = "grid"
-    """dense grids, or the paper's MLP with positional encoding, with wavelengths down to twice the finest
-    cell"""
+    """dense grids, or the paper's MLP, positionally encoded, with wavelengths down to two finest cells"""
     starts_as_box: bool = False
     """signed distance is learned relative to that inside the box, for geometry learned by rendering alone"""
 

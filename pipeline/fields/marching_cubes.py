@@ -82,8 +82,7 @@ def extract_moved(field: Field, code: int) -> Mesh:
 
 @torch.no_grad()
 def on_surface(field: Field, points: Float[np.ndarray, "point 3"], code: int) -> Bool[np.ndarray, "point"]:
-    """Return which points lie on a surface of one video's scene (-1: the shared one), within half of the
-    truncation."""
+    """Return which points lie within half a truncation of a surface of a video's scene (-1: the shared)."""
     assert field.fused is not None, "only fused scenes have a truncation of their own"
     at = torch.from_numpy(np.asarray(points, np.float32)).to(field.log_beta.device)
     distance_m = field.distance_at(at, torch.full((len(at),), code, device=at.device))

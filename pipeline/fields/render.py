@@ -243,8 +243,7 @@ class Renderer:
     def __init__(
         self, reconstruction: Reconstruction, video: str | None = None, agent_step_m: float = 0.0075
     ):
-        """``video`` chooses the scene's code (None: the shared scene); the step is the resolution of the
-        agent's mesh."""
+        """``video``: the scene's code (None: the shared scene); the step is that of the agent's mesh."""
         self.reconstruction = reconstruction
         self.code = reconstruction.video_code(video)
         self.device = reconstruction.scene.log_beta.device

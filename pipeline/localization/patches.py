@@ -44,8 +44,7 @@ class PatchSampling:
 
     target: Target
     focal_px: float
-    """Scene: pictures are resized to this focal length, pixels. Agent: crops are resized to so many pixels
-    per metre."""
+    """Scene: pictures get this focal length, pixels. Agent: crops get so many pixels per metre."""
     window_px: int
     """Agent: edge of the square crop, pixels; scene: unused."""
     stride_px: int

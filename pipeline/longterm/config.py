@@ -35,9 +35,7 @@ class LongTermOptimizerConfig:
     batch: int = 48
     """examples a step"""
     rate: float = 2e-3
-    """peak learning rate; falls to nothing along a cosine (the paper: 1e-3, and five to twenty times the
-    steps)
-    """
+    """peak learning rate; falls along a cosine (the paper: 1e-3, and five to twenty times the steps)"""
 
 
 @dataclass(frozen=True)

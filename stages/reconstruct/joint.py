@@ -33,8 +33,7 @@ FIELD_POINTS, TEMPLATE_POINTS = 512, 4096
 EIKONAL_STEP_M = 0.01
 """step of finite differences, below the finest cell of the agent's grids"""
 TEMPLATE_COLOR, TEMPLATE_FEATURE = 20.0, 0.3
-"""weights of color and features against signed distance while the field copies the template: colors take
-longest"""
+"""weights of color and features against signed distance while the field copies the template"""
 LEAST_FLOW_CONFIDENCE, LEAST_OPACITY = 25, 0.5
 """flow is compared where its confidence (of 255) and the rendered opacity are above these"""
 NEAREST_M = 0.1
@@ -47,8 +46,7 @@ class JointLoss:
     def __init__(
         self, problem: Problem, weights: LossWeights, batches: RayBatches, steps: int, rendered: bool = False
     ):
-        """``rendered``: rays are sampled evenly and by importance, not around measured depth (paper 001,
-        A.1)."""
+        """``rendered``: rays sampled evenly and by importance, not around measured depth (001, A.1)."""
         self.problem, self.weights, self.batches, self.steps = problem, weights, batches, steps
         self.scene_loss = SceneLoss(problem, weights, batches, steps, rendered)
         self.run_frames = RUN_FRAMES if len(problem.runs(RUN_FRAMES)) else 1
@@ -71,8 +69,7 @@ class JointLoss:
         return losses.weighted(terms, shared=True)
 
     def _rendered(self, pose: Pose, number: int, probability: float, generator: Generator) -> Terms:
-        """Render ``number`` rays per frame on and around the agent through both fields and compare all
-        observations."""
+        """Render ``number`` rays per frame on and around the agent through both fields; compare with all."""
         problem, samples = self.problem, self.batches.rendered_samples
         rays = problem.store.agent.at(problem.agent_rays.pick(pose.frame, number, generator).flatten())
         has_scene = problem.has_scene[rays.frame]
@@ -108,8 +105,7 @@ class JointLoss:
 def sample_points(
     pose: Pose, rays: Rays, depth: Float[Tensor, "ray sample"]
 ) -> tuple[Float[Tensor, "ray sample 3"], Float[Tensor, "frame point 3"]]:
-    """Return samples of rays ``[frame * ray]`` in the world, and per frame relative to the agent's root,
-    metres."""
+    """Return samples of rays ``[frame * ray]`` in the world, and per frame in the agent's frame, metres."""
     points_camera = (rays.direction[:, None] * depth[..., None]).view(len(pose.frame), -1, 3)
     world = rigid_torch.apply(pose.world_from_camera, points_camera).view(*depth.shape, 3)
     return world, rigid_torch.apply(pose.agent_from_camera, points_camera)

@@ -27,8 +27,7 @@ LEAST_SLOPE = 0.3
 REACH_M = 0.15
 """half of the samples of rendered rays lie this near to measured depth"""
 SEARCH_SAMPLES = 64
-"""even samples that find the surface where no depth was measured: a fused one is about as thick as their
-spacing"""
+"""even samples that find the surface where no depth is: a fused one is as thick as their spacing"""
 EIKONAL_STEP_M = 0.04
 """step of finite differences, half a cell of the finest grid"""
 EIKONAL_SHARE = 8
@@ -64,8 +63,7 @@ def world_rays(motion: MotionTable, rays: Rays) -> tuple[Float[Tensor, "ray 3"],
 
 
 def sample_depths(rays: Rays, reach_m: float, generator: Generator) -> Float[Tensor, "ray sample"]:
-    """Return the measured depth, `NEAR` samples from ``reach_m`` before it to just behind, and `FREE` before
-    those; metres."""
+    """Return the depth, `NEAR` samples from ``reach_m`` before to just behind it, `FREE` before; metres."""
     depth = rays.depth[:, None]
     place = torch.rand(len(rays), NEAR, generator=generator).to(depth.device)
     around = place * (reach_m / rays.slope[:, None].clamp_min(LEAST_SLOPE) + BEHIND_M) - BEHIND_M
@@ -127,8 +125,7 @@ def rendered_terms(
     weights: LossWeights,
     depth: Float[Tensor, "ray sample"],
 ) -> Terms:
-    """Fit the scene by volume rendering at samples ``depth``, metres: any rays, with or without measured
-    depth."""
+    """Fit the scene by volume rendering at samples ``depth``, metres, of rays with and without depth."""
     origin, direction = world_rays(problem.motion, rays)
     points = origin[:, None] + direction[:, None] * depth[..., None]
     scene = scene_layer(problem, points, problem.video[rays.frame], code_of)

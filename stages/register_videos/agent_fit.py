@@ -39,8 +39,7 @@ PRIOR_POINTS, POINT_SIGMA_M, DAMPING = 20, 0.03, 1e-6
 PREDICTED_POINTS, LEAVING_COST_M = 40, 0.002
 """Points that a predicted pose counts as, and cost of leaving it by one standard deviation, metres."""
 LEAST_POINTS, LEAST_ERODED_PX, NEAREST_M = 25, 60, 0.1
-"""Depth points without which there is no observation, pixels that the eroded mask must keep, least depth
-(metres)."""
+"""Depth points that an observation needs, pixels that the eroded mask keeps, least depth (metres)."""
 RADIUS, FULL_VIEW, DEPTH_SHARE = 0.75, 0.3, 0.1
 """In body lengths: radius around the median that points must lie in, silhouette area in full view (squared),
 and distance from the seen side to the middle."""

@@ -35,8 +35,7 @@ SMOOTHING_PASSES, SMOOTHING_REACH = 2, 3
 OUTLIER_SCALE = (0.35, 0.1)
 """Deviation (radians, metres) at which a neighbour's weight is halved."""
 LEAST_SHARE, COST_DECAY_M, SLOPE_RIDGE_S2 = 0.05, 0.02, 1e-4
-"""Weight of hardly visible frames, cost at which weights fall to 1/e (metres), ridge on the slope (square
-seconds)."""
+"""Weight of hardly visible frames, cost where weights are 1/e (metres), ridge on the slope (s^2)."""
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ MATCHED, LEAST_SHARED = 6, 0.15
 """Pictures that a frame is matched with, those that show most of its points, and the least share of them,
 times the cosine between both axes."""
 REACH_SHARE, REACH_M = 0.03, 0.15
-"""Matches lie as near as this where the present cameras place them: share of the picture's width, metres of
-depth."""
+"""Matches lie as near where present cameras place them: share of the picture's width, metres of depth."""
 
 
 @dataclass(frozen=True)

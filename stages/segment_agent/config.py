@@ -47,8 +47,7 @@ class Config:
     """How the animal is found in one recording."""
 
     backend: Literal["weightless", "foundation"] = "weightless"
-    """By motion, free space and appearance, or by Grounding DINO and SAM 2 (`make extras`, and their
-    checkpoints)."""
+    """By motion, free space and appearance, or by Grounding DINO and SAM 2 (`make extras`, weights)."""
     foundation: FoundationConfig = field(default_factory=FoundationConfig)
     """Settings of the latter."""
     learning: LearningConfig = field(default_factory=LearningConfig)

@@ -40,8 +40,7 @@ def follow(
 
 
 def cut_out(footage: Footage, hint: Prompt, rng: np.random.Generator) -> Float[np.ndarray, "height width"]:
-    """Cut the animal out of the hinted frame: log-odds, -`SURE` outside of the box; a click stands for a box
-    around it."""
+    """Cut the animal out of the hinted frame, or of a box around a click: log-odds, -`SURE` outside."""
     color = footage.color(hint.frame)
     height, width = color.shape[:2]
     x0, y0, x1, y1 = np.array(hint.box_px) * height / footage.clip.color_size[0]

@@ -12,8 +12,7 @@ from pipeline.data.flow import GAPS, open_confidence, open_flow
 from stages.segment_agent.windows import working_picture, working_size
 
 SPARSE_PX, INLIER_PX, AGREED = 8, 2.0, 0.3
-"""distance of the pixels that the background's homography is fitted to, how far they may miss it, and the
-least confidence of their flow"""
+"""the background's homography: spacing of its pixels, their largest error, the flow's least confidence"""
 MOVING, STILL = 4.0, 2.5
 """typical residuals from which on a point moves against the background, and up to which it does not"""
 REACH_PX, OUTLINE_PX = 16, 3

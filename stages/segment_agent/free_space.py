@@ -5,6 +5,7 @@ that an animal that rests for a while is recognised by the times when its place 
 O(references) a frame.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -30,8 +31,7 @@ NEAREST_M = 0.1
 NOISE_REACH_M = 0.15
 """largest difference that may be noise of a surface seen twice, and not another surface"""
 LEAST_PAIRS, MAD_TO_SIGMA, LEAST_NOISE_M = 200, 1.48, 0.002
-"""differences that a range needs to have its noise measured, a normal deviation in median absolute ones, and
-the least deviation of any sensor"""
+"""differences that measure a range's noise, MAD to sigma, and the least deviation of any sensor"""
 SOFTNESS_PX = 1.2
 """deviation of the blur before colours are compared"""
 INNER_WIDTH_PX = 320
@@ -69,8 +69,7 @@ class References:
     frame: Int[np.ndarray, "reference"]
     noise: DepthNoise
     ignored: Callable[[int, Float[np.ndarray, "*shape 3"]], Bool[np.ndarray, "*shape"]] | None = None
-    """which points (world, metres) of a frame are people's, whose motion is no animal's: none sees through
-    them"""
+    """which points (world, metres) of a frame are people's, whose motion is no animal's"""
 
 
 @dataclass(frozen=True)
@@ -112,6 +111,21 @@ def points_of(
     points = rigid.apply(world_from_camera, (rays * depth[..., None]).reshape(-1, 3)).reshape(*depth.shape, 3)
     points[depth == 0] = np.nan
     return points
+
+
+def sample(
+    clip: Clip,
+    frame: int,
+    world_from_camera: Float[np.ndarray, "4 4"],
+    depth: Float[np.ndarray, "height width"],
+    wanted_px: int,
+) -> tuple[Float[np.ndarray, "row column 3"], Float[np.ndarray, "row column"], tuple[slice, slice]]:
+    """Take about ``wanted_px`` squared pixels of a depth picture: `points_of`, the area of each, which."""
+    stride = max(1, round(math.sqrt(depth.size) / wanted_px))
+    chosen = np.s_[stride // 2 :: stride, stride // 2 :: stride]
+    focal_px2 = clip.depth_intrinsics[frame, 0, 0] * clip.depth_intrinsics[frame, 1, 1]
+    points = points_of(clip, frame, world_from_camera, depth, stride)
+    return points, (depth[chosen] * stride) ** 2 / focal_px2, chosen
 
 
 def gather(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], count: int) -> References:
@@ -186,8 +200,7 @@ def soft_color(
 def vote(
     references: References, points_world: Float[np.ndarray, "*shape 3"], frame: int, surfaces: bool = False
 ) -> Votes:
-    """Let all references but the frame itself judge points (world, metres; NaN gets no vote); colors are 0
-    without ``surfaces``."""
+    """Let all other references judge points (world, metres; NaN: none); colors only with ``surfaces``."""
     known = np.isfinite(points_world[..., 0])
     points = np.ascontiguousarray(points_world[known], np.float32)
     other = np.flatnonzero((references.frame != frame) & _looking_at(references, points))

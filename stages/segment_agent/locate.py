@@ -1,16 +1,15 @@
 """Where the animal of a session is: a ball per frame, by what moves and, once learned, by its looks."""
 
-import math
 from collections.abc import Callable
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Shaped
 
 from pipeline.data.clips import Clip
 from stages.segment_agent import free_space, identity, movers
 from stages.segment_agent.config import AnimalConfig
-from stages.segment_agent.free_space import References
+from stages.segment_agent.free_space import References, Votes
 from stages.segment_agent.movers import Candidate, Hint
 from stages.segment_agent.windows import Sphere, supported_depth
 
@@ -100,37 +99,39 @@ def _candidates(
     """
     appearance, apart = known
     wanted_px = COARSE_PX if appearance is None else FINE_PX
-    stride = max(1, round(math.sqrt(math.prod(clip.depth_size)) / wanted_px))
-    chosen = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     whole = free_space.inner_depth(clip, frame) if appearance is None else supported_depth(clip, frame)
-    points, depth = free_space.points_of(clip, frame, world_from_camera, whole, stride), whole[chosen]
+    points, area, chosen = free_space.sample(clip, frame, world_from_camera, whole, wanted_px)
     if appearance is not None:
-        like = _sampled(appearance(frame), clip.depth_size, chosen)
-        depth = np.where(like > -movers.CLEAR_MOTION, depth, 0)
-        points[depth == 0] = np.nan
+        like = sampled(appearance(frame), clip.depth_size, chosen)
+        area = np.where(like > -movers.CLEAR_MOTION, area, 0)
+        points[area == 0] = np.nan
     votes = free_space.vote(references, points, frame)
-    area = (depth * stride) ** 2 / (clip.depth_intrinsics[frame, 0, 0] * clip.depth_intrinsics[frame, 1, 1])
     if appearance is None:
-        surely = movers.surely_moving(votes, share)
-        solid = cv2.dilate(cv2.erode(surely.astype(np.uint8), SOLID), SOLID[::-1, ::-1], anchor=(0, 0)) > 0
-        solid &= surely
+        moving = solid(votes, share)
         if apart is None:
-            return movers.candidates(solid, np.ones(depth.shape), points, area, animal)
-        own, probability = identity.of_one(solid, _sampled(apart(frame), clip.depth_size, chosen))
+            return movers.candidates(moving, np.ones(area.shape), points, area, animal)
+        own, probability = identity.of_one(moving, sampled(apart(frame), clip.depth_size, chosen))
         return movers.candidates(own, probability, points, area, animal)
     motion = movers.motion(votes)
     settled = (votes.occupied > 0) & (motion == 0)
     limited = np.clip(like, -movers.APPEARANCE_LIMIT, movers.APPEARANCE_LIMIT)
     both = limited + motion - movers.SETTLED * settled
     if apart is not None:
-        both += np.minimum(_sampled(apart(frame), clip.depth_size, chosen), 0)
-    both[depth == 0] = -movers.APPEARANCE_LIMIT
+        both += np.minimum(sampled(apart(frame), clip.depth_size, chosen), 0)
+    both[area == 0] = -movers.APPEARANCE_LIMIT
     return movers.candidates(both > 0, 1 / (1 + np.exp(-both)), points, area, animal)
 
 
-def _sampled(
-    picture: Float[np.ndarray, "height width"], size: tuple[int, int], chosen: tuple[slice, slice]
-) -> Float[np.ndarray, "row column"]:
+def solid(votes: Votes, share: float) -> Bool[np.ndarray, "row column"]:
+    """Return which samples surely move, but for what is thinner than `SOLID`."""
+    surely = movers.surely_moving(votes, share)
+    opened = cv2.dilate(cv2.erode(surely.astype(np.uint8), SOLID), SOLID[::-1, ::-1], anchor=(0, 0))
+    return surely & (opened > 0)
+
+
+def sampled(
+    picture: Shaped[np.ndarray, "height width"], size: tuple[int, int], chosen: tuple[slice, slice]
+) -> Shaped[np.ndarray, "row column"]:
     """Read a picture where the chosen pixels of a picture of another (height, width) lie."""
     sides = zip(size, picture.shape, chosen, strict=True)
     at = (((np.arange(side)[part] + 0.5) * (own / side)).astype(int) for side, own, part in sides)

@@ -22,6 +22,7 @@ from stages.segment_agent.footage import Footage
 from stages.segment_agent.free_space import References
 from stages.segment_agent.locate import AppearanceOf, find_mover
 from stages.segment_agent.movers import Hint
+from stages.segment_agent.overlap import Shown
 from stages.segment_agent.painting import Mask, Painter, learn_palette
 from stages.segment_agent.people import People
 from stages.segment_agent.prompt import Prompt
@@ -57,6 +58,10 @@ class Segmentation:
     """People in a session with depth."""
     strangers: float | None = None
     """Share of frames in which something moves about that is none of several animals."""
+    references: References | None = None
+    """Depth pictures that judge the masks; None without depth."""
+    shown: Shown = "mover"
+    """What the masks are of."""
 
 
 def segment(
@@ -86,12 +91,15 @@ def segment(
     mark = None if hint is None else prompts.place(hint, clip, poses)
     match role:
         case "turnaround":
-            return Segmentation(_standing(clip, poses, mark, config).masks(range(len(clip))), path)
+            masks = _standing(clip, poses, mark, config).masks(range(len(clip)))
+            references = free_space.gather(clip, poses, config.references)
+            return Segmentation(masks, path, references=references, shown="rester")
         case "session":
             references, walkers = people.set_apart(clip, poses, config.references)
             painter = _moving(clip, poses, references, mark, config, rng)
             masks = people.hide(painter.masks(range(len(clip))), walkers, clip, poses)
-            return Segmentation(masks, path, walkers)
+            shown = "mover" if mark is None else "rester"
+            return Segmentation(masks, path, walkers, references=references, shown=shown)
         case _:
             assert_never(role)
 

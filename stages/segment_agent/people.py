@@ -131,14 +131,11 @@ def _upright(
     clip: Clip, frame: int, world_from_camera: Float[np.ndarray, "4 4"], references: References
 ) -> tuple[list[UprightMover], Float[np.ndarray, "height"]]:
     """Group the moving points of a frame, and keep what is upright; and return the height of low surfaces."""
-    stride = max(1, round(np.sqrt(np.prod(clip.depth_size)) / COARSE_PX))
-    chosen = np.s_[stride // 2 :: stride, stride // 2 :: stride]
-    whole = free_space.inner_depth(clip, frame)
-    points, depth = free_space.points_of(clip, frame, world_from_camera, whole, stride), whole[chosen]
-    heights = points[depth > 0, 1]
+    inner = free_space.inner_depth(clip, frame)
+    points, area, _ = free_space.sample(clip, frame, world_from_camera, inner, COARSE_PX)
+    heights = points[area > 0, 1]
     low = np.quantile(heights, [FLOOR_QUANTILE]) if len(heights) else np.zeros(0)
     moving = movers.moving(free_space.vote(references, points, frame))
-    area = (depth * stride) ** 2 / (clip.depth_intrinsics[frame, 0, 0] * clip.depth_intrinsics[frame, 1, 1])
     found = []
     for own in movers.groups(moving):
         group = points[own]

@@ -56,8 +56,7 @@ def parse(path: Path, clip: Clip) -> Prompt:
 
 
 def place(prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Hint:
-    """Take a prompt to the world; a box gives how far the animal reaches. Raises InputError MSK-002 without
-    depth there."""
+    """Take a prompt to the world; a box says how far the animal reaches. Raises InputError MSK-002."""
     centre = position(prompt, clip, world_from_camera)
     x0, y0, x1, y1 = prompt.box_px
     distance = rigid.apply(rigid.inverse(world_from_camera[prompt.frame]), centre[None])[0, 2]
@@ -69,8 +68,7 @@ def place(prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "fram
 def position(
     prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]
 ) -> Float[np.ndarray, "3"]:
-    """Return the nearest surface in the middle third of the box, in the world. Raises InputError MSK-002
-    without depth there."""
+    """Return the nearest surface in the box's middle third, in the world. Raises InputError MSK-002."""
     x0, y0, x1, y1 = prompt.box_px
     scale = np.array([clip.depth_size[1] / clip.color_size[1], clip.depth_size[0] / clip.color_size[0]])
     centre = np.array([x0 + x1, y0 + y1]) / 2 * scale

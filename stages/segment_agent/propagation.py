@@ -28,8 +28,7 @@ MESSAGE, SMOOTHING = 0.6, 4.0
 DOUBT = 0.15
 """confidence of flow that is worth half a message"""
 SPATIAL_PX, EDGE = 10.0, 25.0
-"""reach of messages in the picture, working pixels as all here, and the change of color (of 255) that stops
-them"""
+"""reach of messages, working pixels as all here, and the change of color (of 255) that stops them"""
 CONNECTED = 0.1
 """share of what its main part holds of the carried mask that another part must hold to stay"""
 CERTAIN, HINTED_SHARE = 2.0, 0.17

@@ -47,8 +47,7 @@ class Palette:
     def ratio(
         self, color: UInt8[np.ndarray, "height width 3"], room: Bool[np.ndarray, "height width"]
     ) -> Float[np.ndarray, "height width"]:
-        """Return log p(colour | animal) / p(colour | room), within +-2; ``room`` marks pixels that surely
-        show the room."""
+        """Return log p(colour | animal) / p(colour | room), within +-2; ``room`` marks surely the room."""
         if min(self._counts.sum(), room.sum()) < LEAST_COLORS:
             return np.zeros(color.shape[:2], np.float32)
         counts = np.zeros_like(self._counts)
@@ -93,8 +92,7 @@ def label(
 def without_strays(
     labels: UInt8[np.ndarray, "height width"], like: Float[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width"]:
-    """Take away parts, but for the largest, that look rather like the room: rims of furniture that drift
-    makes seem to move."""
+    """Take away parts, but for the largest, that look rather like the room: rims that seem to move."""
     parts, area = _parts((labels > 0).astype(np.uint8), 8)
     if len(area) < 3:
         return labels

@@ -25,8 +25,7 @@ from stages.segment_agent.windows import Sphere, cut, working_picture
 POINTED_M, SURELY_M = 0.1, 0.05
 """around its place lies what a hint points at; nearer, and above the ground, it surely is the animal"""
 GRABBED_PX = 240
-"""smallest side of a picture to cut out of: in smaller ones GrabCut's cost of an outline outweighs what it
-encloses"""
+"""smallest side of a picture to cut out of: below, GrabCut's outline costs more than what it encloses"""
 LEAST_PX = 30
 """pixels of the animal, and of what is not, without which it cannot be cut out"""
 

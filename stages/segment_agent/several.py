@@ -37,8 +37,7 @@ LEAST_FRAMES, RECOGNIZED = 5, 0.75
 ANOTHERS = -1.0
 """log-odds from which on a pixel that geometry knows nothing of is another animal's"""
 PORTRAITS_SHARE = 0.25
-"""portraits that a recording's appearance is learned from too, as a share of its own examples: more would
-outweigh what its room looks like"""
+"""portraits to learn from, as a share of a recording's own examples: more would outweigh its room"""
 STRANGER_SHARE = 0.5
 """share of the frames in which anything is tracked that show a stranger, from which on an animal without a
 turnaround lives here; less may be one that visits"""
@@ -99,7 +98,8 @@ def segment(
     _refuse_strangers(clip, strangers.sum() / max(np.any([strangers, *known], axis=0).sum(), LEAST_FRAMES))
     own = network.names.index(followed)
     found = (joined(painters, margins, own, frame) for frame in range(len(clip)))
-    return Segmentation(people.hide(found, walkers, clip, poses), path, walkers, float(strangers.mean()))
+    found = people.hide(found, walkers, clip, poses)
+    return Segmentation(found, path, walkers, float(strangers.mean()), references, "one of several")
 
 
 def find_all(

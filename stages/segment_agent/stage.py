@@ -52,7 +52,7 @@ def run(
         return _run_of_several(inputs, inputs.identities, config, out, videos)
     clip = Clip.open(inputs.frames)
     hint = None if inputs.prompt is None else prompt.parse(inputs.prompt, clip)
-    residual_m = np.nan
+    found = None
     match config.backend:
         case "weightless":
             if clip.odometry_from_camera is None:
@@ -61,8 +61,8 @@ def run(
             found = segment(clip, inputs.flow, role_of_animal(video, config.role), hint, config, rng)
             masks = found.masks
             if found.path is not None:
-                residual_m = found.path.residual_m
-                log(f"poses: {found.path.alignments} depth alignments agree within {MM * residual_m:.0f} mm")
+                millimeters = MM * found.path.residual_m
+                log(f"poses: {found.path.alignments} depth alignments agree within {millimeters:.0f} mm")
             writing.write_people(out, clip, found)
         case "foundation":
             from stages.segment_agent.backends import foundation
@@ -71,7 +71,7 @@ def run(
         case _:
             assert_never(config.backend)
     summary = writing.write(out, track(masks, "masks", len(clip)), len(clip))
-    pictures.report_quality(out, clip, summary, residual_m)
+    pictures.report_quality(out, clip, summary, config.animal, found)
     if not any(summary.visible):
         log("the animal was never seen: does it move here? A hint (<recording>.prompt.toml) helps")
     return summary
@@ -95,6 +95,5 @@ def _run_of_several(
     found = several.segment(clip, inputs.flow, followed, network, portraits, config)
     summary = writing.write(out, track(found.masks, "masks", len(clip)), len(clip))
     writing.write_people(out, clip, found)
-    assert found.path is not None, "sessions of several animals have depth"
-    pictures.report_quality(out, clip, summary, found.path.residual_m, found.strangers)
+    pictures.report_quality(out, clip, summary, config.animal, found)
     return summary

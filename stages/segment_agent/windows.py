@@ -1,6 +1,4 @@
-"""Cut the part of a frame that may show the animal, at working resolution, with its points in the recording's
-world.
-"""
+"""Cut the part of a frame that may show the animal, at working resolution, with points in the world."""
 
 from dataclasses import dataclass
 
@@ -71,8 +69,7 @@ def rectangle(
     size: tuple[int, int],
     rim_px: int = 8,
 ) -> tuple[slice, slice]:
-    """Return the rows and columns of a working picture of (height, width) that show a ball; empty where it is
-    out of view."""
+    """Return which rows and columns of a picture of (height, width) show a ball; maybe none."""
     intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size)
     centre = rigid.apply(rigid.inverse(world_from_camera), ball.centre_world[None])[0]
     pixel, depth = cameras.project(centre, intrinsics)
@@ -108,8 +105,7 @@ def cut(
 
 
 def supported_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
-    """Read depth without blur at steps, thin things kept that the sensor doubts but neighbours agree on (0 =
-    unknown)."""
+    """Read depth without blur at steps, with thin things that neighbours agree on (0 = unknown)."""
     depth = unblurred(clip.depth(frame))
     return np.where(supported(depth), depth, 0)
 

@@ -19,8 +19,6 @@ class Summary:
     visible: list[bool] = field(default_factory=list)
     confidence: list[float] = field(default_factory=list)
     area: list[float] = field(default_factory=list)
-    contradicted: list[float] = field(default_factory=list)
-    """share of each mask that looks like the room or lies on a surface that other frames saw there"""
     shown: dict[int, np.ndarray] = field(default_factory=dict)
 
 
@@ -31,7 +29,6 @@ def write(folder: Path, masks: Iterable[Mask], count: int, pictures: int = 12) -
         images.write_gray(folder / f"{frame:06d}.png", mask.labels)
         summary.visible.append(mask.visible)
         summary.confidence.append(mask.confidence)
-        summary.contradicted.append(mask.contradicted)
         summary.area.append(float((mask.labels == 255).mean()))
         if frame in shown:
             summary.shown[frame] = mask.labels
