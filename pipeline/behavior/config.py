@@ -8,7 +8,7 @@ Ego = Literal["yaw", "full", "world"]
 Family = Literal["diffusion", "gaussian", "one_stage"]
 """What is learned: goal, path and body by diffusion; each as a Gaussian; path and body without a goal."""
 Control = Literal["unet", "concatenation"]
-"""How goal and path condition a UNet: by a second UNet (ControlNet), or as a part of perception."""
+"""How goal and path condition a UNet: by a second UNet (ControlNet), or within the perception code."""
 SceneEncoder = Literal["pillars", "volume", "none"]
 """2.5-D encoder with height in channels, the six 3-D convolutions of the paper, or no encoder, for
 trajectories without a map."""

@@ -158,7 +158,7 @@ class SceneConstraint:
     def out_of_solid(
         self, points_ego: Float[np.ndarray, "plan point 3"]
     ) -> Float[np.ndarray, "plan point 3"]:
-        """Move points out of what is solid; as many plans per agent as there are, an agent's together."""
+        """Move points out of what is solid; the plans of one agent are consecutive."""
         frame, video = self._of_plans(len(points_ego))
         moved = self.scenes.out_of_solid(rigid.apply(frame, points_ego), video)
         return rigid.apply(rigid.inverse(frame), moved)

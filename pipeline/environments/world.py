@@ -32,7 +32,7 @@ from pipeline.workflow import artifact
 EYE_M = 1.4
 """Height of a person's phone above the floor, metres."""
 CLOSE_M = 2.4
-"""Distance within which an animal that gets away counts as fleeing; farther is its own affair."""
+"""Distance from the person within which an animal that gets away counts as fleeing."""
 START_DRAWS = 30
 """Places that are tried for a person's start before one in something solid is taken."""
 SPLITS = {"train": TRAIN, "test": TEST}

@@ -14,7 +14,7 @@ CELLS = 8
 """cells along the edge of a block"""
 NODES = CELLS + 1
 CHANNELS = 5
-"""signed distance in truncations, red, green, blue in 0..1 times the next, 1 where a color is known"""
+"""signed distance / truncation, red, green, blue in 0..1 times the next, 1 where a color is known"""
 NOWHERE = 0
 """the block that stands for free and for unseen space"""
 
@@ -63,7 +63,7 @@ class FusedGeometry(nn.Module):
         )
 
     def own_blocks(self, video: int) -> tuple[Float[Tensor, "block 3"], Float[Tensor, "block 9 9 9"]]:
-        """Return the lowest corners of a video's own blocks, and signed distances there in truncations."""
+        """Return the lowest corners of a video's own blocks and their nodes' signed distance / truncation."""
         place = torch.nonzero(self.table[video] != self.table[-1])
         block = self.table[video][tuple(place.T)].long()
         return self.low + place * (CELLS * self.sizes[0]), self.blocks[block][..., 0].float()

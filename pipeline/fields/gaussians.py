@@ -174,7 +174,7 @@ class Splats(nn.Module):
         videos: int,
         stands: Bool[Tensor, "row point"] | None = None,
     ):
-        """``stands``: which of the room each video shows and, last, which all share; None: all of them."""
+        """``stands``: which Gaussians each video shows and, last, which all share; None: all of them."""
         super().__init__()
         self.scene, self.agent = scene, agent
         self.register_buffer("agent_weights", agent_weights)
@@ -186,7 +186,7 @@ class Splats(nn.Module):
         """per video: red, green, blue <- matrix @ (red, green, blue, 1)"""
 
     def place_scene(self, video: int | None, which: Int[Tensor, "chosen"] | None = None) -> Cloud:
-        """Return the room, or some of it, as it stood and was lit in one video (None: as all share it)."""
+        """Return the room, or Gaussians of it, as it was in one video (None: as all videos share it)."""
         here = self.stands[-1 if video is None else video]
         which = torch.nonzero(here)[:, 0] if which is None else which[here[which]]
         return self._exposed(self.scene.cloud(which), video)

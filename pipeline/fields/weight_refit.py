@@ -39,7 +39,7 @@ class Influences:
 def different_poses(
     agent_from_bone: Float[np.ndarray, "frame bone 4 4"], count: int
 ) -> Int[np.ndarray, " chosen"]:
-    """Choose poses far from each other, from the one furthest from the mean on: the extremes too."""
+    """Choose poses by farthest-point sampling, beginning with the one furthest from the mean."""
     flat = agent_from_bone[:, :, :3].reshape(len(agent_from_bone), -1)
     distance = ((flat - flat.mean(0)) ** 2).sum(1)
     chosen = [int(distance.argmax())]
@@ -56,7 +56,7 @@ def blend_dual_quaternions(
     agent_from_bone: Float[np.ndarray, "frame bone 4 4"],
     agent_from_bone_rest: Float[np.ndarray, "bone 4 4"],
 ) -> Float[np.ndarray, "frame vertex 3"]:
-    """Pose the surface as the reconstruction does: dual quaternions, all weights; metres, agent frame."""
+    """Pose the surface by dual-quaternion blending with all weights; metres, agent frame."""
     points, weight, rest = (
         torch.from_numpy(np.ascontiguousarray(values, np.float32))
         for values in (vertices, weights, agent_from_bone_rest)

@@ -39,7 +39,7 @@ class Plausibility:
     slide_m_s: float
     """median speed along the ground of feet while they stand, or should; NaN where none does"""
     least_slide_m_s: float
-    """median speed over the ground of the foot that moves least, near the scene: something should stand"""
+    """median speed over the ground of the slowest foot near the scene: one should stand"""
 
 
 @dataclass(frozen=True)

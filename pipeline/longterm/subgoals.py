@@ -43,11 +43,11 @@ BEYOND_M = 1.0
 TURN_M = 0.2
 """A body that stops keeps this far from where it cannot walk, to have room to turn."""
 LANDING_CLEARANCE = 2.6
-"""A leap keeps so many heights of the root from where a body cannot walk: it falls at its full length."""
+"""A leap begins and ends so many root heights from where no body can walk: it falls full length."""
 LARGE_TURN_RAD = 1.7
 """A turn of more than this takes a body at rest two legs."""
 MORE_LEGS = 4
-"""How many more legs than the pace asks for may part a way, so that none leads through furniture."""
+"""How many legs a way may have beyond what the pace asks for, so that none crosses furniture."""
 
 
 @dataclass(frozen=True)

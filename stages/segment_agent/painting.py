@@ -17,7 +17,7 @@ from stages.segment_agent.windows import Sphere, Window, cut, working_picture, w
 COLOR_WEIGHT = 0.7
 """log-odds per unit of the colours' log-ratio"""
 APPEARANCE_WEIGHT, APPEARANCE_WEIGHT_BLIND = 0.3, 0.6
-"""weight of the learned appearance's log-odds beside geometry, and where that knows nothing"""
+"""weight of the learned appearance's log-odds beside geometry, and where geometry is silent"""
 APPEARANCE_ALONE, APPEARANCE_AGAINST = 3.0, 4.0
 """largest log-odds by which it speaks for the animal where geometry knows nothing (elsewhere it does not: the
 edges of geometry are sharper), and against it anywhere"""

@@ -47,7 +47,7 @@ class Palette:
     def ratio(
         self, color: UInt8[np.ndarray, "height width 3"], room: Bool[np.ndarray, "height width"]
     ) -> Float[np.ndarray, "height width"]:
-        """Return log p(colour | animal) / p(colour | room), within +-2; ``room`` marks surely the room."""
+        """Return log p(colour | animal) / p(colour | room), within +-2; ``room`` marks sure room."""
         if min(self._counts.sum(), room.sum()) < LEAST_COLORS:
             return np.zeros(color.shape[:2], np.float32)
         counts = np.zeros_like(self._counts)

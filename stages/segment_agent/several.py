@@ -37,7 +37,7 @@ LEAST_FRAMES, RECOGNIZED = 5, 0.75
 ANOTHERS = -1.0
 """log-odds from which on a pixel that geometry knows nothing of is another animal's"""
 PORTRAITS_SHARE = 0.25
-"""portraits to learn from, as a share of a recording's own examples: more would outweigh its room"""
+"""portraits to learn from, as a share of the recording's own examples: more outweigh its room"""
 STRANGER_SHARE = 0.5
 """share of the frames in which anything is tracked that show a stranger, from which on an animal without a
 turnaround lives here; less may be one that visits"""

@@ -69,7 +69,7 @@ def rectangle(
     size: tuple[int, int],
     rim_px: int = 8,
 ) -> tuple[slice, slice]:
-    """Return which rows and columns of a picture of (height, width) show a ball; maybe none."""
+    """Return the rows and columns of a picture of (height, width) that show a ball, if any."""
     intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size)
     centre = rigid.apply(rigid.inverse(world_from_camera), ball.centre_world[None])[0]
     pixel, depth = cameras.project(centre, intrinsics)
