@@ -37,8 +37,8 @@ def run(house, *module):
 
 
 def tree(house):
-    """Every file but caches, and what a failed job reports about itself: its log and its exit code."""
-    apart = {"__pycache__", "logs", "failures"}
+    """Every file but caches, locks, and what a failed job reports about itself: its log and exit code."""
+    apart = {"__pycache__", "logs", "failures", "locks"}
     files = (path for path in house.rglob("*") if path.is_file() and not apart & set(path.parts))
     return {path.relative_to(house).as_posix(): path.read_bytes() for path in files}
 
