@@ -15,14 +15,14 @@ from pathlib import Path
 from pipeline.core import videos
 from pipeline.core.errors import InputError, exit_code
 from pipeline.workflow import artifact
-from pipeline.workflow.jobs import Home
+from pipeline.workflow.jobs import Home, listing
 from pipeline.workflow.sources import recording_digest
 
 
 def differences(home: Home) -> Iterator[InputError]:
     """Yield an error per artifact and per recording of `home` that differs. Raises RUN-001 without a plan."""
     try:
-        planned = json.loads((home.plan / "dag.json").read_text())
+        planned = json.loads(listing(home).read_text())
     except FileNotFoundError:
         raise InputError("RUN-001", "is not planned yet", str(home), f"run `make {home}`") from None
     for folder in dict.fromkeys(Path(job["out"]) for job in planned):
