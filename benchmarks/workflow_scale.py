@@ -84,7 +84,7 @@ def many_recordings(folder: Path, count: int, snakemake: bool) -> dict[str, Cost
         "snakemake",
         "-n",
         "--quiet",
-        "all",
+        "rules",
         "--cores",
         "2",
         "--config",
