@@ -194,8 +194,13 @@ class Disturbance:
         """Leave a random number of bytes free at a random time; go on when there is room again."""
         build = self.here.make(*GOALS)
         self._sleep()
-        usage = shutil.disk_usage(self.disk)
-        _mount(self.disk, usage.used + int(FULL_BYTES * self.choice.random() ** 3), "remount")
+        spare = int(FULL_BYTES * self.choice.random() ** 3)
+        while build.poll() is None:
+            try:
+                _mount(self.disk, shutil.disk_usage(self.disk).used + spare, "remount")
+                break
+            except subprocess.CalledProcessError:
+                pass  # the build has written more meanwhile, and what is used cannot be taken away
         code = build.wait(WAIT_S)
         _mount(self.disk, DISK_MB << 20, "remount")
         if code and "SYS-001" not in (self.here.folder / "build.log").read_text(errors="replace"):

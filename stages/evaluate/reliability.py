@@ -17,9 +17,10 @@ def reliability_metrics(
     """Return the mean confidence, its expected calibration error over ten equal bins, and the curve as a
     chart.
 
-    Expected calibration error: Guo et al. 2017, "On Calibration of Modern Neural Networks".
+    Frames without a probability do not count. Expected calibration error: Guo et al. 2017, "On Calibration of Modern Neural Networks".
     """
-    metrics = Metrics()
+    metrics, known = Metrics(), np.isfinite(probability)
+    probability, right = probability[known], right[known]
     claimed, met, count = _curve(probability, right)
     metrics.put(f"{name}/confidence_mean", float(probability.mean()) if len(probability) else np.nan)
     metrics.put(

@@ -36,7 +36,7 @@ def follow(
     first = cv2.resize(first, coarse.size[::-1], interpolation=cv2.INTER_AREA)
     for log_odds in propagate(coarse, hint.frame, first, learning, rng):
         inside = cv2.resize(log_odds, footage.clip.color_size[::-1], interpolation=cv2.INTER_LINEAR) > 0
-        yield Mask(np.where(inside, 255, 0).astype(np.uint8), bool(inside.any()), 0.5)
+        yield Mask(np.where(inside, 255, 0).astype(np.uint8), bool(inside.any()), np.nan)
 
 
 def cut_out(footage: Footage, hint: Prompt, rng: np.random.Generator) -> Float[np.ndarray, "height width"]:

@@ -56,7 +56,7 @@ class Mask:
     labels: UInt8[np.ndarray, "height width"]
     visible: bool
     confidence: float
-    """probability that `visible` is right"""
+    """probability that `visible` is right; NaN where nothing measures it"""
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,8 @@ def checks_of(
     summary: Summary, residual_m: float = np.nan, estimated: Float[np.ndarray, "frame"] | None = None
 ) -> list[Check]:
     """Return the figures that reveal wrong masks; without an ``estimated`` IoU, area over time."""
-    visible, unsure = np.array(summary.visible), np.array(summary.confidence) < LOW_CONFIDENCE
+    visible, confidence = np.array(summary.visible), np.array(summary.confidence)
+    unsure = confidence[np.isfinite(confidence)] < LOW_CONFIDENCE
     checks = [
         Check("agent visible", _percent(visible), "%", fail=2, better="higher"),
         Check("frames of low confidence", _percent(unsure), "%", warn=12, fail=30),

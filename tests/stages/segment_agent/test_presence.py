@@ -96,6 +96,8 @@ def test_masks_that_are_implausible_over_time_are_reported_where_nothing_else_ju
     count, rng = 100, np.random.default_rng(0)
     good = Summary([True] * 60 + [False] * 40, [0.95] * count, [0.05] * 60 + [0.0] * 40)
     assert {check.status for check in pictures.checks_of(good)} == {"ok"}
+    unmeasured = replace(good, confidence=[np.nan] * count)
+    assert {check.status for check in pictures.checks_of(unmeasured)} == {"ok", "warn"}
     unsure = replace(good, confidence=[0.6] * count)
     jumping = replace(good, area=rng.choice([0.01, 0.05], count).tolist())
     flashing = replace(good, area=rng.choice([0.0, 0.05], count).tolist())
