@@ -17,7 +17,8 @@ def reliability_metrics(
     """Return the mean confidence, its expected calibration error over ten equal bins, and the curve as a
     chart.
 
-    Frames without a probability do not count. Expected calibration error: Guo et al. 2017, "On Calibration of Modern Neural Networks".
+    Frames without a probability do not count.
+    Expected calibration error: Guo et al. 2017, "On Calibration of Modern Neural Networks".
     """
     metrics, known = Metrics(), np.isfinite(probability)
     probability, right = probability[known], right[known]
