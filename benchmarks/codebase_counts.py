@@ -80,7 +80,7 @@ def long_lines() -> list[str]:
 
 
 def keys() -> list[str]:
-    """Recipe keys: the fields of every stage's `Config`, nested tables resolved."""
+    """Recipe keys: the fields of every stage's `Config`, nested tables resolved; a shared one counts once."""
 
     def fields(config: object, table: str) -> list[str]:
         return [
@@ -91,12 +91,13 @@ def keys() -> list[str]:
             )
         ]
 
-    found = []
+    found, counted = [], set()
     for door in sorted((ROOT / "stages").rglob("__main__.py")):
         stage = ".".join(door.parent.relative_to(ROOT).parts)
         module = "config" if door.with_name("config.py").exists() else "__main__"
         config = getattr(importlib.import_module(f"{stage}.{module}"), "Config", None)
-        if config is not None:
+        if config is not None and config not in counted:
+            counted.add(config)
             found += fields(config(), stage.removeprefix("stages."))
     return found
 

@@ -6,7 +6,7 @@ Writes `<name>.mp4` for sessions and turnaround, without depth, poses and lens; 
 are copied. Build it like any capture, then measure it on the truth of the built-in capture:
 
     cp agents/toy.toml agents/toy_plain.toml && make toy_plain
-    python -m stages.evaluate --truth build/toy/synthetic_capture/truth ...
+    python -m stages.evaluate.reconstruction_metrics --truth build/toy/synthetic_capture/truth ...
 """
 
 import argparse

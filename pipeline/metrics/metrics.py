@@ -3,12 +3,13 @@
 import json
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Shaped, UInt8
 
+from pipeline.data.qa import Check
 from pipeline.metrics.intervals import Interval, names_of
 
 
@@ -56,6 +57,16 @@ class Metrics:
         self.pictures.update(other.pictures)
         self.charts.update(other.charts)
 
+    def judged(self, limits: Iterable[Check]) -> list[Check]:
+        """Return the checks with the figures that they are named by; without those not measured."""
+        known = [limit for limit in limits if self.values.get(limit.name) is not None]
+        return [replace(limit, value=self.values[limit.name]) for limit in known]
+
+    @classmethod
+    def read(cls, folder: Path) -> "Metrics":
+        """Read `metrics.json` and `reasons.json`."""
+        return cls(*(json.loads((folder / name).read_bytes()) for name in ("metrics.json", "reasons.json")))
+
     def write(self, folder: Path, file: str) -> None:
         """Write values as ``file`` and the reasons for missing ones as ``reasons.json``."""
         for name, table in ((file, self.values), ("reasons.json", self.reasons)):
@@ -65,6 +76,11 @@ class Metrics:
 def formatted(value: float | None, form: str = ".3f") -> str:
     """Write a figure for a table; ``-`` where there is none."""
     return "-" if value is None else format(value, form)
+
+
+def mean(values: Shaped[np.ndarray, "value"]) -> float:
+    """Return the mean, of truth values the share; NaN when nothing was measured."""
+    return float(values.mean()) if len(values) else math.nan
 
 
 def median(errors: Float[np.ndarray, "error"]) -> float:

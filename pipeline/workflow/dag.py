@@ -46,8 +46,7 @@ class Need:
     option: str | None = None
     """Command line option without dashes; the artifact's name if None."""
     variants: tuple[str, ...] = ()
-    """Variants of the agent whose artifact of this name is read as well; the folder of all variants is given
-    as --variants."""
+    """Variants of the agent whose artifact of this name is read as well; --variants is the folder of all."""
     flow: Flow | None = None
     """The flow in which it is an input; None: in all that the node is part of."""
     measured: bool = False
@@ -322,16 +321,22 @@ FLOW: tuple[Node, ...] = (
         of_several=True,
     ),
     Node(
-        "evaluation",
-        "evaluate",
+        "reconstruction_metrics",
+        "evaluate.reconstruction_metrics",
         (
             *merging("frames", "masks", "flow"),
-            *(*TEMPLATES, "scene_localizer", "registration", *READ_BY_PAGES),
-            TRUTH,
+            *(*TEMPLATES, "scene_localizer", "registration", "reconstruction", "splats", TRUTH),
         ),
         role_dependencies=("session", "heldout"),
+        table="evaluate",
         gpu=1,
         extra_inputs=("clicks.json",),
+    ),
+    Node(
+        "evaluation",
+        "evaluate",
+        ("reconstruction_metrics", "reconstruction", "behavior_data", "behavior"),
+        gpu=1,
     ),
     Node(
         "registration_tables",
@@ -356,8 +361,7 @@ FLOW: tuple[Node, ...] = (
         (
             *(*merging("frames", "flow", "masks"), "feature_basis", *merging("features")),
             *(*TEMPLATES, *LOCALIZERS, *merging("video_poses"), "registration"),
-            *("reconstruction", "splats", "behavior_data", "behavior"),
-            *("longterm", "simulator", "evaluation"),
+            *(*READ_BY_PAGES, "longterm", "simulator", "reconstruction_metrics", "evaluation"),
         ),
     ),
 )

@@ -1,8 +1,6 @@
-"""Measure a build: registration, localizer, masks, flow, reconstruction and behaviour, beside simple rivals.
+"""Measure behaviour beside simple rivals, and put all metrics of a build together.
 
-Truth is read where it is given (the built-in capture). Elsewhere clicked correspondences (`make annotate`)
-stand for it, and a held-out phone is placed by them or by registration; metrics that need more are left out
-with the reason.
+Those of what precedes behaviour are read from `reconstruction_metrics`.
 """
 
 from pipeline.workflow import cli

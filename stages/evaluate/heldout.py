@@ -9,7 +9,7 @@ from skimage.metrics import structural_similarity
 
 from pipeline.geometry import subsampling
 from pipeline.metrics.lpips import Lpips
-from pipeline.metrics.metrics import Metrics
+from pipeline.metrics.metrics import Metrics, mean
 
 UNSEEN = "no held-out phone, or none that films while its session does"
 NO_LPIPS = "LPIPS needs the weights of AlexNet: name their folder in `[evaluate] lpips_weights`"
@@ -86,8 +86,7 @@ def view_metrics(views: Sequence[HeldoutView], lpips: Lpips | None = None) -> Me
     else:
         rows = np.array([learned_distances(lpips, view) for view in views])
         for name, column in zip(names, rows.T, strict=True):
-            known = column[np.isfinite(column)]
-            metrics.put(name, float(known.mean()) if len(known) else np.nan, UNMEASURED_LPIPS)
+            metrics.put(name, mean(column[np.isfinite(column)]), UNMEASURED_LPIPS)
     return metrics
 
 
@@ -98,8 +97,7 @@ def depth_metrics(name: str, views: Sequence[HeldoutView]) -> Metrics:
     right = np.concatenate([depth_is_right(view).ravel() for view in views])
     agent = np.concatenate([view.true.agent.ravel() for view in views])
     for part, chosen in (("all", known), ("agent", known & agent), ("scene", known & ~agent)):
-        value = float(right[chosen].mean()) if chosen.any() else np.nan
-        metrics.put(f"{name}_{part}", value, "not in view of the held-out phone")
+        metrics.put(f"{name}_{part}", mean(right[chosen]), "not in view of the held-out phone")
     return metrics
 
 
@@ -129,8 +127,7 @@ def picture_metrics(name: str, views: Sequence[HeldoutView]) -> Metrics:
     metrics, rows = Metrics(), np.array([picture_quality(view) for view in views])
     for column, (kind, part) in enumerate((kind, part) for kind in ("psnr", "ssim") for part in PARTS):
         values = rows[:, column][np.isfinite(rows[:, column])]
-        value = float(values.mean()) if len(values) else np.nan
-        metrics.put(f"{name}/{kind}_{part}", value, "not in view of the held-out phone")
+        metrics.put(f"{name}/{kind}_{part}", mean(values), "not in view of the held-out phone")
     return metrics
 
 
@@ -160,9 +157,8 @@ def picture_quality(view: HeldoutView) -> list[float]:
     ours, true = compared_colors(view)
     squared = ((ours - true) ** 2).mean(-1)
     similar = structural_similarity(true, ours, channel_axis=-1, data_range=1.0, full=True)[1].mean(-1)
-    return [-10 * np.log10(max(error, 1e-10)) for error in _per_part(squared, view)] + _per_part(
-        similar, view
-    )
+    psnr = [-10 * np.log10(max(error, 1e-10)) for error in _per_part(squared, view)]
+    return psnr + _per_part(similar, view)
 
 
 def learned_distances(lpips: Lpips, view: HeldoutView) -> list[float]:
@@ -180,7 +176,7 @@ def compared_colors(
 
 def _per_part(values: Float[np.ndarray, "height width"], view: HeldoutView) -> list[float]:
     parts = (np.ones_like(view.true.agent), view.true.agent, ~view.true.agent)
-    return [float(values[part].mean()) if part.any() else np.nan for part in parts]
+    return [mean(values[part]) for part in parts]
 
 
 def exposed(

@@ -16,7 +16,7 @@ from pipeline.data.clips import Clip
 from pipeline.geometry import rigid
 from pipeline.localization.localizer import Localizer
 from pipeline.mapping import sift
-from pipeline.metrics.metrics import Metrics, median
+from pipeline.metrics.metrics import Metrics, mean, median
 from pipeline.metrics.pose_errors import PoseErrors
 
 WITHIN_DEG, WITHIN_M = 5, 0.2
@@ -48,7 +48,7 @@ def metrics_of(name: str, errors: PoseErrors) -> Metrics:
     metrics.put(f"{name}rotation_deg_median", median(errors.degrees), FAILED)
     metrics.put(f"{name}translation_m_median", median(errors.meters), FAILED)
     within = (errors.degrees <= WITHIN_DEG) & (errors.meters <= WITHIN_M)
-    metrics.put(f"{name}within_5deg_20cm_share", float(within.mean()) if len(within) else np.nan)
+    metrics.put(f"{name}within_5deg_20cm_share", mean(within))
     return metrics
 
 

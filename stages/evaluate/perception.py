@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.data.clips import Masks
 from pipeline.geometry import rigid
-from pipeline.metrics.metrics import Metrics
+from pipeline.metrics.metrics import Metrics, mean, median
 from stages.evaluate.reliability import reliability_metrics
 from stages.evaluate.truth import RecordingTruth, TrueFlow
 
@@ -32,7 +32,7 @@ class Overlaps:
 
 def overlaps(masks: Masks, truth: RecordingTruth) -> Overlaps:
     """Compare every frame that shows the agent, in truth or in ours; unknown pixels do not count."""
-    iou, resting, confidence, swapped = [], [], [], []
+    rows = []
     for frame in range(len(masks)):
         label = masks[frame]
         true = truth.masks[frame] if truth.masks.size else np.zeros(label.shape, bool)
@@ -40,17 +40,11 @@ def overlaps(masks: Masks, truth: RecordingTruth) -> Overlaps:
         if max(true.mean(), ours.mean()) < SEEN_SHARE:
             continue
         union = ((ours | true) & counts).sum()
-        iou.append((ours & true & counts).sum() / union if union else 0.0)
-        resting.append(not truth.moving[frame])
-        confidence.append(masks.confidence[frame])
-        if truth.others is not None:
-            swapped.append((ours & truth.others[frame]).sum() > (ours & true).sum())
-    return Overlaps(
-        np.array(iou, float),
-        np.array(resting, bool),
-        np.array(confidence, float),
-        np.array(swapped, bool) if truth.others is not None else None,
-    )
+        iou = (ours & true & counts).sum() / union if union else 0.0
+        others = 0 if truth.others is None else (ours & truth.others[frame]).sum()
+        rows.append((iou, not truth.moving[frame], masks.confidence[frame], others > (ours & true).sum()))
+    iou, resting, confidence, swapped = np.array(rows, float).reshape(-1, 4).T
+    return Overlaps(iou, resting > 0, confidence, None if truth.others is None else swapped > 0)
 
 
 def mask_metrics(sessions: Sequence[Overlaps], turnaround: Overlaps | None) -> Metrics:
@@ -58,14 +52,14 @@ def mask_metrics(sessions: Sequence[Overlaps], turnaround: Overlaps | None) -> M
     metrics = Metrics()
     iou = np.concatenate([each.iou for each in sessions]) if sessions else np.zeros(0)
     resting = np.concatenate([each.resting for each in sessions]) if sessions else np.zeros(0, bool)
-    metrics.put("masks/iou_mean", _mean(iou), "the animal is never visible")
-    metrics.put("masks/iou_resting", _mean(iou[resting]), "the animal never rests in view")
+    metrics.put("masks/iou_mean", mean(iou), "the animal is never visible")
+    metrics.put("masks/iou_resting", mean(iou[resting]), "the animal never rests in view")
     swapped = [each.swapped for each in sessions if each.swapped is not None]
     if swapped:
-        metrics.put("masks/identity_swaps", _mean(np.concatenate(swapped)), "no animal is ever visible")
+        metrics.put("masks/identity_swaps", mean(np.concatenate(swapped)), "no animal is ever visible")
     confidence = np.concatenate([each.confidence for each in sessions]) if sessions else np.zeros(0)
     metrics.add(reliability_metrics("masks", confidence, iou >= RIGHT_IOU))
-    metrics.put("masks/iou_turnaround", _mean(turnaround.iou) if turnaround else np.nan, "no turnaround")
+    metrics.put("masks/iou_turnaround", mean(turnaround.iou) if turnaround else np.nan, "no turnaround")
     return metrics
 
 
@@ -92,12 +86,10 @@ def people_metrics(sessions: Sequence[tuple[RecordingTruth, Float[np.ndarray, "f
     if errors:
         error = np.concatenate(errors)
         found = np.isfinite(error)
-        metrics.put("people/found", _mean(found), "nobody is ever in view")
-        median = float(np.median(error[found])) if found.any() else float("nan")
-        metrics.put("people/position_median_m", median, "nobody was found")
-        metrics.put(
-            "people/unseen", unseen / tracked_frames if tracked_frames else np.nan, "nobody was found"
-        )
+        metrics.put("people/found", mean(found), "nobody is ever in view")
+        metrics.put("people/position_median_m", median(error[found]), "nobody was found")
+        share = unseen / tracked_frames if tracked_frames else np.nan
+        metrics.put("people/unseen", share, "nobody was found")
     return metrics
 
 
@@ -135,9 +127,5 @@ def flow_metrics(pairs: Sequence[FlowPair]) -> Metrics:
         agent.append(error[known & pair.agent])
         zero.append(np.linalg.norm(pair.true, axis=-1)[known])
     for name, parts in (("epe_px_mean", ours), ("epe_px_agent_mean", agent), ("zero_flow_epe_px_mean", zero)):
-        metrics.put(f"flow/{name}", _mean(np.concatenate(parts) if parts else np.zeros(0)), why)
+        metrics.put(f"flow/{name}", mean(np.concatenate(parts) if parts else np.zeros(0)), why)
     return metrics
-
-
-def _mean(values: np.ndarray) -> float:
-    return float(values.mean()) if len(values) else float("nan")

@@ -37,15 +37,13 @@ class Reconstructed:
 
 @dataclass(frozen=True, kw_only=True)
 class BuildFolders(Reconstructed):
-    """Where all finished artifacts stand; per-recording ones by id."""
+    """Where the artifacts before behaviour stand; per-recording ones by id."""
 
     masks: Mapping[str, Path]
     flow: Mapping[str, Path]
     scene_localizer: Path
     registration: Path
     splats: Path
-    behavior_data: Path
-    behavior: Path
     clicks: Path | None = None
     """file of clicked correspondences, where there is one"""
 
@@ -89,9 +87,8 @@ def recorded(folders: Reconstructed, videos: tuple[Video, ...]) -> list[Recordin
             continue
         source_index = read_source_index(folders.frames[video.id])
         truth = RecordingTruth.open(folders.truth_folder, name, source_index)
-        found.append(
-            RecordingWithTruth(video, name, Clip.open(folders.frames[video.id]), truth, source_index)
-        )
+        clip = Clip.open(folders.frames[video.id])
+        found.append(RecordingWithTruth(video, name, clip, truth, source_index))
     return found
 
 

@@ -79,9 +79,6 @@ def shots(
         depth = usable_depth(clip, frame, farthest_m=RANGE_M)
         color = cv2.resize(clip.color(frame), depth.shape[::-1], interpolation=cv2.INTER_AREA)
         time_s = float(clip.timestamp_s[frame] + video.offset_s)
-        camera, no_agent = (
-            (world_from_camera[frame], clip.depth_intrinsics[frame]),
-            np.zeros(depth.shape, bool),
-        )
-        found.append(HeldoutShot(*camera, time_s, color, depth, no_agent))
+        camera = world_from_camera[frame], clip.depth_intrinsics[frame]
+        found.append(HeldoutShot(*camera, time_s, color, depth, agent=np.zeros(depth.shape, bool)))
     return found

@@ -18,7 +18,7 @@ from pipeline.fields.render import Renderer, render_depth
 from pipeline.geometry import rigid, subsampling
 from pipeline.geometry.meshes import Mesh, RayCaster
 from pipeline.metrics.lpips import Lpips
-from pipeline.metrics.metrics import Metrics
+from pipeline.metrics.metrics import Metrics, mean
 from pipeline.metrics.pose_errors import pose_errors
 from pipeline.metrics.surface_distance import TriangleSurface, chamfer, split
 from stages.evaluate import heldout, reading, surfaces
@@ -59,9 +59,7 @@ def reconstruction_metrics(
     sessions = reading.of_role(known, "session")
     motions = {each.video.id: reading.read_motion(folders.reconstruction, each.video.id) for each in sessions}
     metrics.add(agent_roots(sessions, motions, frames))
-    (turnaround, *_), (walkthrough, *_) = (
-        reading.of_role(known, role) for role in ("turnaround", "walkthrough")
-    )
+    turnaround, walkthrough = (reading.of_role(known, role)[0] for role in ("turnaround", "walkthrough"))
     metrics.add(surfaces.track_metrics(track_distances(folders, sessions, motions, turnaround, frames)))
     metrics.add(_agent_chamfer(folders, sessions, motions, frames, config, rng))
     metrics.add(_scene_chamfer(folders, walkthrough, frames, rng))
@@ -279,7 +277,7 @@ def _agent_chamfer(
                 true = rigid.apply(frames.world_from_true_world, each.truth.vertices_world(frame))
                 surfaces_world = TriangleSurface(posed[mesh.faces]), TriangleSurface(true[faces])
                 distances.append(chamfer(*surfaces_world, AGENT_POINTS, rng))
-    value = float(np.mean(distances)) if distances else np.nan
+    value = mean(np.array(distances))
     share = len(distances) / total if total else np.nan
     metrics.put("reconstruction/agent_chamfer_m", value, "the agent's pose is known in no visible frame")
     metrics.put("reconstruction/agent_chamfer_share", share, "the animal is never visible")

@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.metrics.metrics import Metrics, median, percentile
+from pipeline.metrics.metrics import Metrics, mean, median, percentile
 from pipeline.metrics.pose_errors import PoseErrors, joined
 from stages.evaluate.reliability import reliability_metrics
 
-REFUSED = "more than half of the frames have no pose"
+REFUSED, REFUSED_TENTH = "more than half of the frames have no pose", "a tenth of the frames has no pose"
 GOOD = (2.0, 0.05)
 """degrees and metres within which a pose counts as right"""
 GOOD_ROOT = (20.0, 0.08)
@@ -28,7 +28,7 @@ def camera_metrics(
     metrics.put("registration/videos_registered", registered)
     metrics.put("registration/videos_total", len(errors))
     right = is_right(all_errors)
-    metrics.put("registration/within_2deg_5cm_share", float(right.mean()) if len(right) else np.nan)
+    metrics.put("registration/within_2deg_5cm_share", mean(right))
     certain = np.concatenate([confidence[id] for id in errors]) if errors else np.zeros(0)
     metrics.add(reliability_metrics("registration", certain, right))
     order = np.argsort(-certain, kind="stable")
@@ -54,16 +54,11 @@ def root_metrics(
     metrics, all_errors = Metrics(), joined(list(errors))
     metrics.put(f"{name}/agent_root_m_median", median(all_errors.meters), REFUSED)
     metrics.put(f"{name}/agent_root_deg_median", median(all_errors.degrees), REFUSED)
-    metrics.put(
-        f"{name}/agent_root_m_p90", percentile(all_errors.meters, 90), "a tenth of the frames has no pose"
-    )
+    metrics.put(f"{name}/agent_root_m_p90", percentile(all_errors.meters, 90), REFUSED_TENTH)
     given = np.isfinite(all_errors.degrees)
     known = np.concatenate(placed) if placed else given
-    metrics.put(
-        f"{name}/agent_flips_share",
-        float((all_errors.degrees[given] > FLIPPED_DEG).mean()) if given.any() else np.nan,
-    )
-    metrics.put(f"{name}/agent_placed_share", float(known.mean()) if len(known) else np.nan)
+    metrics.put(f"{name}/agent_flips_share", mean(all_errors.degrees[given] > FLIPPED_DEG))
+    metrics.put(f"{name}/agent_placed_share", mean(known))
     return metrics
 
 

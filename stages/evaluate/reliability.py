@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.data import plots
-from pipeline.metrics.metrics import Metrics
+from pipeline.metrics.metrics import Metrics, mean
 
 BINS = 10
 DOT_AREAS = (20, 320)
@@ -23,15 +23,12 @@ def reliability_metrics(
     metrics, known = Metrics(), np.isfinite(probability)
     probability, right = probability[known], right[known]
     claimed, met, count = _curve(probability, right)
-    metrics.put(f"{name}/confidence_mean", float(probability.mean()) if len(probability) else np.nan)
-    metrics.put(
-        f"{name}/calibration_error",
-        float((count * np.abs(claimed - met)).sum() / count.sum()) if count.sum() else np.nan,
-    )
+    metrics.put(f"{name}/confidence_mean", mean(probability))
+    error = float((count * np.abs(claimed - met)).sum() / count.sum()) if count.sum() else np.nan
+    metrics.put(f"{name}/calibration_error", error)
     if count.sum():
-        metrics.charts[f"{name}: share that was right against the confidence reported; area: frames"] = (
-            _drawn(claimed, met, count)
-        )
+        caption = f"{name}: share that was right against the confidence reported; area: frames"
+        metrics.charts[caption] = _drawn(claimed, met, count)
     return metrics
 
 
@@ -51,11 +48,7 @@ def _drawn(
     figure, axes = plots.panels(1, 1, width_in=4, height_in=4)
     axis, filled = axes[0, 0], count > 0
     axis.plot((0, 1), (0, 1), color=plots.GREY, linewidth=1)
-    axis.scatter(
-        claimed[filled],
-        met[filled],
-        s=np.interp(count[filled] / count.max(), (0, 1), DOT_AREAS),
-        color=plots.BLUE,
-    )
+    area = np.interp(count[filled] / count.max(), (0, 1), DOT_AREAS)
+    axis.scatter(claimed[filled], met[filled], s=area, color=plots.BLUE)
     axis.set(xlim=(0, 1), ylim=(0, 1), xlabel="confidence", ylabel="share that was right", aspect="equal")
     return plots.pixels(figure)

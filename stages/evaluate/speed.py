@@ -10,9 +10,9 @@ from pipeline.core import threads
 from pipeline.metrics.metrics import Metrics
 from pipeline.rivals.predictors import Ats
 
-NAMES = ("simulator/plan_50_s", "simulator/plan_few_s")
+STEPS = {"simulator/plan_50_s": 50, "simulator/plan_few_s": 10}
+"""By metric: steps a level of the plans that are timed."""
 REPEATS = 3
-ALL_STEPS, FEW_STEPS = 50, 10
 
 
 def plan_metrics(data: BehaviorData, on_cpu: Ats, seed: int, *, measure: bool) -> Metrics:
@@ -23,13 +23,12 @@ def plan_metrics(data: BehaviorData, on_cpu: Ats, seed: int, *, measure: bool) -
     """
     metrics = Metrics()
     if not measure or len(data.start) == 0:
-        metrics.skip(NAMES, "not measured: seconds would differ from run to run")
+        metrics.skip(STEPS, "not measured: seconds would differ from run to run")
         return metrics
     context, _ = data.windows(np.array([0]))
-    full = replace(on_cpu, sampling=replace(on_cpu.sampling, goal_steps=ALL_STEPS, sequence_steps=ALL_STEPS))
-    few = replace(on_cpu, sampling=replace(on_cpu.sampling, goal_steps=FEW_STEPS, sequence_steps=FEW_STEPS))
-    for name, method in zip(NAMES, (full, few), strict=True):
-        seconds = []
+    for name, steps in STEPS.items():
+        sampling = replace(on_cpu.sampling, goal_steps=steps, sequence_steps=steps)
+        method, seconds = replace(on_cpu, sampling=sampling), []
         with threads.alone():
             for _ in range(REPEATS):
                 begin = time.perf_counter()

@@ -12,6 +12,7 @@ from pipeline.fields import skinning
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import RayCaster
 from pipeline.metrics.metrics import Metrics, median, percentile
+from stages.evaluate.registration import REFUSED, REFUSED_TENTH
 
 NEAREST_M, RANGE_M = 0.05, 5.0
 REACHED = 0.99
@@ -55,12 +56,8 @@ def track_metrics(distances: Sequence[Float[np.ndarray, "point"]]) -> Metrics:
     """Summarise distances of followed points over all frames; unknown poses count as failures."""
     metrics = Metrics()
     every = np.concatenate(distances) if len(distances) else np.zeros(0)
-    metrics.put(
-        "reconstruction/agent_track_m_median", median(every), "more than half of the frames have no pose"
-    )
-    metrics.put(
-        "reconstruction/agent_track_m_p90", percentile(every, 90), "a tenth of the frames has no pose"
-    )
+    metrics.put("reconstruction/agent_track_m_median", median(every), REFUSED)
+    metrics.put("reconstruction/agent_track_m_p90", percentile(every, 90), REFUSED_TENTH)
     return metrics
 
 

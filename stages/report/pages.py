@@ -55,8 +55,6 @@ def number(value: Any) -> str:
         return "–"
     if isinstance(value, bool) or not isinstance(value, int | float):
         return str(value)
-    if value == round(value) and abs(value) < 1e7:
-        return f"{value:.0f}"
-    if abs(value) >= 100:
+    if value == round(value) or abs(value) >= 100:
         return f"{value:.0f}"
     return f"{value:#.3g}".rstrip(".") if abs(value) >= 1e-3 else f"{value:.1e}"

@@ -36,6 +36,7 @@ class Inputs:
     behavior: Path
     longterm: Path
     simulator: Path
+    reconstruction_metrics: Path
     evaluation: Path
 
     def folders(self, artifact: str) -> dict[str | None, Path]:

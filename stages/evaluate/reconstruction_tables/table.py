@@ -16,7 +16,7 @@ from pipeline.metrics.intervals import aligned, bootstrapped, episodes, formatte
 from pipeline.metrics.lpips import Lpips
 from pipeline.metrics.metrics import Metrics, formatted
 from stages.evaluate import heldout, reading, reconstruction, surfaces
-from stages.evaluate.heldout import PARTS, HeldoutView
+from stages.evaluate.heldout import PARTS
 from stages.evaluate.reading import Reconstructed
 
 PAPER = {
@@ -109,7 +109,8 @@ def metrics(
         followed = reconstruction.track_distances(here, sessions, motions, turnaround, frames)
         one.add(surfaces.track_metrics(followed))
         found.add_as(variant, one, "reconstruction")
-        right[variant] = np.array([_depth_acc(view) for view in views])
+        shares = [heldout.depth_metrics(variant, [view]).values for view in views]
+        right[variant] = np.array([list(each.values()) for each in shares], float)  # NaN: not in view
         if views:
             found.pictures[variant] = heldout.side_by_side(views)
     for variant in folders:
@@ -117,14 +118,6 @@ def metrics(
         if variant != "ours" and reference in right and len(right["ours"]):
             _compare(found, variant, right[reference] - right[variant], rng)
     return found
-
-
-def _depth_acc(view: HeldoutView) -> list[float]:
-    """Return the share of right depth of one picture: all, agent, scene; NaN for what is not in it."""
-    known = (view.true.depth > 0) & (view.true.depth <= heldout.RANGE_M)
-    right = heldout.depth_is_right(view)
-    parts = (known, known & view.true.agent, known & ~view.true.agent)
-    return [float(right[part].mean()) if part.any() else np.nan for part in parts]
 
 
 def _compare(

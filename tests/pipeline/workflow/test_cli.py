@@ -177,7 +177,7 @@ def test_inputs_are_derived_from_the_fields():
         ("fit_feature_basis", "frames", ["v000", "v001", "v002"]),
         ("reconstruct", "frames", ["v000", "v001", "v002", "v003"]),
         ("reconstruct", "masks", ["v001", "v002", "v003"]),
-        ("evaluate", "frames", ["v000", "v001", "v002", "v003", "v004"]),
+        ("evaluate.reconstruction_metrics", "frames", ["v000", "v001", "v002", "v003", "v004"]),
         ("tabulate_behavior", "behavior_trials", ["ats-0", "ats-1", "world-0", "world-1"]),
     ],
 )

@@ -343,7 +343,7 @@ def test_a_walkthrough_without_depth_is_told_metres_by_sessions_that_train(house
     assert not [id for id, job in told.items() if "--captures" in job["arguments"] and id != "frames.v000"]
 
 
-def test_clicks_are_read_by_the_evaluation_alone(house):
+def test_clicks_are_read_by_reconstruction_metrics_alone(house):
     for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d"):
         house.write(f"captures/toy/{name}", name)
     house.python("pipeline.workflow.plan", "plan", "toy")
@@ -354,7 +354,7 @@ def test_clicks_are_read_by_the_evaluation_alone(house):
     assert {name for name in after if before.get(name) != after[name]} == {"extra.clicks.json"}
     jobs = json.loads((house.folder / "build/toy/plan/dag.json").read_text())
     readers = [job["id"] for job in jobs if "--clicks" in job["arguments"]]
-    assert readers == ["evaluation"]
+    assert readers == ["reconstruction_metrics"]
     assert all("extra.clicks.json" in str(job["keys"]) for job in jobs if job["id"] in readers)
 
 

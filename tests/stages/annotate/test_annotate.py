@@ -45,10 +45,7 @@ def running(room, path):
 def folders(room, registration) -> BuildFolders:
     frames = {id: room.build / "frames" / id for id in ("v000", "v001")}
     nowhere = room.build / "none"
-    unread = dict.fromkeys(
-        ("agent_template", "reconstruction", "scene_localizer", "splats", "behavior_data", "behavior"),
-        nowhere,
-    )
+    unread = dict.fromkeys(("agent_template", "reconstruction", "scene_localizer", "splats"), nowhere)
     template = room.build / "scene_template"
     return BuildFolders(
         frames=frames,

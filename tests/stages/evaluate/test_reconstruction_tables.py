@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.metrics.metrics import Metrics
-from stages.evaluate.heldout import HeldoutShot, HeldoutView
+from stages.evaluate.heldout import HeldoutShot, HeldoutView, depth_metrics
 from stages.evaluate.reading import Reconstructed
 from stages.evaluate.reconstruction_tables import table
 
@@ -25,7 +25,9 @@ def view(wrong: int) -> HeldoutView:
 
 def test_what_a_rival_lacks_is_told_with_an_interval():
     right = {
-        name: np.array([table._depth_acc(view(wrong + k % 2)) for k in range(12)])
+        name: np.array(
+            [list(depth_metrics(name, [view(wrong + k % 2)]).values.values()) for k in range(12)], float
+        )
         for name, wrong in (("ours", 8), ("totalrecon", 28))
     }
     found = Metrics()

@@ -13,7 +13,7 @@ from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import BehaviorData
 from pipeline.metrics.metrics import Metrics
 from pipeline.rivals.predictors import Ats
-from stages.evaluate import measuring, speed
+from stages.evaluate import speed, stage
 from stages.evaluate.config import Config
 
 DATA = SimpleNamespace(start=np.zeros(1), windows=lambda index: (None, None), videos=())
@@ -40,7 +40,7 @@ def test_plans_are_timed_with_one_thread():
     assert set(ours.threads) == {1} and values["simulator/plan_few_s"] >= 0
 
 
-def test_plans_are_timed_on_the_cpu(monkeypatch: pytest.MonkeyPatch):
+def test_plans_are_timed_on_the_cpu(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     asked = {}
 
     def nothing(*given: object, **named: object) -> Metrics:
@@ -60,12 +60,11 @@ def test_plans_are_timed_on_the_cpu(monkeypatch: pytest.MonkeyPatch):
         (BehaviorData, "load", lambda folder: DATA),
         (Scenes, "load", nothing),
         (Ats, "load", loaded),
-        (measuring, "_against_clicks", nothing),
-        (measuring.behavior, "behavior_metrics", remembers("behavior")),
-        (measuring.physical, "physical_metrics", remembers("physical")),
-        (measuring.speed, "plan_metrics", remembers("speed")),
+        (Metrics, "read", nothing),
+        (stage.behavior, "behavior_metrics", remembers("behavior")),
+        (stage.physical, "physical_metrics", remembers("physical")),
+        (stage.speed, "plan_metrics", remembers("speed")),
     ):
         monkeypatch.setattr(owner, name, double)
-    folders = SimpleNamespace(truth=None, behavior=Path(), behavior_data=Path(), reconstruction=Path())
-    measuring.evaluate(folders, (), Config(), "cuda")
+    stage.run(stage.Inputs(*[tmp_path] * 4), Config(), tmp_path, device="cuda")
     assert asked == {"behavior": "cuda", "physical": "cuda", "speed": "cpu"}

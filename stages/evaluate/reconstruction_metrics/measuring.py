@@ -1,12 +1,9 @@
-"""Ask every subject for its metrics, one after the other."""
+"""Ask every subject but behaviour for its metrics, one after the other."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.behavior.config import PlanSamplingConfig
-from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.trajectories import BehaviorData
 from pipeline.core import devices, progress
 from pipeline.core.videos import Video
 from pipeline.data import flow
@@ -17,19 +14,15 @@ from pipeline.geometry import subsampling
 from pipeline.localization import localizer as localizers
 from pipeline.metrics.metrics import Metrics
 from pipeline.metrics.pose_errors import PoseErrors, joined, pose_errors
-from pipeline.rivals.predictors import Ats
 from stages.evaluate import (
-    behavior,
     clicked,
     heldout,
     localizing,
     perception,
-    physical,
     reading,
     real_phone,
     reconstruction,
     registration,
-    speed,
 )
 from stages.evaluate.config import Config
 from stages.evaluate.reading import BuildFolders, RecordingWithTruth, TruthAlignment
@@ -45,37 +38,16 @@ NEED_TRUTH = (
 )  # fmt: skip
 
 
-def evaluate(
-    folders: BuildFolders, videos: Sequence[Video], config: Config, device: devices.Device
-) -> Metrics:
-    """Return all metrics of a build."""
-    metrics, rng = Metrics(), np.random.default_rng(config.seed)
-    if folders.truth is None:
-        sessions = [video for video in videos if video.role == "session"]
-        placed = sum((folders.registration / video.id / "poses.npz").exists() for video in sessions)
-        metrics.put("registration/videos_registered", placed)
-        metrics.put("registration/videos_total", len(sessions))
-        metrics.skip(NEED_TRUTH + reconstruction.NAMES, NO_TRUTH)
-        metrics.add(_against_clicks(folders, tuple(videos), config, device))
-    else:
-        metrics.add(_against_truth(folders, videos, config, rng, device))
-    progress.log("evaluate: behaviour")
-    data = BehaviorData.load(folders.behavior_data)
-    ours = _predictor(folders, data, device)
-    metrics.add(behavior.behavior_metrics(data, ours, config))
-    progress.log("evaluate: penetration and foot slide")
-    metrics.add(physical.physical_metrics(data, ours, folders.reconstruction, seed=config.seed))
-    metrics.add(
-        speed.plan_metrics(data, _predictor(folders, data, "cpu"), config.seed, measure=config.time_plans)
-    )
-    return metrics
-
-
-def _against_clicks(
+def against_clicks(
     folders: BuildFolders, videos: tuple[Video, ...], config: Config, device: devices.Device
 ) -> Metrics:
     """Measure a real capture: registration by clicks, held-out views by the phone's own sensor."""
     metrics, cameras = Metrics(), {}
+    sessions = [video for video in videos if video.role == "session"]
+    registered = sum((folders.registration / video.id / "poses.npz").exists() for video in sessions)
+    metrics.put("registration/videos_registered", registered)
+    metrics.put("registration/videos_total", len(sessions))
+    metrics.skip(NEED_TRUTH + reconstruction.NAMES, NO_TRUTH)
     if folders.clicks is None:
         metrics.skip(clicked.NAMES + clicked.OWN_NAMES, clicked.NO_CLICKS)
     else:
@@ -99,10 +71,11 @@ def _against_clicks(
     return metrics
 
 
-def _against_truth(
-    folders: BuildFolders, videos: Sequence, config: Config, rng: np.random.Generator, device: devices.Device
+def against_truth(
+    folders: BuildFolders, videos: tuple[Video, ...], config: Config, device: devices.Device
 ) -> Metrics:
-    metrics, known = Metrics(), reading.recorded(folders, tuple(videos))
+    """Measure a capture whose truth is known: registration, single frames, masks, flow, reconstruction."""
+    metrics, known = Metrics(), reading.recorded(folders, videos)
     frames, sessions = reading.frames_of_truth(folders, known), reading.of_role(known, "session")
     progress.log("evaluate: registration")
     metrics.add(_registration(folders, sessions, frames))
@@ -112,6 +85,7 @@ def _against_truth(
     progress.log("evaluate: masks and flow")
     metrics.add(_perception(folders, sessions, reading.of_role(known, "turnaround")[0]))
     progress.log("evaluate: reconstruction")
+    rng = np.random.default_rng(config.seed)
     metrics.add(reconstruction.reconstruction_metrics(folders, known, frames, config, rng, device))
     return metrics
 
@@ -198,10 +172,3 @@ def _perception(
     ]
     metrics.add(perception.people_metrics(found))
     return metrics
-
-
-def _predictor(folders: BuildFolders, data: BehaviorData, device: devices.Device) -> Ats:
-    """Open the behaviour model as a predictor on its own windows."""
-    return Ats.load(
-        folders.behavior, Scenes.load(folders.behavior_data, data.videos), PlanSamplingConfig(), device=device
-    )

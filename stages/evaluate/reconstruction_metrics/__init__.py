@@ -1,0 +1,1 @@
+"""What precedes behaviour, against truth: masks, flow, registration, localizer, reconstruction."""

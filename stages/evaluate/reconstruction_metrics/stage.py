@@ -1,0 +1,46 @@
+"""The stage: all that precedes behaviour, and what is known of the truth -> metrics, the quality page."""
+
+from pathlib import Path
+
+from pipeline.core import devices
+from pipeline.core.videos import Video
+from pipeline.data import qa
+from pipeline.metrics.metrics import Metrics
+from stages.evaluate.config import Config
+from stages.evaluate.reading import BuildFolders
+from stages.evaluate.reconstruction_metrics import measuring
+
+LIMITS = (
+    qa.Check("registration/rotation_deg_median", None, "deg", 1.0),
+    qa.Check("registration/translation_m_median", None, "m", 0.04),
+    qa.Check("masks/iou_mean", None, "", 0.75, better="higher"),
+    qa.Check("reconstruction/depth_acc_all", None, "", 0.88, better="higher"),
+    qa.Check("reconstruction/agent_root_m_median", None, "m", 0.08),
+)
+"""What the quality page judges, without values."""
+
+
+def run(
+    inputs: BuildFolders,
+    config: Config,
+    out: Path,
+    *,
+    device: devices.Device = "cpu",
+    videos: tuple[Video, ...] = (),
+) -> Metrics:
+    """Measure what precedes behaviour into `out`, and return the metrics."""
+    measure = measuring.against_clicks if inputs.truth is None else measuring.against_truth
+    metrics = measure(inputs, videos, config, device)
+    metrics.write(out, "metrics.json")
+    qa.write(
+        out,
+        good="errors of a few centimetres and of less than a degree, and masks that follow the animal",
+        bad="an error far above its limit: what is made after it is no better",
+        checks=metrics.judged(LIMITS),
+        pictures=[
+            qa.Picture(f"{kind}_{n}", image, caption)
+            for kind, shown in (("chart", metrics.charts), ("view", metrics.pictures))
+            for n, (caption, image) in enumerate(shown.items())
+        ],
+    )
+    return metrics
