@@ -3,20 +3,24 @@
     python -SE -m pipeline.workflow.reproduce begin CRATE             recipe, recordings of `again_<hash>`
     python -SE -m pipeline.workflow.reproduce compare CRATE AGENT     exit 1 where something differs
 
-Recordings are found by their hash among the captures here. Same seed, environment and kind of CPU: equal bit
-for bit; elsewhere the metrics that moved are listed. Standard library only.
+Recordings are found by hash among the captures here, clicks, prompts and a former reconstruction beside them.
+Same code, environment and CPU: equal bit for bit; else metrics that moved are listed. Standard library only.
 """
 
+import glob
 import json
 import math
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pipeline.core import config
 from pipeline.core.errors import InputError, exit_code
-from pipeline.workflow import artifact, dag
+from pipeline.core.videos import Video
+from pipeline.workflow import artifact, captures, dag, recipes
 from pipeline.workflow.sources import recording_digest
 
 FILE = "ro-crate-metadata.json"
@@ -25,24 +29,13 @@ SHOWN_METRICS = 20
 
 
 @dataclass(frozen=True)
-class RecordedArtifact:
-    """What a crate holds of one artifact."""
-
-    name: str
-    """`masks/v002`"""
-    key: str | None
-    content: str
-    config: dict[str, Any]
-    versions: dict[str, str]
-
-
-@dataclass(frozen=True)
 class Crate:
     """A build as its report describes it."""
 
-    recordings: dict[str, str | None]
-    """sha256 by file name; None for the built-in capture"""
-    artifacts: tuple[RecordedArtifact, ...]
+    recordings: tuple[Video, ...]
+    """their `sha256` is None for the built-in capture"""
+    artifacts: dict[str, artifact.Manifest]
+    """by name, `masks/v002`, in flow order; without their files"""
     metrics: dict[str, float | None]
 
 
@@ -52,45 +45,66 @@ def read(path: Path) -> Crate:
     try:
         graph = json.loads(file.read_bytes())["@graph"]
         root = next(entity for entity in graph if entity["@id"] == "./")
-        recordings, artifacts = {}, []
+        recordings, artifacts = [], {}
         for entity in graph:
             found = _properties(entity.get("additionalProperty", []))
-            if entity["@id"].startswith("#recording/"):
-                recordings[entity["name"]] = found["sha256"]
+            if recording := re.fullmatch(r"#recording/(v\d+)", entity["@id"]):
+                video = {"id": recording[1], "file": entity["name"], **found}
+                recordings.append(config.from_table(Video, video, where=str(file)))
             elif entity["@id"].startswith("#artifact/"):
-                settings, versions = json.loads(found["config"]), json.loads(found["versions"])
-                artifacts.append(
-                    RecordedArtifact(entity["name"], found["key"], found["content"], settings, versions)
-                )
-        return Crate(recordings, tuple(artifacts), _properties(root["variableMeasured"]))
+                tables = {key: json.loads(found[key]) for key in ("inputs", "config", "versions")}
+                known = {key: found[key] for key in ("stage", "key", "content")} | tables
+                artifacts[entity["name"]] = artifact.Manifest(**known, files={})
+        return Crate(tuple(recordings), artifacts, _properties(root["variableMeasured"]))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as error:
         remedy = f"give build/<agent>/report or its {FILE}"
         raise InputError("CRT-001", f"is no crate of a report ({error!r})", str(file), remedy) from error
 
 
-def begin(crate: Crate, agents: Path, captures: Path) -> str:
-    """Write the recipe, link the recordings, return the new animal's name. Raises CRT-002."""
-    name = "again_" + artifact.digest_of([each.content for each in crate.artifacts])[:8]
-    wanted = {file: _found(digest, captures) for file, digest in crate.recordings.items() if digest}
-    found = {file: path for file, path in wanted.items() if path}
-    missing = [file for file in wanted if file not in found]
-    if missing:
+def begin(crate: Crate, agents: Path, captured: Path, builds: Path) -> str:
+    """Write the recipe, link the recordings, return the new animal's name. Raises CRT-002, CRT-003."""
+    name = "again_" + artifact.digest_of([each.content for each in crate.artifacts.values()])[:8]
+    if any(video.animal for video in crate.recordings):
+        what, remedy = "is of one of several animals; the others' turnarounds are not in it", "build the home"
+        raise InputError("CRT-003", what, name, remedy)
+    wanted = {video: video.sha256 for video in crate.recordings if video.sha256}
+    paths = [path for path in captured.glob("*/*") if wanted and not path.is_symlink()]
+    known = {recording_digest(path): path for path in paths}
+    if missing := [video.file for video, digest in wanted.items() if digest not in known]:
         remedy = "put the recordings with these hashes into captures/<any agent>/"
         raise InputError("CRT-002", "recordings of the crate are not here", ", ".join(missing), remedy)
-    (agents / f"{name}.toml").write_text(recipe(crate))
-    (captures / name).mkdir(parents=True, exist_ok=True)
-    for file, path in found.items():
-        link = captures / name / file
-        link.unlink(missing_ok=True)
-        link.symlink_to(path.resolve())
+    # Names of a crate, which may hide or say anything, make no paths; ids do.
+    files = {video.id: f"{video.id}{known[digest].suffix}" for video, digest in wanted.items()}
+    said = {}
+    for video, digest in wanted.items():
+        path, file = known[digest], files[video.id]
+        _link(path, file, captured / name)
+        other = files.get(video.synchronized_with or "")
+        clock = {"synchronized_with": other, "offset_s": video.offset_s if other else None}
+        said[f'"{file}"'] = {"role": video.role, "split": video.split, **clock}
+    (agents / f"{name}.toml").write_text(recipe(crate) + _toml(said, [recipes.VIDEOS_TABLE]))
+    ids = json.dumps({file: id for id, file in files.items()})
+    artifact.write_if_changed(builds / name / "plan/ids.json", ids)
     return name
+
+
+def _link(path: Path, file: str, links: Path) -> None:
+    """Link a recording, under the name `file`, and what beside it decides results."""
+    wanted = {extra: path.with_name(extra) for node in dag.FLOW for extra in node.extra_inputs} | {file: path}
+    for sidecar in path.parent.glob(f"{glob.escape(path.name)}.*{captures.SIDECAR}"):
+        wanted[file + sidecar.name.removeprefix(path.name)] = sidecar
+    links.mkdir(parents=True, exist_ok=True)
+    for link, source in wanted.items():
+        (links / link).unlink(missing_ok=True)
+        if source.exists():
+            (links / link).symlink_to(source.resolve())
 
 
 def recipe(crate: Crate) -> str:
     """Return the settings of all artifacts as a recipe; the plan sets what differs between recordings."""
     tables: dict[str, dict[str, Any]] = {}
-    for each in crate.artifacts:
-        node = dag.NODES.get(each.name.partition("/")[0])
+    for name, each in crate.artifacts.items():
+        node = dag.NODES.get(name.partition("/")[0])
         if node is not None:
             settings = {key: value for key, value in each.config.items() if key not in node.fixed}
             table = tables.setdefault(dag.table_of(node), settings)
@@ -101,28 +115,25 @@ def recipe(crate: Crate) -> str:
 
 
 def differing(crate: Crate, build: Path) -> list[str]:
-    """Return the names of artifacts whose content is not the crate's, or that are missing, in flow order."""
-    order = {name: place for place, name in enumerate(dag.NODES)}
-    wrong = []
-    for each in crate.artifacts:
-        made = artifact.read_manifest(build / each.name)
-        if made is None or made.content != each.content:
-            wrong.append(each.name)
-    return sorted(wrong, key=lambda name: (order.get(name.partition("/")[0], len(order)), name))
+    """Return the names of artifacts whose bytes are not the crate's, or that are missing, in flow order."""
+    contents = {name: artifact.content_of(artifact.digests(build / name)) for name in crate.artifacts}
+    return [name for name, each in crate.artifacts.items() if each.content != contents[name]]
 
 
 def compare(crate: Crate, build: Path) -> Iterator[str]:
-    """Yield what differs: the first artifact with its versions, then the metrics that moved most."""
+    """Yield what differs: the first artifact, its versions and settings, then the metrics that moved most."""
     wrong = differing(crate, build)
     if not wrong:
         return
     yield f"{len(wrong)} of {len(crate.artifacts)} artifacts differ; the first one is {wrong[0]}"
-    first = next(each for each in crate.artifacts if each.name == wrong[0])
-    manifest = artifact.read_manifest(build / wrong[0])
-    here = manifest.versions if manifest else {}
-    for library in sorted(first.versions.keys() | here.keys()):
-        if first.versions.get(library) != here.get(library):
-            yield f"  {library}: {first.versions.get(library)} in the crate, {here.get(library)} here"
+    first, here = crate.artifacts[wrong[0]], artifact.read_manifest(build / wrong[0])
+    if here is None:
+        return
+    if changed := artifact.damaged(build / wrong[0]):
+        yield f"  changed since it was written: {', '.join(changed)}"
+    for was, now in ((first.versions, here.versions), (first.config, here.config)):
+        for name in sorted(name for name in was.keys() | now.keys() if was.get(name) != now.get(name)):
+            yield f"  {name}: {was.get(name)} in the crate, {now.get(name)} here"
     try:
         now = json.loads((build / "evaluation/metrics.json").read_bytes())
     except (OSError, ValueError):
@@ -142,32 +153,22 @@ def _properties(rows: list[Mapping[str, Any]]) -> dict[str, Any]:
     return {row["name"]: row["value"] for row in rows}
 
 
-def _found(digest: str, captures: Path) -> Path | None:
-    for path in sorted(captures.glob("*/*")):
-        if not path.is_symlink() and recording_digest(path) == digest:
-            return path
-    return None
-
-
 def _toml(table: Mapping[str, Any], path: list[str]) -> str:
     """Write a table and those within it; what is None keeps its default."""
     inner = [_toml(value, [*path, key]) for key, value in table.items() if isinstance(value, Mapping)]
     plain = {key: value for key, value in table.items() if not isinstance(value, Mapping | None)}
-    lines = [f"\n[{'.'.join(path)}]", *(f"{key} = {_value(value)}" for key, value in plain.items())]
+    lines = [
+        f"\n[{'.'.join(path)}]",
+        *(f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in plain.items()),
+    ]
     return "\n".join(lines) + "\n" + "".join(inner)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, list):
-        return f"[{', '.join(_value(each) for each in value)}]"
-    return json.dumps(value, ensure_ascii=False)
 
 
 def main(arguments: list[str]) -> int:
     """Run one of the two commands of the module's docstring."""
     match arguments:
         case ["begin", path]:
-            print(begin(read(Path(path)), Path("agents"), Path("captures")))
+            print(begin(read(Path(path)), Path("agents"), Path("captures"), Path("build")))
             return 0
         case ["compare", path, agent]:
             lines = list(compare(read(Path(path)), Path("build", agent)))

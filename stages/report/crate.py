@@ -16,6 +16,8 @@ from stages.report.collect import read_manifest
 FILE = "ro-crate-metadata.json"
 BUILTIN = "synthetic_capture"
 """Stands beside the other artifacts where a build has no recordings of a user's."""
+PLANNED = ("role", "split", "sha256", "synchronized_with", "offset_s", "animal")
+"""What is kept of a recording, so that it is planned the same again."""
 Entity = dict[str, Any]
 
 
@@ -40,7 +42,8 @@ def describe(
         "variableMeasured": _properties(**dict(sorted(metrics.items()))),
     }
     if times:
-        root["locationCreated"] = _machine()
+        found = {"system": platform.system(), "architecture": platform.machine(), "cores": os.cpu_count()}
+        root["locationCreated"] = {"@type": "Place", "additionalProperty": _properties(**found)}
     about = {
         "@id": FILE,
         "@type": "CreativeWork",
@@ -56,7 +59,7 @@ def _recording(video: Video, safe: bool) -> Entity:
         "@id": f"#recording/{video.id}",
         "@type": "CreativeWork",
         "name": video.id if safe else video.file,
-        "additionalProperty": _properties(role=video.role, split=video.split, sha256=video.sha256),
+        "additionalProperty": _properties(**{key: getattr(video, key) for key in PLANNED}),
     }
 
 
@@ -89,8 +92,3 @@ def _artifact(name: str, manifest: Mapping[str, Any], record: Path, times: bool)
 
 def _properties(**values: str | float | None) -> list[Entity]:
     return [{"@type": "PropertyValue", "name": name, "value": value} for name, value in values.items()]
-
-
-def _machine() -> Entity:
-    found = {"system": platform.system(), "architecture": platform.machine(), "cores": os.cpu_count()}
-    return {"@type": "Place", "name": "machine", "additionalProperty": _properties(**found)}

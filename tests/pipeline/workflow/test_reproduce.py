@@ -1,6 +1,7 @@
 """A report's crate is enough to build again; what differs is named in flow order."""
 
 import json
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +25,7 @@ SETTINGS = {
 }
 
 
-def build(folder: Path, words: dict[str, str], sha256: str | None = None) -> Path:
+def build(folder: Path, words: dict[str, str], videos: tuple[Video, ...] = ()) -> Path:
     """Write small artifacts, with the crate that a report would hold of them; returns the crate."""
     found: dict[str, dict[str | None, Path]] = {}
     for name, settings in SETTINGS.items():
@@ -37,7 +38,6 @@ def build(folder: Path, words: dict[str, str], sha256: str | None = None) -> Pat
             found.setdefault(name, {})[id] = place
     (folder / "records").mkdir(exist_ok=True)
     (folder / "records" / "masks.v000.json").write_text(json.dumps({"seconds": 4.5, "threads": 1}))
-    videos = (Video("v000", "walk.r3d", "walkthrough", "none", sha256),)
     described = crate.describe("toy", found, videos, {"masks/iou_mean": 0.8, "x/none": None})
     (folder / crate.FILE).write_text(json.dumps(described))
     return folder / crate.FILE
@@ -53,6 +53,19 @@ def test_the_first_artifact_that_differs_is_named(tmp_path: Path):
     (tmp_path / "other" / "evaluation/metrics.json").write_text('{"masks/iou_mean": 0.7}')
     lines = list(reproduce.compare(known, tmp_path / "other"))
     assert "the first one is masks/v001" in lines[0] and "0.8 in the crate, 0.7 here" in lines[-1]
+
+
+def test_a_changed_byte_and_a_changed_setting_are_named(tmp_path: Path):
+    known = reproduce.read(build(tmp_path / "a", {}))
+    (tmp_path / "a/flow/result.txt").write_text("sane")
+    lines = list(reproduce.compare(known, tmp_path / "a"))
+    assert "1 of 5 artifacts differ; the first one is flow" in lines[0]
+    assert lines[1] == "  changed since it was written: result.txt"
+    shutil.rmtree(tmp_path / "a/flow")
+    with artifact.create(tmp_path / "a/flow", stage="flow", config={"backend": "raft"}, inputs={}) as made:
+        (made / "result.txt").write_text("other")
+    lines = list(reproduce.compare(known, tmp_path / "a"))
+    assert "  backend: search in the crate, raft here" in lines
 
 
 def test_an_artifact_that_was_not_built_differs(tmp_path: Path):
@@ -74,19 +87,43 @@ def test_the_recipe_holds_the_settings(tmp_path: Path):
     assert config.from_table(Flow, table["estimate_flow"], where="recipe") == Flow(**SETTINGS["flow"])
 
 
-def test_recordings_are_found_by_their_hash(tmp_path: Path):
-    captures, agents = tmp_path / "captures", tmp_path / "agents"
+def test_recordings_are_found_by_their_hash_and_planned_as_they_were(tmp_path: Path):
+    captures, agents, builds = (tmp_path / name for name in ("captures", "agents", "build"))
     (captures / "luna").mkdir(parents=True)
     agents.mkdir()
-    (captures / "luna" / "renamed.r3d").write_bytes(b"recording")
-    digest = reproduce.recording_digest(captures / "luna" / "renamed.r3d")
-    known = reproduce.read(build(tmp_path / "a", {}, digest))
-    name = reproduce.begin(known, agents, captures)
-    assert (captures / name / "walk.r3d").read_bytes() == b"recording"
-    assert (agents / f"{name}.toml").is_file()
+    for name in ("renamed.r3d", "other.mp4", "renamed.r3d.masks.toml", "clicks.json"):
+        (captures / "luna" / name).write_text(name)
+    digests = [reproduce.recording_digest(captures / "luna" / name) for name in ("renamed.r3d", "other.mp4")]
+    videos = (
+        Video("v000", "../luna/clicks.json", "session", "train", digests[0]),
+        Video("v003", "v003", "heldout", "none", digests[1], synchronized_with="v000", offset_s=1.5),
+    )
+    known = reproduce.read(build(tmp_path / "a", {}, videos))
+    for _ in range(2):
+        name = reproduce.begin(known, agents, captures, builds)
+    here = {path.name: path.read_text() for path in (captures / name).iterdir()}
+    assert here == {
+        "v000.r3d": "renamed.r3d",
+        "v003.mp4": "other.mp4",
+        "v000.r3d.masks.toml": "renamed.r3d.masks.toml",
+        "clicks.json": "clicks.json",
+    }
+    said = config.read_table(agents / f"{name}.toml")["videos"]
+    assert said["v000.r3d"] == {"role": "session", "split": "train"}
+    clock = {"synchronized_with": "v000.r3d", "offset_s": 1.5}
+    assert said["v003.mp4"] == {"role": "heldout", "split": "none", **clock}
+    ids = json.loads((builds / name / "plan/ids.json").read_text())
+    assert ids == {"v000.r3d": "v000", "v003.mp4": "v003"}
     (captures / "luna" / "renamed.r3d").write_bytes(b"another one")
     with pytest.raises(InputError, match="CRT-002"):
-        reproduce.begin(known, agents, captures)
+        reproduce.begin(known, agents, captures, builds)
+
+
+def test_one_of_several_animals_is_refused(tmp_path: Path):
+    video = Video("v001", "turnaround_rex.r3d", "turnaround", "none", None, animal="rex")
+    known = reproduce.read(build(tmp_path / "a", {}, (video,)))
+    with pytest.raises(InputError, match="CRT-003"):
+        reproduce.begin(known, tmp_path, tmp_path, tmp_path)
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"@graph": [{"@id": "./"}]}', '{"@graph": 3}'])
@@ -100,7 +137,9 @@ def test_times_are_kept_and_methods_cite_what_was_used(tmp_path: Path):
     described = json.loads(build(tmp_path / "a", {}).read_text())
     masks = next(entity for entity in described["@graph"] if entity["@id"] == "#artifact/masks/v000")
     assert {"@type": "PropertyValue", "name": "seconds", "value": 4.5} in masks["additionalProperty"]
-    folders = {name: {None: tmp_path / "a" / name} for name in ("frames", "flow")}
+    folders: dict[str, dict[str | None, Path]] = {
+        name: {None: tmp_path / "a" / name} for name in ("frames", "flow")
+    }
     assert "10 Hz" in methods.paragraph(folders) and "[kroeger2016fast]" in methods.paragraph(folders)
     assert "RAFT" not in methods.paragraph(folders)
     entries = methods.bibliography(folders)
