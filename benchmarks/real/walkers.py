@@ -65,6 +65,7 @@ SAMPLING = PlanSamplingConfig(
     method="ddpm_large",
     goal_steps=20,
     sequence_steps=1,
+    guidance=1.0,
     path_noise_std=0.0,
     avoid_solid=False,
     max_path_draws=1,

@@ -28,6 +28,10 @@ SamplingMethod = Literal["ddpm", "ddpm_large", "ddim"]
 Ho et al. 2020, Sec. 3.2), which keeps the spread that few steps of the former lose; DDIM adds none."""
 
 
+MOST_GUIDANCE = 2.0
+"""Largest scale that sliders offer: goals err more from there on."""
+
+
 @dataclass(frozen=True)
 class PlanSamplingConfig:
     """How plans are drawn."""
@@ -39,8 +43,10 @@ class PlanSamplingConfig:
     """Denoising steps of the goal."""
     sequence_steps: int = 10
     """Denoising steps of path and body."""
-    guidance: float = 1.0
-    """Scale s of classifier-free guidance ("interactivity")."""
+    guidance: float = 1.25
+    """Scale s of classifier-free guidance ("interactivity"). Of 1, 1.25, 1.5 and 2 it has the least energy
+    score of goals (0.743 m; at 1: 0.757) and the right share of flights on sessions left out of training
+    (built-in cat). Bodies, which follow their paths, are guided by 1 at most."""
     guided: Guided = "observer"
     """What the guidance acts on."""
     companions_guidance: float = 1.0

@@ -321,7 +321,8 @@ class Sampler:
 
         shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
         along = [denoise(codes.full, 1.0), *map(denoise, codes.less)]
-        drawn, spread = replace(sampling, method="ddim"), sampling.body_noise_std
+        drawn = replace(sampling, method="ddim", guidance=min(sampling.guidance, 1.0))
+        spread = sampling.body_noise_std
         body = self._drawn(along, shape, drawn, sampling.sequence_steps, rng, spread=spread)
         return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
 

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from pipeline.behavior.config import PlanSamplingConfig
+
 Embodiment = Literal["person", "robot"]
 """A person steps forward, sideways and turns; a robot on wheels drives forward and turns."""
 RewardName = Literal["approach", "follow", "calm", "none"]
@@ -33,7 +35,7 @@ class EnvironmentConfig:
     """Denoising steps of the animal's goals; 50 for the full sampler."""
     sequence_steps: int = 4
     """Denoising steps of its paths and bodies; 10 for the full sampler."""
-    guidance: float = 1.0
+    guidance: float = PlanSamplingConfig.guidance
     """Scale of classifier-free guidance: the interactivity."""
     candidates: int = 2
     """Plans drawn at most where the first one is blocked."""

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.behavior.config import ReplanningConfig
+from pipeline.behavior.config import MOST_GUIDANCE, ReplanningConfig
 from pipeline.geometry import rigid
 from stages.export_simulator.actions import SessionClip
 from stages.export_simulator.export import SimulatorParts
@@ -92,7 +92,7 @@ def controls(sampling: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """
     steps = int(sampling["sequence_steps"])
     return {
-        "interactivity": {"least": 0.0, "most": 1.0, "default": min(float(sampling["guidance"]), 1.0)},
+        "interactivity": {"least": 0.0, "most": MOST_GUIDANCE, "default": float(sampling["guidance"])},
         "samples": {"choices": list(GOAL_CHOICES), "default": GOALS},
         "steps": {"choices": sorted({steps, FINE_STEPS}), "default": steps},
     }

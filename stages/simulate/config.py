@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from pipeline.behavior.config import PlanSamplingConfig
+
 ObserverScript = Literal["away", "still", "approach", "circle"]
 """What a scripted observer does."""
 SubgoalSource = Literal["none", "visited", "behavior"]
@@ -19,7 +21,7 @@ class Config:
     """What the observer does."""
     observer_speed_m_s: float = 1.0
     """Walking speed of the observer, m/s."""
-    guidance: float = 1.0
+    guidance: float = PlanSamplingConfig.guidance
     """Scale of classifier-free guidance: the interactivity."""
     without: tuple[Literal["scene", "observer", "past", "goal"], ...] = ()
     """Conditions that plans are drawn without."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.behavior.config import MOST_GUIDANCE
 from pipeline.behavior.simulator import Simulator, SimulatorState
 from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.core import loopback
@@ -141,8 +142,8 @@ class LiveView:
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        guidance = float(np.clip(self.simulator.flock.sampling.guidance, 0, 1))
-        self.interactivity = gui.add_slider("interactivity", 0.0, 1.0, SLIDER_STEP, guidance)
+        guidance = float(np.clip(self.simulator.flock.sampling.guidance, 0, MOST_GUIDANCE))
+        self.interactivity = gui.add_slider("interactivity", 0.0, MOST_GUIDANCE, SLIDER_STEP, guidance)
         self.playing = gui.add_checkbox("time passes", True)
         self.again = Event()  # clicks come on another thread, perhaps in the middle of a step
         gui.add_button("start again, next seed").on_click(lambda _event: self.again.set())

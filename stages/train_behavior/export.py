@@ -171,7 +171,7 @@ def golden_plan(sampler: Sampler, architecture: Architecture, *, accompanied: bo
     drawn = {name: noise.standard_normal(shape, dtype=np.float32) for name, shape in shapes.items()}
     plans = {
         f"guidance_{s:g}": sampler.plan(observation, replace(sampling, guidance=s), np.random.default_rng(0))
-        for s in (1.0, 0.5)
+        for s in (sampling.guidance, 1.0, 0.5)
     }
     return {
         "input": {

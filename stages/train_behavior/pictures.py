@@ -45,7 +45,7 @@ def pictures(
         "no scene": PlanSamplingConfig(scene=False),
         "no past": PlanSamplingConfig(past=False),
     }
-    strength = {f"interactivity {s:g}": PlanSamplingConfig(guidance=s) for s in (0.0, 0.5, 1.0)}
+    strength = {f"interactivity {s:g}": PlanSamplingConfig(guidance=s) for s in (0.0, 1.0, 2.0)}
     with_scene = {name: removed[name] for name in ("all", "no scene")}
     coming = approach(
         SIDES[0], CLOSE_M, WALK_M_S, frames=some.others.shape[2], rate_hz=sampler.scaling.rate_hz

@@ -78,7 +78,7 @@ def approach(
 
 def measure(sampler: Sampler, observation: Observation, *, radius_m: float, seed: int) -> Reactions:
     """Sample goals of some windows under scripted observers, always with the same noise."""
-    sampling = PlanSamplingConfig(avoid_solid=False)
+    sampling = PlanSamplingConfig(guidance=1.0, avoid_solid=False)  # what was learned, not amplified
     how = {"frames": observation.others.shape[2], "rate_hz": sampler.scaling.rate_hz}
 
     def mean_goals(

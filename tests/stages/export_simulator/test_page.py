@@ -336,7 +336,7 @@ def _check_it_plays(page: Page, name: str, place: np.ndarray) -> None:
 def test_keys_stay_alive_while_the_panel_is_used(simulator: Path, chromium: Browser) -> None:
     with browser.shown(chromium, (simulator / "index.html").as_uri(), size=(900, 760)) as (page, wrong):
         page.locator("#interactivity").press("ArrowLeft")
-        assert page.input_value("#interactivity") == "0.95", "arrows are the slider's"
+        assert page.input_value("#interactivity") == "1.2", "arrows are the slider's"
         _check_a_key_walks(page, "w")
         page.locator("[data-sense=past]").focus()
         page.keyboard.press("Space")
@@ -477,7 +477,7 @@ def _check_a_followed_link(page: Page) -> None:
     page.evaluate("location.hash = '#replay=v002&view=animal&speed=0&samples=1'")
     page.wait_for_function("ats.state().replay?.name === 'v002'", timeout=10_000)
     state = page.evaluate("ats.state()")
-    kept = {"replay": "v002", "view": "animal", "speed": 1, "samples": 1, "interactivity": 1}
+    kept = {"replay": "v002", "view": "animal", "speed": 1, "samples": 1, "interactivity": 1.25}
     assert {key: state["settings"][key] for key in kept} == kept and state["aim"] is None
     page.wait_for_function("ats.state().tick > 2", timeout=20_000)
 

@@ -369,7 +369,7 @@ def test_golden_plan_uses_the_noise_it_names(windows):
             return self.queue.pop(0)
 
     plan = sampler.plan(golden_observation(ARCHITECTURE), PlanSamplingConfig("ddim", 10, 10), Noted())
-    np.testing.assert_allclose(plan.path[0], golden["plans"]["guidance_1"]["path"], atol=1e-4)
+    np.testing.assert_allclose(plan.path[0], golden["plans"]["guidance_1.25"]["path"], atol=1e-4)
 
 
 @pytest.mark.slow

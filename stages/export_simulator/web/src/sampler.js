@@ -206,7 +206,7 @@ export class Sampler {
     return this.run(denoise(codes.full), denoise(codes.withoutObserver), faint, {
       method: 'ddim',
       count: steps,
-      interactivity,
+      interactivity: Math.min(interactivity, 1),
     });
   }
 

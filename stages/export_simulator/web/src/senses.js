@@ -160,7 +160,9 @@ export class Senses {
     for (let turns = 0; turns <= 2 * TURNS; turns++) {
       const angle = (nearer * Math.ceil(turns / 2) * (turns % 2 ? 1 : -1) * Math.PI) / 2 / TURNS;
       const [cosine, sine] = [Math.cos(angle), Math.sin(angle)];
-      const turned = [cosine * x + sine * z, y, cosine * z - sine * x].map((value, axis) => start[axis] + value);
+      const turned = [cosine * x + sine * z, y, cosine * z - sine * x].map(
+        (value, axis) => start[axis] + value,
+      );
       if (this.allows(turned)) return turned;
     }
     return cleared;
