@@ -39,7 +39,7 @@ PPO_SETTINGS = {
     "policy_kwargs": {"log_std_init": -0.7, "net_arch": [64, 64]},
 }  # fmt: skip
 """Small batches' usual values; a second is ten steps, so that 0.98 looks five seconds ahead. Rewards are divided
-by the running spread of their returns, which reach 10, or the value network's gradient drowns the policy's."""
+by the running spread of their returns, which reach 5, or the value network's gradient drowns the policy's."""
 OBSERVED = ("animal", "velocity")
 """The floor plan around the person, 256 numbers, made learning several times as slow."""
 Policy = Callable[[dict[str, Float[np.ndarray, "person ..."]]], Float[np.ndarray, "person action"]]

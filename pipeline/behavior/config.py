@@ -26,8 +26,6 @@ NoiseCourse = Literal["linear", "rectified"]
 SamplingMethod = Literal["ddpm", "ddpm_large", "ddim"]
 """DDPM adds noise of the posterior's variance at each step, or of the larger one of the forward step (both of
 Ho et al. 2020, Sec. 3.2), which keeps the spread that few steps of the former lose; DDIM adds none."""
-
-
 MOST_GUIDANCE = 2.0
 """Largest scale that sliders offer: goals err more from there on."""
 
@@ -44,9 +42,8 @@ class PlanSamplingConfig:
     sequence_steps: int = 10
     """Denoising steps of path and body."""
     guidance: float = 1.25
-    """Scale s of classifier-free guidance ("interactivity"). Of 1, 1.25, 1.5 and 2 it has the least energy
-    score of goals (0.743 m; at 1: 0.757) and the right share of flights on sessions left out of training
-    (built-in cat). Bodies, which follow their paths, are guided by 1 at most."""
+    """Scale s of classifier-free guidance, for bodies at most 1. Of 1, 1.25, 1.5, 2 it has the least energy
+    score of goals and the right share of flights in left-out sessions of the built-in cat."""
     guided: Guided = "observer"
     """What the guidance acts on."""
     companions_guidance: float = 1.0

@@ -322,8 +322,7 @@ class Sampler:
         shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
         along = [denoise(codes.full, 1.0), *map(denoise, codes.less)]
         drawn = replace(sampling, method="ddim", guidance=min(sampling.guidance, 1.0))
-        spread = sampling.body_noise_std
-        body = self._drawn(along, shape, drawn, sampling.sequence_steps, rng, spread=spread)
+        body = self._drawn(along, shape, drawn, sampling.sequence_steps, rng, spread=sampling.body_noise_std)
         return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
 
     def paths_out_of_solid(

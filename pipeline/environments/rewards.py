@@ -10,8 +10,8 @@ from pipeline.environments.config import RewardName
 
 REACHED_M = 0.7
 """Distance at which the animal counts as reached: an arm's length."""
-REACHED_REWARD, FLEEING_COST = 10.0, 10.0
-"""What ends an `approach`, in metres of progress."""
+REACHED_REWARD, FLEEING_COST = 5.0, 5.0
+"""What ends an `approach`, in metres of progress; twice as much, and PPO may learn to keep away."""
 FOLLOW_M = 1.2
 """Distance at which `follow` is best."""
 

@@ -2,6 +2,5 @@
 
 The only stage that reads truth. `reading` opens artifacts and brings truth into our frames (one SE(3) from
 the walk-through's cameras, one constant agent SE(3) from the turnaround); `registration`, `localizing`,
-`perception`, `heldout`, `surfaces` and `behavior` each return `Metrics`. The program `reconstruction_metrics`
-measures what precedes behaviour, this one behaviour, and puts all together.
+`perception`, `heldout`, `surfaces` and `behavior` each return `Metrics`.
 """

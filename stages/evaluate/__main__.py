@@ -1,7 +1,4 @@
-"""Measure behaviour beside simple rivals, and put all metrics of a build together.
-
-Those of what precedes behaviour are read from `reconstruction_metrics`.
-"""
+"""Measure behaviour beside simple rivals, and put all metrics of a build together."""
 
 from pipeline.workflow import cli
 from stages.evaluate import stage

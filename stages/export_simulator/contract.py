@@ -86,10 +86,7 @@ def contract(
 
 
 def controls(sampling: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return what a visitor sets, its range and its default, which is the sampler's.
-
-    `interactivity` is the scale of classifier-free guidance on the observer.
-    """
+    """Return what a visitor sets, its range and default; `interactivity` is the scale of guidance."""
     steps = int(sampling["sequence_steps"])
     return {
         "interactivity": {"least": 0.0, "most": MOST_GUIDANCE, "default": float(sampling["guidance"])},

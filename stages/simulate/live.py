@@ -142,8 +142,8 @@ class LiveView:
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        guidance = float(np.clip(self.simulator.flock.sampling.guidance, 0, MOST_GUIDANCE))
-        self.interactivity = gui.add_slider("interactivity", 0.0, MOST_GUIDANCE, SLIDER_STEP, guidance)
+        scale = min(self.simulator.flock.sampling.guidance, MOST_GUIDANCE)
+        self.interactivity = gui.add_slider("interactivity", 0.0, MOST_GUIDANCE, SLIDER_STEP, scale)
         self.playing = gui.add_checkbox("time passes", True)
         self.again = Event()  # clicks come on another thread, perhaps in the middle of a step
         gui.add_button("start again, next seed").on_click(lambda _event: self.again.set())
