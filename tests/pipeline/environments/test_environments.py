@@ -185,7 +185,7 @@ def test_rewards_name_what_they_reward():
     near = StepOutcome(
         np.array([1.0, 1.0]), np.array([0.6, 0.9]), np.array([0.0, 0.5]), np.array([False, True])
     )
-    assert REWARDS["approach"](near).tolist() == pytest.approx([10.4, -9.9])
+    assert REWARDS["approach"](near).tolist() == pytest.approx([5.4, -4.9])
     assert REWARDS["follow"](near).tolist() == pytest.approx([-0.6, -0.3])
     assert REWARDS["calm"](near).tolist() == [0.0, -0.5]
 
