@@ -100,7 +100,7 @@ def write_depth(path: Path, depth: Float[np.ndarray, "height width"]) -> None:
             file.write(str(path))
     if not _is_complete(Path(path)):  # OpenEXR does not notice a disk that is full when it closes the file
         Path(path).write_bytes(bytes(max(depth.nbytes, MAX_EXR_HEADER_BYTES)))  # raises the disk's own reason
-        raise OSError(errno.EIO, "OpenEXR wrote an incomplete file", str(path))
+        raise OSError(errno.ENOSPC, "there is room again by now", str(path))
 
 
 def _is_complete(path: Path) -> bool:
