@@ -361,7 +361,7 @@ def _inputs(plan: Plan, need: Need, node: Node, part: Video | Trial | None) -> I
         for other in (Home(plan.home.agent, variant) for variant in need.variants):
             yield Input(f"{other}/{need.artifact}", str(other.folder / need.artifact), inner)
         return
-    one = isinstance(part, Video) and not need.roles
-    for video in [part] if one else [each for each in plan.videos if need.wants(each, source.roles)]:
+    own = [part] if isinstance(part, Video) and not need.roles else None
+    for video in own or [each for each in plan.videos if need.wants(each, source.roles)]:
         made = dag.folder_of(need.artifact, video)
         yield Input(f"{made}/{video.id}", f"{plan.home_of(made).folder}/{made}/{video.id}", need.part)
