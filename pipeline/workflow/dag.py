@@ -343,9 +343,7 @@ FLOW: tuple[Node, ...] = (
         "evaluate.registration_tables",
         (
             Need("registration", variants=REGISTRATION_VARIANTS),
-            "scene_template",
-            *merging("frames", roles=("walkthrough", "session")),
-            TRUTH,
+            *("scene_template", *merging("frames", roles=("walkthrough", "session")), TRUTH),
         ),
         on_demand=True,
     ),
