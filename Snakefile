@@ -6,11 +6,15 @@
 # More configuration: variant=NAME, gpu=N (GPUs of a job that uses one), processes=N (per machine, where several fit one
 # model), launcher="srun --ntasks-per-node=1" (starts them on every machine of an allocation), container=agent-to-sim.sif
 # (the image of envs/apptainer.def that jobs run in, with --software-deployment-method apptainer).
+import gc
 import shlex
 import sys
 
 sys.path.insert(0, workflow.basedir)
 from pipeline.workflow import dag, engine
+
+# The collector walks the whole graph of jobs again and again: 8 % of the time on 3,000 recordings, the same memory.
+gc.set_threshold(100_000, 20, 1000)
 
 HOMES = engine.homes(config)
 GPUS = int(config.get("gpu", 0))
