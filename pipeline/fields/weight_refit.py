@@ -79,7 +79,8 @@ def refit_weights(
     descended = _descend_on_simplex(gram, start / start.sum(1, keepdims=True))
     chosen = np.argsort(-descended, axis=1, kind="stable")[:, :FOUR]
     best = np.zeros_like(descended)
-    np.put_along_axis(best, chosen, _best_on_simplex(_chosen(gram, chosen)), 1)
+    among = np.take_along_axis(np.take_along_axis(gram, chosen[:, :, None], 1), chosen[:, None, :], 2)
+    np.put_along_axis(best, chosen, _best_on_simplex(among), 1)
     nearer = _cost(gram, best) < _cost(gram, descended)
     return _influences(candidates, best, FOUR), _influences(
         candidates, np.where(nearer[:, None], best, descended), EIGHT
@@ -95,12 +96,6 @@ def _influences(
     padding = ((0, 0), (0, count - order.shape[1]))
     joints, heaviest = np.pad(np.where(heaviest > 0, joints, 0), padding), np.pad(heaviest, padding)
     return Influences(joints.astype(np.uint8), (heaviest / heaviest.sum(1, keepdims=True)).astype(np.float32))
-
-
-def _chosen(
-    gram: Float[np.ndarray, "vertex k k"], chosen: Int[np.ndarray, "vertex n"]
-) -> Float[np.ndarray, "vertex n n"]:
-    return np.take_along_axis(np.take_along_axis(gram, chosen[:, :, None], 1), chosen[:, None, :], 2)
 
 
 def _cost(

@@ -209,13 +209,10 @@ def _run(run: Callable[..., object], inputs: type, fields: Sequence[InputField],
         "video": task.recording,
     }
     known = {name: offer() for name, offer in offered.items() if name in accepted}
-    with task.create() if _leads() else tempfile.TemporaryDirectory() as folder:
+    # of the processes that torchrun started, the first alone publishes the artifact
+    leads = os.environ.get("RANK", "0") == "0" or "TORCHELASTIC_RUN_ID" not in os.environ
+    with task.create() if leads else tempfile.TemporaryDirectory() as folder:
         run(given, task.config, Path(folder), **known)
-
-
-def _leads() -> bool:
-    """Return whether this process publishes the artifact: of those that torchrun started, the first alone."""
-    return os.environ.get("RANK", "0") == "0" or "TORCHELASTIC_RUN_ID" not in os.environ
 
 
 def _settings(defaults: Any, table: str = "") -> Iterator[str]:

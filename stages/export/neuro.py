@@ -31,7 +31,8 @@ def write_movement(folder: Path, sessions: Mapping[str, Motion]) -> ExportRecord
         position = (("time", "space", "keypoints", "individuals"), np.swapaxes(places, 1, 2)[..., None])
         certain = (("time", "keypoints", "individuals"), confidence[..., None])
         time = {"time": session.timestamp_s, "space": list("xyz"), "keypoints": bones}
-        about = {"ds_type": "poses", "fps": _rate_hz(session), "time_unit": "seconds"}
+        rate_hz = round(float(1 / np.median(np.diff(session.timestamp_s))), 4)
+        about = {"ds_type": "poses", "fps": rate_hz, "time_unit": "seconds"}
         poses = xarray.Dataset(
             {"position": position, "confidence": certain},
             coords=time | {"individuals": ["agent"]},
@@ -78,7 +79,3 @@ def write_nwb(folder: Path, sessions: Mapping[str, Motion]) -> ExportRecord:
         worst_mm = max(worst_mm, float(np.nanmax(np.abs(found - keypoints(session)))) * 1000)
     remark = "recordings do not say when they were made: the session's start stands as 1970-01-01"
     return ExportRecord(version("pynwb"), {"largest": worst_mm}, version("pynwb"), remark)
-
-
-def _rate_hz(session: Motion) -> float:
-    return round(float(1 / np.median(np.diff(session.timestamp_s))), 4)

@@ -80,7 +80,8 @@ def segment(
     Raises:
         InputError: MSK-004 without depth and hint; MSK-002, MSK-003 where hint or cameras point at nothing.
     """
-    if not _has_depth(clip):
+    probes = subsampling.evenly(len(clip), PROBES).tolist()
+    if not any((clip.depth(frame) > 0).any() for frame in probes):
         if hint is None:
             what = "there is no depth, so motion alone does not separate the animal from the room"
             remedy = "give a hint: one box around the animal in one frame (<recording>.prompt.toml)"
@@ -155,10 +156,6 @@ def resized(balls: list[Sphere | None], first: list[Sphere | None]) -> list[Sphe
 def appearance_of(painter: Painter, network: Appearance) -> AppearanceOf:
     """Return the log-odds of a network at working resolution, frame by frame."""
     return lambda frame: network.log_odds(painter.working_picture(frame))
-
-
-def _has_depth(clip: Clip) -> bool:
-    return any((clip.depth(frame) > 0).any() for frame in subsampling.evenly(len(clip), PROBES).tolist())
 
 
 @dataclass(frozen=True)

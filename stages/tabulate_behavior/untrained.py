@@ -4,7 +4,7 @@ import numpy as np
 
 from pipeline.behavior.trajectories import TRAIN, BehaviorData
 from pipeline.metrics.scores import GOAL_SCORES, PLAN_SCORES, SCORES
-from pipeline.rivals.predictors import ConstantVelocity, LocationPrior, Samples, StandStill
+from pipeline.rivals.predictors import ConstantVelocity, LocationPrior, StandStill
 from stages.tabulate_behavior.reading import MethodScores
 
 RIVALS = {"location_prior": LocationPrior, "stand_still": StandStill, "constant_velocity": ConstantVelocity}
@@ -48,17 +48,13 @@ def _scores(
                 {
                     name: np.mean([SCORES[name](each, future) for each in drawn], axis=0)
                     for name in names
-                    if _predicts(drawn[0], name)
+                    if name in GOAL_SCORES or drawn[0].path is not None
                 }
             )
         found |= {
             f"end_to_end/{name}": np.concatenate([part[name] for part in parts])[None] for name in parts[0]
         }
     return MethodScores(like.goal_window, like.plan_window, found, like.past, like.future)
-
-
-def _predicts(samples: Samples, name: str) -> bool:
-    return name in GOAL_SCORES or samples.path is not None
 
 
 def _numbers(data: BehaviorData, windows: np.ndarray) -> np.ndarray:

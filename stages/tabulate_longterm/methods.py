@@ -57,9 +57,8 @@ def route_cvae(
         route = model.route(clips.channels[:, 0], clips.channels[:, -1], clips.seen)
         made = []
         for index in range(len(clips)):
-            roots = decode_clip(
-                _with_pose(route[index], model), clips.world_from_clip[index], model.poses
-            ).world_from_agent
+            channels = torch.cat([route[index], route.new_zeros(route.shape[1], model.sizes.pose)], dim=-1)
+            roots = decode_clip(channels, clips.world_from_clip[index], model.poses).world_from_agent
             places = encode_places(
                 roots, np.full(len(roots), clips.scene[index]), dataset.scenes, model.sizes.points, rng
             )
@@ -78,7 +77,3 @@ def nearest(bank: Clips, clips: Clips) -> Float[Tensor, "clip frame channel"]:
         return torch.cat([both[..., :ROOT_CHANNELS], 0.1 * both[..., ROOT_CHANNELS:]], dim=-1).flatten(1)
 
     return bank.channels[torch.cdist(ends(clips), ends(bank)).argmin(1)]
-
-
-def _with_pose(route: Float[Tensor, "frame 9"], model: LongTerm) -> Float[Tensor, "frame channel"]:
-    return torch.cat([route, route.new_zeros(len(route), model.sizes.pose)], dim=-1)
