@@ -15,7 +15,7 @@ Role = Literal["walkthrough", "turnaround", "session", "heldout"]
 Split = Literal["train", "test", "none"]
 ROLES: tuple[Role, ...] = get_args(Role)
 SPLITS: tuple[Split, ...] = get_args(Split)
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".3gp", ".webm")
 """names of video files end like this, in lower case"""
 
 

@@ -4,6 +4,7 @@ Nothing is ever extracted to disk: members are checked when the container opens 
 most ``max_bytes`` each.
 """
 
+import codecs
 import json
 import lzma
 import stat
@@ -67,8 +68,10 @@ class Container(ABC):
         return f"{self.where}/{name}"
 
     def text(self, name: str) -> str:
-        """Read a text; what is no UTF-8 in it is replaced."""
-        return self.read(name).decode(errors="replace")
+        """Read a text, UTF-8 or as Windows saves it, with a mark; what is neither is replaced."""
+        data = self.read(name)
+        wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        return data.decode("utf-16" if wide else "utf-8-sig", errors="replace")
 
     def table(self, name: str) -> dict[str, Any]:
         """Read a JSON table. Raises CAP-004."""
@@ -111,12 +114,12 @@ class Container(ABC):
 
 
 class FolderContainer(Container):
-    """A folder's files, addressed by their relative paths; links are not followed."""
+    """A folder's files, addressed by their relative paths; links are not followed, hidden files not seen."""
 
     def __init__(self, folder: Path) -> None:
         self.where = str(folder)
         self._folder = folder
-        files = (path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
+        files = (path for path in folder.rglob("[!.]*") if path.is_file() and not path.is_symlink())
         self.names = frozenset(path.relative_to(folder).as_posix() for path in files)
 
     def path(self, name: str) -> Path:

@@ -47,15 +47,7 @@ def _is_file(*suffixes: str) -> Callable[[Path], bool]:
 
 
 def _holds_movie(path: Path) -> bool:
-    return (
-        path.is_dir()
-        and (path / "depth").is_dir()
-        and any(each.suffix.lower() in VIDEO_SUFFIXES for each in path.iterdir())
-    )
-
-
-def _holds_seven_scenes(path: Path) -> bool:
-    return path.is_dir() and next(path.glob("frame-*.color.*"), None) is not None
+    return (path / "depth").is_dir() and any(each.suffix.lower() in VIDEO_SUFFIXES for each in path.iterdir())
 
 
 FORMATS: tuple[Format, ...] = (
@@ -71,7 +63,7 @@ FORMATS: tuple[Format, ...] = (
         "NeRFCapture", lambda path: _is_file(".zip")(path) or _holds("transforms.json")(path), "nerfcapture"
     ),
     Format("TUM RGB-D", _holds("rgb.txt", "depth.txt"), "tum"),
-    Format("7-Scenes RGB-D", _holds_seven_scenes, "seven_scenes"),
+    Format("7-Scenes RGB-D", lambda path: any(path.glob("frame-*.color.*")), "seven_scenes"),
     Format("video and depth", _holds_movie, "plain_video"),
     Format("video alone", _is_file(*VIDEO_SUFFIXES), "plain_video", has_depth=False),
 )

@@ -13,7 +13,7 @@ import av
 import av.container
 import av.error
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from pipeline.data.images import MAX_PIXELS
 from pipeline.recordings.recording import damaged, no_frames
@@ -26,12 +26,18 @@ _GUARDS = {
 """a list of other files (ffconcat, HLS) is no video, pictures larger than any phone's are not decoded"""
 SKIP_FRAMES = 90
 """further ahead than this, decoding begins anew at the nearest key frame"""
+CAPTURE_RATE = "com.android.capture.fps"
+"""tag of Android: pictures taken per second, however many are shown per second"""
+CLEARLY_SLOWED = 3.0
+"""dim light halves the rate of an ordinary video; from this factor on it is slow motion, or time lapse"""
+MOST_ASPECT = 2.0
+"""of a pixel's sides; a camera's are less unequal, more is a broken header"""
 
 
 class Movie:
-    """A video whose frames are read by number, cheapest in order."""
+    """A video whose frames are read by number, cheapest in order; stretched to square pixels on request."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, square_pixels: bool = False) -> None:
         self.where = str(path)
         self._path = path
         with self._opened() as container:
@@ -40,11 +46,14 @@ class Movie:
             if not times or stream.time_base is None:
                 raise no_frames(self.where, "the video is empty")
             self._pts = np.array(times)
-            self.timestamp_s = (self._pts - self._pts[0]) * float(stream.time_base)
+            shown_s = (self._pts - self._pts[0]) * float(stream.time_base)
+            self.timestamp_s = shown_s / _slowed(shown_s, container.metadata.get(CAPTURE_RATE, ""))
+            aspect = float(stream.sample_aspect_ratio or 1) if square_pixels else 1.0
         self._decoder: Iterator[av.VideoFrame] | None = None
         self._position = 0
         first = self._first()
-        self.size = (first.height, first.width)
+        stretch = aspect if 1 / MOST_ASPECT <= aspect <= MOST_ASPECT else 1.0
+        self.size = (first.height, round(first.width * stretch))
         self.quarter_turns = round(-first.rotation / 90) % 4
 
     def __len__(self) -> int:
@@ -62,7 +71,8 @@ class Movie:
             if frame.pts > wanted:  # the wanted one is lost; this one may be asked for next
                 self._decoder = itertools.chain([frame], self._decoder)
                 return None
-            return None if frame.is_corrupt else frame.to_ndarray(format="rgb24")
+            height, width = self.size
+            return None if frame.is_corrupt else frame.to_ndarray(format="rgb24", width=width, height=height)
         self._decoder = iter(())
         return None
 
@@ -73,7 +83,21 @@ class Movie:
         return frame
 
     def _decoded_from(self, number: int) -> Iterator[av.VideoFrame]:
-        """Yield decoded frames from the key frame at or before a number on, stepping over what is damaged."""
+        """Yield decoded frames from one at or before a number on.
+
+        Pictures shown before a key frame may be stored behind it and need the key frame before (open groups
+        of pictures, usual in HEVC): decoding begins earlier until nothing before the number is missing.
+        """
+        start = number
+        while True:
+            decoder = self._sought(start)
+            first = next(decoder, None)
+            if not start or (first is not None and (first.pts or 0) <= self._pts[number]):
+                return itertools.chain(() if first is None else (first,), decoder)
+            start = max(2 * start - number - 1, 0)
+
+    def _sought(self, number: int) -> Iterator[av.VideoFrame]:
+        """Yield decoded frames from the key frame that is found for a number, stepping over damage."""
         with self._opened() as container:
             stream = container.streams.video[0]
             if number:
@@ -106,6 +130,15 @@ class Movie:
                 why = f"pictures of {codec.width} x {codec.height}, larger than any phone's"
                 raise damaged(self.where, why)
             yield container
+
+
+def _slowed(shown_s: Float[np.ndarray, "frame"], capture_rate: str) -> float:
+    """Return how many times slower than life a video is shown, by its tag; 1 where it has none."""
+    try:
+        slowed = float(capture_rate) * float(np.median(np.diff(shown_s)))
+    except ValueError:
+        return 1.0
+    return slowed if CLEARLY_SLOWED <= max(slowed, 1 / max(slowed, 1e-9)) < np.inf else 1.0
 
 
 def _packet_times(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[int]:

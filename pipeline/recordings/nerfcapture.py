@@ -81,7 +81,8 @@ def _table(container: Container) -> dict[str, Any]:
     what, remedy = "not a NeRFCapture recording: it has no transforms.json", "give the streamed folder"
     if isinstance(container, ZipContainer):
         what = "a zip that holds no NeRFCapture recording"
-        remedy = "unpack it, and give the folder that the app wrote"
+        unpack = "unpack it, and give the folder that the app wrote"
+        remedy = "rename it to .r3d" if {"metadata", "rgbd/0.jpg"} <= container.names else unpack
     raise InputError("CAP-003", what, container.where, remedy)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.core.errors import InputError
 from pipeline.core.videos import VIDEO_SUFFIXES
 from pipeline.data import images
 from pipeline.recordings import text_files
@@ -43,6 +44,9 @@ def open_recording(path: Path) -> Recording:
     if len(index) == 0:
         why = "no depth picture carries the number of a video frame, counted from 0"
         raise no_frames(container.where, why)
+    if (min(depth), max(depth)) == (1, len(movie)):
+        what = f"depth is numbered from 1 to {len(movie)}, the video's frames from 0"
+        raise InputError("CAP-004", what, container.where, "number depth/ and poses.txt from 0")
     if max(depth) + 1 < 0.5 * len(movie):
         why = f"{len(movie)} video frames, but depth up to number {max(depth)}: name it by the frame"
         raise broken_metadata(container.where, why)
@@ -69,7 +73,7 @@ def open_recording(path: Path) -> Recording:
 
 
 def _alone(path: Path) -> Recording:
-    movie = Movie(path)
+    movie = Movie(path, square_pixels=True)
     return Recording(
         where=str(path),
         kind="video without depth",

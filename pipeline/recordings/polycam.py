@@ -64,7 +64,8 @@ def open_recording(path: Path) -> Recording:
         measured = _depth(container, number, size)
         if not corrected:
             return measured
-        return np.where(_border(container, f"keyframes/{color}/{number}.jpg", size), 0, measured)
+        brightest = container.color(f"keyframes/{color}/{number}.jpg").max(-1)
+        return np.where(cv2.resize(brightest, size[::-1], interpolation=cv2.INTER_AREA) < 3, 0, measured)
 
     return Recording(
         where=container.where,
@@ -124,10 +125,6 @@ def _mesh(container: FolderContainer) -> Mesh:
         raise damaged(container.place("raw.glb"), "it holds no surface")
     vertices = rigid.apply(world_from_aligned, np.asarray(loaded.vertices, float)).astype(np.float32)
     return Mesh(vertices, np.asarray(loaded.faces, np.int32), np.full((len(vertices), 3), 128, np.uint8))
-
-
-def _border(container: FolderContainer, name: str, size: tuple[int, int]) -> np.ndarray:
-    return cv2.resize(container.color(name).max(-1), size[::-1], interpolation=cv2.INTER_AREA) < 3
 
 
 def _confidence(

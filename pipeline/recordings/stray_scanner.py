@@ -33,6 +33,7 @@ POSE = ("qx", "qy", "qz", "qw", "x", "y", "z")
 MAX_FRAMES = 1 << 31
 """frame numbers are below this"""
 COEFFICIENTS = ("fx", "fy", "cx", "cy")
+READ = {"timestamp", "frame", *POSE, *COEFFICIENTS}
 OLDEST = ("x", "y", "z", "qx", "qy", "qz", "qw")
 """columns of the oldest app, which wrote no header"""
 
@@ -86,23 +87,22 @@ def read_odometry(text: str, where: str) -> OdometryTable:
     """Read the table by its column names: 7 (oldest, no header), 9 or 15 columns, blanks where unknown."""
     lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines())]
     lines = [row for row in lines if any(row)]
-    header = tuple(lines[0]) if lines else ()
-    if not set(POSE) <= set(header):
-        if len(header) != len(OLDEST):
-            raise broken_metadata(where, f"columns {', '.join(header) or 'none'} are no odometry")
-        header = OLDEST
-    else:
+    header = tuple(cell.lower() for cell in lines[0]) if lines else ()
+    if {"timestamp", *POSE} <= set(header):
         lines = lines[1:]
+    elif len(header) != len(OLDEST):
+        raise broken_metadata(where, f"columns {', '.join(header) or 'none'} are no odometry")
+    else:
+        header = OLDEST
+    known = [(i, name) for i, name in enumerate(header) if name in READ]
     try:
-        rows = [[float(cell) if cell else np.nan for cell in row[: len(header)]] for row in lines]
-        table = np.array(rows).reshape(-1, len(header))
-    except ValueError as error:
+        column = {name: np.array([float(row[i] or "nan") for row in lines]) for i, name in known}
+    except (ValueError, IndexError) as error:
         raise broken_metadata(where, f"a row is cut or no numbers ({error})") from error
-    column = {name: table[:, i] for i, name in enumerate(header)}
     timestamp_s = column.get("timestamp")
     if timestamp_s is not None and (not np.isfinite(timestamp_s).all() or np.any(np.diff(timestamp_s) <= 0)):
         raise broken_metadata(where, "the times must increase")
-    frame = column.get("frame", np.arange(len(table)))
+    frame = column.get("frame", np.arange(len(lines)))
     if not (np.isfinite(frame) & (frame >= 0) & (frame < MAX_FRAMES)).all():
         raise broken_metadata(where, "a frame has no number")
     pose, coefficients = np.stack([column[name] for name in POSE], axis=1), None

@@ -24,24 +24,20 @@ def lines(container: Container, name: str) -> list[str]:
 def table(
     container: Container, name: str, columns: int, rows: int | None = None
 ) -> Float[np.ndarray, "row column"]:
-    """Read numbers in columns separated by blanks or commas; raises CAP-004 when they are no such table."""
+    """Read numbers in columns separated by blanks or commas; raises CAP-004 when they are no such table.
+
+    What old Windows programs write for none (``-1.#IND``) is NaN.
+    """
     cells = [line.replace(",", " ").split() for line in lines(container, name)]
     try:
-        read = np.array([[_number(cell) for cell in row] for row in cells], float).reshape(
-            len(cells), columns
-        )
+        numbers = [[float("nan" if ".#" in cell else cell) for cell in row] for row in cells]
+        read = np.array(numbers).reshape(len(cells), columns)
     except ValueError as error:
-        raise broken_metadata(
-            container.place(name), f"not a table of {columns} columns of numbers"
-        ) from error
+        why = f"not a table of {columns} columns of numbers"
+        raise broken_metadata(container.place(name), why) from error
     if rows is not None and len(read) != rows:
         raise broken_metadata(container.place(name), f"{len(read)} rows instead of {rows}")
     return read
-
-
-def _number(cell: str) -> float:
-    """Read a number; what old Windows programs write for none (``-1.#IND``) is NaN."""
-    return np.nan if ".#" in cell else float(cell)
 
 
 def coefficients(

@@ -96,7 +96,7 @@ def _listed(container: FolderContainer, name: str) -> list[tuple[float, str]]:
     """Return (time, file) of every line, in time order."""
     found = []
     for line in text_files.lines(container, name):
-        cells = line.split()
+        cells = line.replace("\\", "/").replace(",", " ").split()
         try:
             time_s = float(cells[0])
             if not np.isfinite(time_s):

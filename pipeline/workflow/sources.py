@@ -84,7 +84,7 @@ def digest(stage: str, cache: Cache) -> str:
     while waiting:
         module = waiting.pop()
         path = _path_of(module)
-        if module in seen or path is None or _is_plumbing(module):
+        if module in seen or path is None or module.removeprefix("pipeline.") in PLUMBING:
             continue
         source = Source(**cache.get(path, _read))
         seen[module] = source.digest
@@ -127,10 +127,6 @@ def _path_of(module: str) -> Path | None:
     return next((p for p in (path.with_suffix(".py"), path / "__init__.py") if p.is_file()), None)
 
 
-def _is_plumbing(module: str) -> bool:
-    return module.removeprefix("pipeline.") in PLUMBING
-
-
 def _assets(room: Path, cache: Cache) -> dict[str, str]:
     """Return the digests of the room's files that are not Python and that the stage may read."""
     found = {}
@@ -145,10 +141,10 @@ def _assets(room: Path, cache: Cache) -> dict[str, str]:
 
 
 def recording_digest(path: Path, digest_of: Callable[[Path], str] = artifact.digest_of_file) -> str:
-    """Return the hash of a recording: of the file, or of all files of a folder."""
+    """Return the hash of a recording: of the file, or of all files of a folder but hidden ones."""
     if path.is_file():
         return digest_of(path)
-    files = sorted(file for file in path.rglob("*") if file.is_file())
+    files = sorted(file for file in path.rglob("[!.]*") if file.is_file())
     return artifact.digest_of({file.relative_to(path).as_posix(): digest_of(file) for file in files})
 
 

@@ -32,12 +32,24 @@ def put(folder: Path, members: dict[str, bytes | str]) -> Path:
     return folder
 
 
-def write_movie(path: Path, pictures: list[np.ndarray], *, rate: int = 60, key_every: int = 8) -> None:
+def write_movie(
+    path: Path,
+    pictures: list[np.ndarray],
+    *,
+    rate: int = 60,
+    key_every: int = 8,
+    codec: str = "libx264",
+    options: dict[str, str] | None = None,
+    tags: dict[str, str] | None = None,
+    aspect: Fraction = Fraction(1),
+) -> None:
+    """Write a video; `tags` are the file's, `aspect` is a pixel's width over its height."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(
-            "libx264", rate=rate, options={"crf": "4", "preset": "ultrafast", "g": str(key_every)}
-        )
+    with av.open(str(path), "w", options={"movflags": "use_metadata_tags"} if tags else {}) as container:
+        container.metadata.update(tags or {})
+        encoder = {"crf": "4", "preset": "ultrafast", "g": str(key_every)} if options is None else options
+        stream = container.add_stream(codec, rate=rate, options=encoder)
+        stream.codec_context.sample_aspect_ratio = aspect
         stream.height, stream.width, stream.pix_fmt = *pictures[0].shape[:2], "yuv444p"
         stream.time_base = Fraction(1, rate)
         for number, picture in enumerate(pictures):

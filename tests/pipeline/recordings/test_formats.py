@@ -3,8 +3,10 @@
 Upright, metric, with its poses, whatever the app stores.
 """
 
+import codecs
 import json
 import struct
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from pipeline.geometry import rigid
 from pipeline.recordings import extraction, stray_scanner, tum
 from pipeline.recordings.formats import format_of, open_recording
 from pipeline.recordings.movies import Movie
+from pipeline.workflow.sources import recording_digest
 from tests.pipeline.recordings import made_formats
 from tests.stages.extract_frames.made_recordings import Made, walk, write_zip
 
@@ -119,6 +122,69 @@ def test_the_first_frames_intrinsics_stand_in_for_missing_ones(tmp_path):
     ]
     recording = open_recording(made.write(tmp_path / "a.r3d"))
     assert recording.intrinsics[:, 0, 0].tolist() == [51, 50, 50, 51, 50, 50]
+
+
+def _windows(data: bytes) -> bytes:
+    return codecs.BOM_UTF8 + data.replace(b"\n", b"\r\n")
+
+
+def _powershell(data: bytes) -> bytes:
+    return data.decode().encode("utf-16")
+
+
+def _noted(data: bytes) -> bytes:
+    """With the columns in another order and one of words."""
+    rows = [row.split(b", ") for row in data.split(b"\n")]
+    notes = [b"note", *[b"sofa"] * (len(rows) - 1)]
+    return b"\n".join(b", ".join([*row[5:], note, *row[:5]]) for row, note in zip(rows, notes, strict=True))
+
+
+@pytest.mark.parametrize(
+    "saved", [_windows, _powershell, _noted, lambda data: data.replace(b"time", b"Time")]
+)
+def test_times_of_an_odometry_survive_whatever_saved_it(tmp_path, saved):
+    """The video's own times are counted, four times too fast here: without the column all would be wrong."""
+    path = made_formats.stray(tmp_path / "a", walk(8, rate_hz=RATE_HZ, quarter_turns=LANDSCAPE))
+    (path / "odometry.csv").write_bytes(saved((path / "odometry.csv").read_bytes()))
+    np.testing.assert_allclose(open_recording(path).timestamp_s, np.arange(8) / RATE_HZ, atol=1e-6)
+
+
+@pytest.mark.parametrize("saved", [_windows, _powershell])
+@pytest.mark.parametrize("write", [made_formats.tum, made_formats.video_and_depth, made_formats.seven_scenes])
+def test_text_files_may_come_from_windows(tmp_path, write, saved):
+    made = walk(6)
+    path = write(tmp_path / "a", made)
+    for file in path.glob("*.txt"):
+        file.write_bytes(saved(file.read_bytes()))
+    recording = open_recording(path)
+    np.testing.assert_allclose(recording.intrinsics[0], made.intrinsics, atol=1e-6)
+    np.testing.assert_allclose(np.abs(recording.pose), np.abs(made_formats.quaternion_poses(made)), atol=1e-6)
+
+
+def test_tum_lists_may_be_written_on_windows(tmp_path):
+    path = made_formats.tum(tmp_path / "a", walk(6))
+    for name in ("rgb.txt", "depth.txt"):
+        text = (path / name).read_text()
+        (path / name).write_text(text.replace("/", "\\").replace(" rgb", ",rgb").replace(" depth", ",depth"))
+    assert len(open_recording(path).index) == 6
+
+
+def test_hidden_files_of_a_mac_are_not_seen(tmp_path):
+    path = made_formats.video_and_depth(tmp_path / "a", walk(6))
+    before = recording_digest(path)
+    for name in ("._clip.mov", ".DS_Store", "depth/._000001.png"):
+        (path / name).write_bytes(b"\0\5\x16\7")
+    assert len(open_recording(path).index) == 6
+    assert recording_digest(path) == before
+
+
+def test_depth_that_is_numbered_from_1_is_refused(tmp_path):
+    """As ffmpeg numbers pictures: every frame would get its neighbour's depth."""
+    path = made_formats.video_and_depth(tmp_path / "a", walk(6))
+    for number in range(5, -1, -1):
+        (path / f"depth/{number:06d}.png").rename(path / f"depth/{number + 1:06d}.png")
+    with pytest.raises(InputError, match=r"CAP-004(.|\n)*number depth/ and poses.txt from 0"):
+        open_recording(path)
 
 
 @pytest.mark.parametrize("columns", [7, 9, 15])
@@ -257,6 +323,37 @@ def test_a_video_is_read_in_any_order(tmp_path):
         assert np.abs(movie.read(number).astype(int) - made.color(number)).mean() < 0.6, number
 
 
+def test_pictures_stored_behind_a_later_key_frame_are_found(tmp_path):
+    """HEVC of phones: decoding from that key frame alone would leave them out."""
+    open_groups = "log-level=none:keyint=10:min-keyint=10:bframes=4:open-gop=1:scenecut=0"
+    pictures = [np.full((64, 64, 3), 5 * i, np.uint8) for i in range(40)]
+    made_formats.write_movie(
+        tmp_path / "a.mov", pictures, codec="libx265", options={"x265-params": open_groups}
+    )
+    for number in range(39, -1, -1):  # backwards: every one is looked for anew
+        found = Movie(tmp_path / "a.mov").read(number)
+        assert found is not None and abs(float(found.mean()) - 5 * number) < 3, number
+
+
+@pytest.mark.parametrize(("captured", "times_slower"), [("240.0", 8), ("60.0", 1), ("1", 1 / 30), ("?", 1)])
+def test_slow_motion_of_android_has_the_times_of_life(tmp_path, captured, times_slower):
+    """An ordinary video of 60 pictures a second falls to 30 in dim light, and keeps its times."""
+    path = tmp_path / "a.mp4"
+    tags = {"com.android.capture.fps": captured}
+    made_formats.write_movie(path, [walk(6).color(i) for i in range(6)], rate=30, tags=tags)
+    np.testing.assert_allclose(Movie(path).timestamp_s, np.arange(6) / 30 / times_slower, atol=1e-3)
+
+
+@pytest.mark.parametrize(("aspect", "width"), [(Fraction(4, 3), 64), (Fraction(1), 48), (Fraction(90), 48)])
+def test_a_video_alone_has_square_pixels(tmp_path, aspect, width):
+    """Its lens is calibrated with one focal length; beside depth it stays as its intrinsics describe it."""
+    path, made = tmp_path / "a.mp4", walk(6)
+    made_formats.write_movie(path, [made.color(i) for i in range(6)], aspect=aspect)
+    recording = open_recording(path)
+    assert recording.color_size == recording.read_color(0).shape[:2] == (64, width)
+    assert Movie(path).size == (64, 48)
+
+
 def _no_depth(path, made):
     made_formats.write_movie(path.with_suffix(".mp4"), [made.color(i) for i in range(6)])
     return path.with_suffix(".mp4")
@@ -328,6 +425,10 @@ def _unmatched(path, made):
     return path
 
 
+def _zip_of_record3d(path, made):
+    return made.write(path.with_suffix(".r3d")).rename(path.with_suffix(".zip"))
+
+
 def _zipped(path, made):
     write_zip(path.with_suffix(".zip"), {"a/rgb.mp4": b"", "a/odometry.csv": b""})
     return path.with_suffix(".zip")
@@ -337,6 +438,7 @@ FAULTS = {
     "CAP-001": _cut_video,
     "CAP-003": lambda path, made: path,
     "CAP-003 ": _zipped,
+    "CAP-003  ": _zip_of_record3d,
     "CAP-004": _new_odometry,
     "CAP-004 ": _new_polycam,
     "CAP-006": _no_depth,
@@ -359,6 +461,7 @@ def test_what_cannot_be_used_is_refused_with_a_remedy(tmp_path, code):
         _understand(path)
     assert refused.value.code == code.strip()
     assert refused.value.remedy
+    assert (refused.value.remedy == "rename it to .r3d") == (FAULTS[code] is _zip_of_record3d)
 
 
 @pytest.mark.parametrize(
