@@ -64,7 +64,7 @@ def loss_curves(
                 steps = np.arange(len(means)) + len(curve) - len(means) + 1
                 shown = label if row == 0 else None
                 axis.plot(steps, means, color=f"C{number % 10}", linewidth=0.8, label=shown)
-        axis.set(title=title, xlabel="step", yscale="log" if log else "linear")
+        axis.set(title=title, xlabel="step", ylabel="loss", yscale="log" if log else "linear")
         if len(labelled_curves) > 1:
             axis.legend(fontsize=7)
     return pixels(figure)
@@ -85,7 +85,7 @@ def histograms(
         if good_below is not None:
             for edge, bar in zip(edges, bars, strict=False):
                 bar.set_facecolor(GREEN if edge < good_below else ORANGE)
-        axis.set(xlabel=label, xscale="log" if log else "linear")
+        axis.set(xlabel=label, ylabel="count", xscale="log" if log else "linear")
     return pixels(figure)
 
 
@@ -107,7 +107,7 @@ def time_series(
             axis.axhline(limit, color="black", linestyle="--", linewidth=0.8)
         axis.set(ylabel=label, ylim=(0, None))
         axis.margins(x=0)
-    axes[-1, 0].set_xlabel("s")
+    axes[-1, 0].set_xlabel("time [s]")
     return pixels(figure)
 
 

@@ -1,5 +1,7 @@
 """Quality page of the scene template: a turntable, the bird's-eye coverage, real beside rendered frames."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import UInt8
 
@@ -8,7 +10,7 @@ from pipeline.data.clips import Clip
 from pipeline.data.qa import Check, Picture, captioned
 from pipeline.geometry import rigid
 from pipeline.geometry import views as overview
-from pipeline.geometry.meshes import RayCaster
+from pipeline.geometry.meshes import Mesh, RayCaster
 from stages.build_scene_template.template import SceneTemplate
 
 UP = np.array([0.0, 1.0, 0.0])
@@ -29,18 +31,20 @@ CAPTIONS = {
 def pictures(template: SceneTemplate, clip: Clip) -> list[Picture]:
     """Draw the template for people."""
     caster = RayCaster(template.mesh)
-    turned, compared = turntable(template, caster), frames(template, clip, caster)
+    turned, compared = turntable(template.mesh), frames(template, clip, caster)
     return captioned(CAPTIONS, turntable=turned, coverage=coverage(template), frames=compared)
 
 
-def turntable(template: SceneTemplate, caster: RayCaster) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw the mesh from four raised corners."""
-    low, high = np.quantile(template.mesh.vertices, EXTENT, axis=0)
+def turntable(mesh: Mesh) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw what of a mesh faces the eye, from four raised corners."""
+    low, high = np.quantile(mesh.vertices, EXTENT, axis=0)
     centre, reach = (low + high) / 2, np.linalg.norm(high - low) * REACH
     intrinsics = np.array([[FOCAL_PX, 0, WIDTH_PX // 2], [0, FOCAL_PX, HEIGHT_PX // 2], [0, 0, 1]])
     views = []
     for angle in np.pi * (np.arange(4) / 2 + 0.25):
         eye = centre + reach * np.array([np.cos(angle) * EYE_ASIDE, EYE_ABOVE, np.sin(angle) * EYE_ASIDE])
+        towards = (mesh.face_normals() * (eye - mesh.vertices[mesh.faces[:, 0]])).sum(1) > 0
+        caster = RayCaster(replace(mesh, faces=mesh.faces[towards]))
         views.append(overview.view(caster, rigid.look_at(eye, centre, UP), intrinsics, HEIGHT_PX, WIDTH_PX))
     return plots.grid(views, 2)
 
@@ -56,12 +60,11 @@ def frames(template: SceneTemplate, clip: Clip, caster: RayCaster) -> UInt8[np.n
     """Put frames beside the mesh as their cameras see it."""
     chosen = np.linspace(0, len(clip) - 1, 7).astype(int)[1:-1]
     height, width = clip.color_size
-    real = [clip.color(int(frame)) for frame in chosen]
     drawn = [
         overview.view(caster, template.world_from_camera[frame], clip.intrinsics[frame], height, width)
         for frame in chosen
     ]
-    return plots.grid(real + drawn, len(chosen))
+    return plots.grid([clip.color(int(frame)) for frame in chosen] + drawn, len(chosen))
 
 
 def checks(template: SceneTemplate) -> list[Check]:

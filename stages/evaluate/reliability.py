@@ -27,7 +27,9 @@ def reliability_metrics(
     error = float((count * np.abs(claimed - met)).sum() / count.sum()) if count.sum() else np.nan
     metrics.put(f"{name}/calibration_error", error)
     if count.sum():
-        caption = f"{name}: share that was right against the confidence reported; area: frames"
+        caption = (
+            f"{name.replace('/agent', ' of the animal')}: share that was right by confidence; area: frames"
+        )
         metrics.charts[caption] = _drawn(claimed, met, count)
     return metrics
 
@@ -49,6 +51,6 @@ def _drawn(
     axis, filled = axes[0, 0], count > 0
     axis.plot((0, 1), (0, 1), color=plots.GREY, linewidth=1)
     area = np.interp(count[filled] / count.max(), (0, 1), DOT_AREAS)
-    axis.scatter(claimed[filled], met[filled], s=area, color=plots.BLUE)
+    axis.scatter(claimed[filled], met[filled], s=area, color=plots.BLUE, clip_on=False, zorder=3)
     axis.set(xlim=(0, 1), ylim=(0, 1), xlabel="confidence", ylabel="share that was right", aspect="equal")
     return plots.pixels(figure)

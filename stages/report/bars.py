@@ -30,6 +30,12 @@ class Bar:
     factor: float = 1.0
     """how many times that metric is the limit"""
 
+    @property
+    def sign(self) -> str:
+        """How a value must compare: a rival is to be beaten, a limit and a total may be met."""
+        rival = isinstance(self.limit, str) and self.factor == 1.0
+        return "≥" if self.better == "higher" else "<" if rival else "≤"
+
 
 @dataclass(frozen=True)
 class Judged:
@@ -70,7 +76,7 @@ BARS = (
 
 
 def judge(metrics: Metrics, reasons: Mapping[str, str]) -> list[Judged]:
-    """Compare every bar with its metric; a rival must be beaten, a limit and a total may be met."""
+    """Compare every bar with its metric."""
     return [_judged(bar, metrics, reasons) for bar in BARS]
 
 
@@ -82,8 +88,7 @@ def _judged(bar: Bar, metrics: Metrics, reasons: Mapping[str, str]) -> Judged:
     if value is None or limit is None:
         missing = bar.metric if value is None else str(bar.limit)
         return Judged(bar, value, limit, "none", reasons.get(missing, "not measured"))
-    rival = isinstance(bar.limit, str) and bar.better == "lower" and bar.factor == 1.0
-    holds = value < limit if rival else value <= limit if bar.better == "lower" else value >= limit
+    holds = {"<": value < limit, "≤": value <= limit, "≥": value >= limit}[bar.sign]
     return Judged(bar, value, limit, "ok" if holds else "fail", "")
 
 

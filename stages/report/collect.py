@@ -92,9 +92,9 @@ class ChapterReport:
     @property
     def worries(self) -> list[tuple[Note, dict[str, Any]]]:
         """Checks that are not fine, worst first."""
-        found = [(note, check) for note in self.notes for check in note.checks]
-        worrying = [pair for pair in found if pair[1]["status"] in ("warn", "fail")]
-        return sorted(worrying, key=lambda pair: -LIGHTS.index(pair[1]["status"]))
+        bad = ("warn", "fail")
+        found = [(note, check) for note in self.notes for check in note.checks if check["status"] in bad]
+        return sorted(found, key=lambda pair: -LIGHTS.index(pair[1]["status"]))
 
     @property
     def cover(self) -> EmbeddedPicture | None:

@@ -55,12 +55,8 @@ def describe(
 
 
 def _recording(video: Video, safe: bool) -> Entity:
-    return {
-        "@id": f"#recording/{video.id}",
-        "@type": "CreativeWork",
-        "name": video.id if safe else video.file,
-        "additionalProperty": _properties(**{key: getattr(video, key) for key in PLANNED}),
-    }
+    planned = {key: getattr(video, key) for key in PLANNED}
+    return _entity(f"#recording/{video.id}", "CreativeWork", video.id if safe else video.file, planned)
 
 
 def _artifacts(folders: Mapping[str, Mapping[str | None, Path]], times: bool) -> Iterator[Entity]:
@@ -82,12 +78,11 @@ def _artifact(name: str, manifest: Mapping[str, Any], record: Path, times: bool)
         known = json.loads(record.read_bytes())
         keys = ("seconds", "cpu_seconds", "peak_memory_mb", "threads", "commit", "finished")
         properties |= {key: known.get(key) for key in keys}
-    return {
-        "@id": f"#artifact/{name}",
-        "@type": "Dataset",
-        "name": name,
-        "additionalProperty": _properties(**properties),
-    }
+    return _entity(f"#artifact/{name}", "Dataset", name, properties)
+
+
+def _entity(at: str, kind: str, name: str, properties: Mapping[str, Any]) -> Entity:
+    return {"@id": at, "@type": kind, "name": name, "additionalProperty": _properties(**properties)}
 
 
 def _properties(**values: str | float | None) -> list[Entity]:

@@ -30,16 +30,13 @@ def render(
     )
     environment.filters |= {"number": number, "in_words": in_words}
     environment.globals |= {"describe": metric_words.describe, "remedy": remedy}
-    shared = {"name": name, "chapters": chapters, "words": WORDS, "marks": qa.MARKS}
-    index = environment.get_template("index.html").render(
-        **shared, judged=judged, metrics=metrics, reasons=reasons, methods=methods
-    )
-    pages = {"index.html": index}
+    shared = {"name": name, "chapters": chapters, "judged": judged, "words": WORDS, "marks": qa.MARKS}
+    index = environment.get_template("index.html")
+    pages = {"index.html": index.render(**shared, metrics=metrics, reasons=reasons, methods=methods)}
     chapter = environment.get_template("chapter.html")
-    around = zip((None, *chapters), chapters, (*chapters[1:], None), strict=False)
-    for before, shown, after in around:
-        text = chapter.render(**shared, shown=shown, before=before, after=after)
-        pages[f"{shown.chapter.artifact}.html"] = text
+    for before, shown, after in zip((None, *chapters), chapters, (*chapters[1:], None), strict=False):
+        file = f"{shown.chapter.artifact}.html"
+        pages[file] = chapter.render(**shared, shown=shown, before=before, after=after)
     return pages
 
 

@@ -90,16 +90,13 @@ def histograms(data: BehaviorData) -> UInt8[np.ndarray, "height width 3"]:
 def validity(data: BehaviorData, test: Collection[str]) -> UInt8[np.ndarray, "height width 3"]:
     """Draw valid times and window starts per recording."""
     figure, axes = plots.panels(1, 1, width_in=9, height_in=0.5 + 0.4 * max(len(data.videos), 2))
-    axis = axes[0, 0]
+    axis, names = axes[0, 0], []
     for row, video in enumerate(data.videos):
         trajectory, mine = data.trajectories[video], data.video == row
         valid, starts = trajectory.timestamp_s[trajectory.valid], trajectory.timestamp_s[data.start[mine]]
         axis.scatter(valid, np.full(len(valid), row), s=3, color=plots.BLUE)
         axis.scatter(starts, np.full(len(starts), row + 0.25), s=3, color=plots.RED)
-    names = [
-        f"{video} {'test' if video in test else 'train'}: {(data.video == row).sum()}"
-        for row, video in enumerate(data.videos)
-    ]
+        names.append(f"{video} {'test' if video in test else 'train'}: {mine.sum()}")
     axis.set_yticks(range(len(names)), names)
     axis.set_xlabel(f"time [s]: valid (blue), starts of windows of {data.past + data.future} frames (red)")
     return plots.pixels(figure)

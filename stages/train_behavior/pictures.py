@@ -22,7 +22,7 @@ GUIDED_PATHS = 12
 PANEL_IN = 2.6, 2.3
 WINDOW_HALF_M = 3.0
 CAPTIONS = {
-    "goals": "Sampled goals (orange) with conditions removed; animal blue, others green.",
+    "goals": "Sampled goals (orange) with conditions removed; animal blue, others green; a column a moment.",
     "guidance": "The same with an observer who walks up from ahead; same noise at each interactivity.",
     "paths": "Sampled paths with and without the scene.",
     "guided_paths": "Paths to a given goal (blue dot), from dark to light in time, by scale of guidance "

@@ -32,7 +32,7 @@ ARROW_M, ARROW_FRAMES = 0.15, 15
 """Length of the lines that show the heading, and the frames between them."""
 CAPTIONS = {
     "losses": "Loss of each network over its training, smoothed.",
-    "routes": "Held-out routes from above: true (blue), made (orange), what stands nearby (grey).",
+    "routes": f"Held-out routes in panels of {2 * SHOWN_M:g} m: true blue, generated orange, scene grey.",
 }
 
 
@@ -63,7 +63,7 @@ def evaluate_held_out(learned: TrainedLongTerm, dataset: DatasetSplit, seed: int
         Check("bodies at sub-goals: gap to the scene, median", 100 * gap, "cm", 2.0),
         Check("bodies at sub-goals: deepest vertex in the scene, median", 100 * depth, "cm", 4.0),
         Check("contact vertices found", len(learned.model.contacts.vertices), "", 10, 1, "higher"),
-        Check("spread of poses that p explains", explained, "share", 0.9, 0.5, "higher"),
+        Check("variance of poses that the pose space explains", explained, "share", 0.9, 0.5, "higher"),
     ]
     losses = plots.loss_curves({name: {"total": record.total()} for name, record in learned.records.items()})
     return ModelReport(checks, captioned(CAPTIONS, losses=losses, routes=routes(clips, made, where)))

@@ -21,6 +21,16 @@ def test_honest_and_boasting_probabilities():
     assert (picture.min(-1) < 200).any()
 
 
+def test_a_dot_at_the_edge_is_drawn_whole_and_captions_hold_no_keys():
+    sure = reliability_metrics("x/agent", np.ones(100), np.ones(100, bool))
+    unsure = reliability_metrics("x/agent", np.full(100, 0.5), np.arange(100) % 4 == 0)
+    (caption,), area = sure.charts, []
+    for picture in (*sure.charts.values(), *unsure.charts.values()):
+        area.append(int((picture[..., 2].astype(int) - picture[..., 0] > 60).sum()))
+    assert area[0] == pytest.approx(area[1], rel=0.1), "pixels"
+    assert caption.startswith("x of the animal: ")
+
+
 def test_nothing_measured():
     assert reliability_metrics("x", np.zeros(0), np.zeros(0, bool)).values == {
         "x/confidence_mean": None,

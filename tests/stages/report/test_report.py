@@ -6,6 +6,7 @@ import json
 import re
 from pathlib import Path
 
+import jinja2
 import numpy as np
 import pytest
 
@@ -15,6 +16,7 @@ from pipeline.workflow import artifact, dag
 from stages.report import bars, collect, pages, stage
 from stages.report.chapters import CHAPTERS, WORDS, remedy
 from stages.report.config import Config
+from tests.stages.export_simulator import browser
 
 ROOT = Path(__file__).parents[3]
 ROLES = (
@@ -129,6 +131,42 @@ def test_feet_that_slide_are_not_fine() -> None:
     judged = bars.judge(slide, {})
     assert [row.limit for row in judged if "foot" in row.bar.metric] == [pytest.approx(0.06)]
     assert bars.worst(judged) == "fail" and bars.worst(bars.judge({}, {})) == "ok"
+
+
+def test_a_missed_bar_is_named_where_it_makes_a_page_red(tmp_path: Path) -> None:
+    texts = make_report(tmp_path / "first", tmp_path / "report")
+    for page in ("index.html", "evaluation.html"):
+        shown = " ".join(re.sub(r"<[^>]*>", " ", texts[page]).split())
+        assert re.search(r"overlap of masks with the true animal:? \(?0.500 ,? ?\(?bar ≥ 0.750", shown), page
+    assert "Bars" not in texts["masks.html"], "only where they are judged"
+
+
+def test_the_sign_shown_is_the_comparison_made() -> None:
+    met = {"behavior/ats/foot_slide_m_s": 0.06, "behavior/recorded/foot_slide_m_s": 0.04}
+    (feet,) = [row for row in bars.judge(met, {}) if row.value is not None]
+    assert (feet.bar.sign, feet.verdict) == ("≤", "ok"), "exactly at the limit"
+    assert {bar.sign for bar in bars.BARS if "location prior" in bar.words} == {"<"}
+
+
+def test_what_stands_between_backticks_is_code(tmp_path: Path) -> None:
+    environment = jinja2.Environment(loader=jinja2.PackageLoader("stages.report"), autoescape=True)
+    macros = environment.get_template("layout.html").make_module({"words": {}, "marks": {}})
+    assert str(macros.code("see `[a]` <b>")) == "see <code>[a]</code> &lt;b&gt;"
+    texts = make_report(tmp_path / "first", tmp_path / "report")
+    assert not any("`" in text for text in texts.values())
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path(browser.CHROMIUM).exists(), reason="Chromium is not installed")
+def test_a_check_with_small_limits_fits_a_phone(tmp_path: Path) -> None:
+    texts = make_report(tmp_path / "first", tmp_path / "report")
+    assert "≤ 1<" in texts["masks.html"]
+    long = texts["masks.html"].replace("≤ 1<", "≤ 1.0e-04, ≤ 1.0e-04, ≤ 1.0e-04, ≤ 1.0e-04<")
+    (tmp_path / "long.html").write_text(long)
+    with browser.chromium() as opened:
+        page = opened.new_page(viewport={"width": 390, "height": 844})
+        page.goto((tmp_path / "long.html").as_uri())
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390, "pixels"
 
 
 def test_no_raw_key_reaches_a_reader(tmp_path: Path) -> None:
