@@ -7,7 +7,7 @@ READ = f"""
 import {{ readState }} from '{SOURCES}/state.js';
 const {{ keys }} = JSON.parse(await new Response(process.stdin).text());
 const contract = {{ controls: {{ interactivity: {{ least: 0, most: 1, default: 1 }},
-  samples: {{ choices: [1], default: 1 }}, steps: {{ choices: [4], default: 4 }} }} }};
+  samples: {{ choices: [1], default: 1 }}, steps: {{ choices: [4], default: 4 }} }}, scene: {{ bounds_m: [[-2, 0, -1], [2, 3, 1]] }} }};
 const answers = keys.map((key) => {{
   const {{ state, ignored }} = readState(contract, [], `#${{key}}=1&seed=3`);
   return Number(ignored.join() === `${{key}}=1` && state.seed === 3 && !Object.hasOwn(state, key)
@@ -15,6 +15,13 @@ const answers = keys.map((key) => {{
 }});
 console.log(JSON.stringify(answers));
 """
+ASKED = (
+    READ.partition("const answers")[0]
+    + """
+const asked = (key) => readState(contract, [], `#${key}`).ignored.length;
+console.log(JSON.stringify(keys.map(asked)));
+"""
+)
 
 
 def test_a_name_that_is_a_mark_stays_a_name():
@@ -29,3 +36,16 @@ def test_an_address_sets_only_what_is_a_setting():
     """What every object of JavaScript has by birth is no setting."""
     keys = ["constructor", "toString", "valueOf", "__proto__", "hasOwnProperty", "nothing"]
     assert asked_of_node(READ, keys=keys).tolist() == [1] * len(keys)
+
+
+@needs_node
+def test_places_outside_the_room_mean_nothing():
+    places = [
+        "aim=1,0.5",
+        "aim=1,0.5,0.4;-2,-1",
+        "route=0,0;1,1",
+        "aim=99,99",
+        "aim=1,0.5;0,-7",
+        "route=0,0;3,0",
+    ]
+    assert asked_of_node(ASKED, keys=places).tolist() == [0, 0, 0, 1, 1, 1]

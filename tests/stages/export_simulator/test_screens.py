@@ -50,6 +50,16 @@ def test_nothing_covers_anything(simulator: Path, chromium: Browser) -> None:
                 assert _apart(boxes[first], boxes[second]), (width, height, folded, first, second)
 
 
+def test_a_goal_does_not_move_the_buttons_of_a_usual_window(simulator: Path, chromium: Browser) -> None:
+    with browser.shown(chromium, (simulator / "index.html").as_uri(), size=(1280, 720)) as (page, _):
+        page.evaluate("ats.pause()")
+        heights = []
+        for goals in ("[]", "[[0, 0]]"):
+            page.evaluate(f"ats.visit({goals})")
+            heights.append(page.locator("#player").bounding_box()["height"])
+        assert heights[0] == heights[1], "pixels: one row"
+
+
 def _fold(page: Page, folded: bool) -> None:
     if page.is_visible("#panel-body") == folded:
         page.click("#panel-toggle")

@@ -6,7 +6,7 @@ export function sorry(text, remedy) {
   card.classList.add('sorry');
   card.replaceChildren(
     ...[
-      ['h1', 'Not here, sadly'],
+      ['h1', 'This page cannot be shown'],
       ['p', text],
       ['p', remedy],
     ].map(([tag, content]) => Object.assign(document.createElement(tag), { textContent: content })),

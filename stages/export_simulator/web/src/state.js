@@ -40,6 +40,9 @@ export function readState(contract, clips, hash = location.hash) {
   const number = (least, most) => (text) =>
     text !== '' && Number(text) >= least && Number(text) <= most ? Number(text) : null;
   const among = (values) => (text) => values.find((value) => String(value) === text) ?? null;
+  const [low, high] = contract.scene.bounds_m;
+  const within = ([x, z]) => x >= low[0] && x <= high[0] && z >= low[2] && z <= high[2];
+  const places = (text) => (readPlaces(text).length && readPlaces(text).every(within) ? text : null);
   const read = {
     interactivity: number(interactivity.least, interactivity.most),
     samples: among(samples.choices),
@@ -48,8 +51,8 @@ export function readState(contract, clips, hash = location.hash) {
     speed: among(SPEEDS),
     view: among(VIEWS),
     replay: (text) => (clips.some((clip) => clip.name === text) ? text : null),
-    aim: (text) => (readPlaces(text).length ? text : null),
-    route: (text) => (readPlaces(text).length ? text : null),
+    aim: places,
+    route: places,
     at: (text) => (readPoint(text) ? text : null),
     animal: among((contract.animals ?? []).map(({ name }) => name)),
     does: (text) => (readDoings(text, contract) ? text : null),
