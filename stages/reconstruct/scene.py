@@ -212,10 +212,10 @@ def even_depths(
 
 
 def camera_prior(problem: Problem) -> Terms:
-    """Keep corrections of cameras small where registration is certain, and alike at neighbouring knots."""
-    correction = problem.motion.camera / CAMERA_M
+    """Keep corrections of cameras small where registration is certain, and alike at a video's next knots."""
+    correction, knot = problem.motion.camera / CAMERA_M, torch.unique(problem.motion.knot)
     return {
-        "drift": (DRIFT_WEIGHT, torch.diff(correction, dim=0).square()),
+        "drift": (DRIFT_WEIGHT, (correction[knot + 1] - correction[knot]).square()),
         "anchor": (ANCHOR_WEIGHT, problem.camera_precision[:, None] * correction.square()),
     }
 

@@ -1,5 +1,7 @@
 """Losses, composite rendering and gap filling: each with the property that a wrong one cannot have."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import torch
 
@@ -97,6 +99,18 @@ def test_held_cameras_do_not_move_and_free_ones_move_smoothly():
     torch.testing.assert_close(moved[:10], pose[:10])
     bend = torch.diff(moved[10:, 0, 3], n=2)
     assert (bend.abs() > 1e-6).sum() <= 3, "corrections bend at knots only"
+
+
+def test_corrections_of_one_video_say_nothing_of_the_next():
+    pose = torch.eye(4).repeat(30, 1, 1)
+    table = MotionTable(pose, pose, torch.eye(4)[None], [10, 20], [True, True], knot_frames=5)
+    problem = SimpleNamespace(motion=table, camera_precision=torch.ones(len(table.camera)))
+    with torch.no_grad():
+        table.camera[table.knot[10] :] = 0.01
+    assert not scene.camera_prior(problem)["drift"][1].any()
+    with torch.no_grad():
+        table.camera[-1] = 0.02
+    assert (scene.camera_prior(problem)["drift"][1].sum(1) > 0).tolist() == [False] * 5 + [True]
 
 
 def test_gaps_are_bridged_by_straight_lines():
