@@ -155,7 +155,8 @@ def _choose_stances(problem: Problem, plan: OptimizationPlan, segments: Sequence
         return frame, torch.stack(losses, dim=-1).cpu().numpy()
 
     losses = list(_in_each(problem, plan, segments, losses_of, "stances"))
-    usual = float(np.nanmedian(np.concatenate([loss[:, 0] for _, loss in losses])))
+    level = [loss[:, 0] for _, loss in losses]  # none where other processes have all new recordings
+    usual = float(np.nanmedian(np.concatenate(level))) if level else np.nan
     for frame, loss in losses:
         chosen[frame] = posing.by_frame(posing.most_likely(loss, usual), len(frame)).to(chosen)
     lean, bone = (torch.stack([getattr(stance, name) for stance in choices]) for name in ("lean", "bone"))

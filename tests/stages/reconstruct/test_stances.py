@@ -1,11 +1,13 @@
 """An animal that sits is told from one that stands, in each frame, though registration has it level."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from stages.reconstruct import assemble, optimise, posing
-from tests.stages.reconstruct.test_optimise import SHAPES, film_animal, plan, template
+from tests.stages.reconstruct.test_optimise import SHAPES, film_animal, plan, problem, template
 
 FRAMES, SITS = 40, slice(20, 40)
 HALF_M = np.array([0.1, 0.1, 0.3])
@@ -25,6 +27,14 @@ def test_the_better_of_two_misfits_tells_nothing():
     assert posing.most_likely(loss, 0.5).tolist() == [1] * 6
     loss[2] = np.nan
     assert posing.most_likely(loss, 0.5).tolist() == [1] * 6, "unseen, it is thought to sit on"
+
+
+def test_a_process_chooses_none_where_others_have_all_that_is_new():
+    found, _ = problem()
+    without = replace(found, agent_frames=found.agent_frames[:0])
+    before = found.motion.initial_agent.clone()
+    optimise._choose_stances(without, plan(stance=1), list(optimise.chunks(found, 100)))
+    assert torch.equal(found.motion.initial_agent, before)
 
 
 def test_parts_are_told_by_frame():
