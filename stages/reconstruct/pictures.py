@@ -48,11 +48,11 @@ def report_quality(
             pictures.append(qa.Picture(f"{id}_frames", image, caption))
     curves = plots.loss_curves({name: {"total": record.total()} for name, record in records.items()})
     pictures.append(qa.Picture("losses", curves, "losses of each phase, running mean, logarithmic"))
-    psnr, depth, iou = (np.mean(column) for column in zip(*rows, strict=True)) if rows else (np.nan,) * 3
+    psnr, depth, iou = np.ma.masked_invalid(np.reshape(rows, (-1, 3))).mean(0).filled(np.nan).tolist()
     checks = [
-        qa.Check("PSNR of rendered training frames", float(psnr), "dB", 20, 15, "higher"),
-        qa.Check("measured depth reproduced within 0.1 m", float(depth), "share", 0.9, 0.75, "higher"),
-        qa.Check("agent's silhouette against its mask, IoU", float(iou), "share", 0.7, 0.5, "higher"),
+        qa.Check("PSNR of rendered training frames", psnr, "dB", 20, 15, "higher"),
+        qa.Check("measured depth reproduced within 0.1 m", depth, "share", 0.9, 0.75, "higher"),
+        qa.Check("agent's silhouette against its mask, IoU", iou, "share", 0.7, 0.5, "higher"),
     ]
     qa.write(
         folder,
