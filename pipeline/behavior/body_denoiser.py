@@ -17,7 +17,7 @@ from pipeline.behavior.trajectories import RATE_HZ
 CONTROL_CHANNELS = 8
 """channels of a path that condition the UNet: position, velocity, heading"""
 ROOT_CHANNELS = 6
-"""the body's channels of the root's rotation: its x and its y axis"""
+"""the body's leading channels: the root's rotation in the ego frame, its x and its y axis"""
 HEADING_MEMORY_M = 0.1
 """way after which an earlier heading counts for a third"""
 PATH_NOISE_M = 0.02

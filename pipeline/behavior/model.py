@@ -15,7 +15,7 @@ from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import nn
 
-from pipeline.behavior.body_denoiser import CONTROL_CHANNELS, BodyDenoiser, OneStageDenoiser
+from pipeline.behavior.body_denoiser import CONTROL_CHANNELS, ROOT_CHANNELS, BodyDenoiser, OneStageDenoiser
 from pipeline.behavior.config import (
     AblatedInput,
     Control,
@@ -60,9 +60,6 @@ from pipeline.behavior.pointwise import WaypointUNet
 from pipeline.behavior.trajectories import ABSENT_M, FUTURE, KINDS, PAST, RATE_HZ
 from pipeline.core.errors import InputError, other_versions_refused
 from pipeline.geometry import rigid
-
-ROOT_CHANNELS = 6
-"""the body's leading channels: the root's rotation in the ego frame, its first two columns"""
 
 
 @dataclass(frozen=True)

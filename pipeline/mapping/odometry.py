@@ -180,7 +180,7 @@ def optimize_pose_graph(
 ) -> Float[np.ndarray, "frame 4 4"]:
     """Minimise the edges' squared Mahalanobis errors by Gauss-Newton, the first frame held.
 
-    An edge's residual is log(measured_second_from_first @ current first_from_second), its robust weight
+    An edge's residual is log(current first_from_second @ measured second_from_first), its robust weight
     Cauchy's. Jacobians take the relative error as small, which odometry grants.
     """
     poses = np.array(world_from_camera, float)

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.geometry import align, cameras, rigid
 from pipeline.mapping import pose_optimization, sift
+from pipeline.mapping.odometry import JUMP_INFLATION
 
 HEIGHT_PX = 240
 """Shorter side of the pictures that flow is computed on, pixels: DIS is fast there and still sub-pixel."""
@@ -35,8 +36,6 @@ ENOUGH_SHARE = 0.7
 """With this share no other explanation is searched."""
 SIGMA_RAD, SIGMA_M = float(np.deg2rad(0.25)), 0.008
 """Standard deviations of one motion, radians and metres, measured on rendered sessions."""
-JUMP_INFLATION = 60.0
-"""The deviations of an unknown motion are so many times larger."""
 SIFT_FEATURES = 500
 """SIFT points per picture where flow fails."""
 FAR_M = 1e3

@@ -36,8 +36,6 @@ TEMPLATE_COLOR, TEMPLATE_FEATURE = 20.0, 0.3
 """weights of color and features against signed distance while the field copies the template"""
 LEAST_FLOW_CONFIDENCE, LEAST_OPACITY = 25, 0.5
 """flow is compared where its confidence (of 255) and the rendered opacity are above these"""
-NEAREST_M = 0.1
-"""points nearer to the camera than this project to no pixel"""
 
 
 class JointLoss:
@@ -181,7 +179,7 @@ def later_pixels(
     mixed = (scene_camera + share * (agent_camera - scene_camera)).view(*rendered.weight.shape, 3)
     point = (rendered.weight[..., None] * mixed).sum(1) / rendered.opacity.clamp_min(1e-3)[:, None]
     pixel, ahead = cameras.project(point, problem.store.views.intrinsics[later].repeat_interleave(number, 0))
-    return pixel, usable.repeat_interleave(number) & (ahead > NEAREST_M) & (
+    return pixel, usable.repeat_interleave(number) & (ahead > body.NEAREST_M) & (
         rays.flow_confidence > LEAST_FLOW_CONFIDENCE
     ) & (rendered.opacity.detach() > LEAST_OPACITY)
 

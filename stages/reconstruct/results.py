@@ -19,6 +19,7 @@ from pipeline.fields.fields import Reconstruction
 from pipeline.geometry import cameras, rigid
 from pipeline.geometry.meshes import Mesh
 from stages.reconstruct.assemble import RegisteredVideo, scene_first
+from stages.reconstruct.body import NEAREST_M
 from stages.reconstruct.problem import Problem
 from stages.reconstruct.rays import THUMBNAIL
 
@@ -32,8 +33,6 @@ SEEN_WITHIN_M = 0.045
 """the scene's surface is cut where nothing was measured this near: backs of thin shells, rims"""
 MOST_POINTS, MOST_FRAMES = 3_000_000, 300
 """measured points, and frames that show free space, are thinned to about so many"""
-NEAREST_M = 0.1
-"""points nearer to a camera than this are not in view"""
 
 
 @dataclass(frozen=True)

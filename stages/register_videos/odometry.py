@@ -13,8 +13,8 @@ from pipeline.core.progress import track
 from pipeline.data.clips import Clip, Masks, usable_depth
 from pipeline.geometry import rigid
 from pipeline.mapping import pose_optimization, visual_odometry
-from pipeline.mapping.odometry import find_jumps, repair
-from pipeline.mapping.visual_odometry import JUMP_INFLATION, Odometry
+from pipeline.mapping.odometry import JUMP_INFLATION, find_jumps, repair
+from pipeline.mapping.visual_odometry import Odometry
 from stages.register_videos.config import VoteConfig
 from stages.register_videos.votes import FrameVotes, close
 
