@@ -273,10 +273,13 @@ def _decoded(stored: Picture, size: tuple[int, int], where: str) -> UInt8[np.nda
 
 
 def _confidence(recording: Recording, number: int, depth: np.ndarray) -> UInt8[np.ndarray, "height width"]:
-    """Return the phone's confidence; an export without it trusts all depth that there is."""
+    """Return the confidence of depth: 2 where no frame has any, 0 where this one alone lacks it."""
     if recording.read_confidence is None:
         return np.where(depth > 0, 2, 0).astype(np.uint8)
-    return _sampled(np.minimum(recording.read_confidence(number), 2), depth.shape)
+    confidence = recording.read_confidence(number)
+    if confidence is None:
+        return np.zeros(depth.shape, np.uint8)
+    return _sampled(np.minimum(confidence, 2), depth.shape)
 
 
 def reduced_size(size: tuple[int, int], max_side_px: int) -> tuple[int, int]:

@@ -57,7 +57,7 @@ def open_recording(path: Path) -> Recording:
         raise broken_metadata(container.where, f"keyframes of {len(sizes)} sizes")
     size = _depth(container, int(index[0]), None).shape
     matrices = _columns(tables, MATRIX).reshape(-1, 3, 4)
-    known = set(index.tolist()) <= container.numbered("keyframes/confidence").keys()
+    confidence = container.numbered("keyframes/confidence")
     mesh = {"raw.glb", "mesh_info.json"} <= container.names
 
     def depth(number: int) -> np.ndarray:
@@ -78,7 +78,7 @@ def open_recording(path: Path) -> Recording:
         depth_size=size,
         read_color=lambda i: container.read(f"keyframes/{color}/{i}.jpg"),
         read_depth=depth,
-        read_confidence=(lambda i: _confidence(container, i, size)) if known else None,
+        read_confidence=(lambda i: _confidence(container, confidence.get(i), size)) if confidence else None,
         convention=OPENGL,
         up=Y_UP,
         read_mesh=(lambda: _mesh(container)) if mesh else None,
@@ -128,10 +128,12 @@ def _mesh(container: FolderContainer) -> Mesh:
 
 
 def _confidence(
-    container: FolderContainer, number: int, size: tuple[int, int]
-) -> UInt8[np.ndarray, "height width"]:
+    container: FolderContainer, name: str | None, size: tuple[int, int]
+) -> UInt8[np.ndarray, "height width"] | None:
     """Read 0 as low, 255 as high and whatever lies between as medium."""
-    raw = container.gray(f"keyframes/confidence/{number}.png")
+    if name is None:
+        return None
+    raw = container.gray(name)
     if raw.shape != size:
         raw = cv2.resize(raw, size[::-1], interpolation=cv2.INTER_NEAREST)
     return np.where(raw == 0, 0, np.where(raw == 255, 2, 1)).astype(np.uint8)

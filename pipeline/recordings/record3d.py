@@ -255,13 +255,15 @@ def _read_depth(container: Container, name: str, size: tuple[int, int]) -> Float
 
 def _confidence_reader(
     container: Container, layout: _Layout, index: np.ndarray, size: tuple[int, int]
-) -> Callable[[int], np.ndarray] | None:
-    """Return a reader of confidence pictures where every frame has one."""
+) -> Callable[[int], np.ndarray | None] | None:
+    """Return a reader of confidence pictures where frames have one."""
     known = _numbers(container.names, layout.confidence)
-    if isinstance(container, FolderContainer) or not set(index) <= known:
+    if isinstance(container, FolderContainer) or known.isdisjoint(index):
         return None
 
-    def read(frame: int) -> np.ndarray:
+    def read(frame: int) -> np.ndarray | None:
+        if frame not in known:
+            return None
         data = _decompress_exactly(container, layout.confidence % frame, math.prod(size))
         return np.frombuffer(data, np.uint8).reshape(size)
 

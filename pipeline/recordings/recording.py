@@ -46,8 +46,8 @@ class Recording:
     """picture of the app's frame number; None where the file is damaged there"""
     read_depth: Callable[[int], Float[np.ndarray, "height width"]]
     """metres as stored, of the app's frame number"""
-    read_confidence: Callable[[int], UInt8[np.ndarray, "height width"]] | None = None
-    """0 low, 1 medium, 2 high; None where the format has none"""
+    read_confidence: Callable[[int], UInt8[np.ndarray, "height width"] | None] | None = None
+    """0 low, 1 medium, 2 high, and None for a frame that lacks it; None where the recording has none"""
     convention: Convention = OPENCV
     """what the format documents about its poses"""
     up: tuple[float, float, float] | None = None

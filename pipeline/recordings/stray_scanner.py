@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from pipeline.core.errors import InputError
 from pipeline.recordings import text_files
@@ -65,7 +65,11 @@ def open_recording(path: Path) -> Recording:
     timestamp_s = movie.timestamp_s[index] if rows.timestamp_s is None else rows.timestamp_s[valid]
     size = _depth(container, depth[int(index[0])], None).shape
     _refuse_constant_rows(container, [depth[int(number)] for number in index[:: max(1, len(index) // 5)]])
-    known = all(f"confidence/{int(number):06d}.png" in container.names for number in index)
+    confidence = container.numbered("confidence")
+
+    def confident(number: int) -> UInt8[np.ndarray, "height width"] | None:
+        return container.gray(confidence[number]) if number in confidence else None
+
     return Recording(
         where=container.where,
         kind="Stray Scanner",
@@ -77,7 +81,7 @@ def open_recording(path: Path) -> Recording:
         depth_size=size,
         read_color=movie.read,
         read_depth=lambda i: _depth(container, depth[i], size),
-        read_confidence=(lambda i: container.gray(f"confidence/{i:06d}.png")) if known else None,
+        read_confidence=confident if confidence else None,
         convention=OPENCV,
         up=Y_UP,
     )

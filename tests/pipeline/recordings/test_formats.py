@@ -197,6 +197,16 @@ def test_every_age_of_stray_scanner_is_read(tmp_path, columns):
         np.testing.assert_allclose(recording.timestamp_s, made.timestamp_s, atol=1e-6)
 
 
+@pytest.mark.parametrize(("app", "folder"), [("stray", "confidence"), ("polycam", "keyframes/confidence")])
+def test_a_frame_without_confidence_is_not_trusted_and_the_others_are_as_measured(tmp_path, app, folder):
+    path = getattr(made_formats, app)(tmp_path / "a", walk(8, quarter_turns=LANDSCAPE))
+    sorted((path / folder).iterdir())[3].unlink()
+    recording = open_recording(path)
+    depth = np.ones(recording.depth_size, np.float32)
+    confidence = [extraction._confidence(recording, int(number), depth) for number in recording.index]
+    assert [np.unique(each).tolist() for each in confidence] == [[0] if i == 3 else [1] for i in range(8)]
+
+
 def test_frames_without_depth_shift_nothing(tmp_path):
     made = walk(12, quarter_turns=LANDSCAPE)
     path = made_formats.stray(tmp_path / "a", made)
