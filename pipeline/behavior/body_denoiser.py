@@ -83,7 +83,8 @@ class BodyDenoiser(nn.Module):
     ) -> Float[Tensor, "batch 3 frame"]:
         """Return how far the path goes in each frame, metres; in the first as in the second."""
         del x, t
-        step = (control * self.path_std).diff(dim=-1)
+        place = control * self.path_std
+        step = place[..., 1:] - place[..., :-1]
         return torch.cat([step[..., :1], step], dim=-1)
 
     def headings(
@@ -100,7 +101,7 @@ class BodyDenoiser(nn.Module):
         level = level * (square / (square + PATH_NOISE_M**2))
         way = (level.square().sum(1) + 1e-12).sqrt().cumsum(-1)
         since = (way[:, None, :] - way[:, :, None]).clamp(max=0)
-        gone = level @ (torch.exp(since / HEADING_MEMORY_M) * self.past).mT
+        gone = level @ (torch.exp(since / HEADING_MEMORY_M) * self.past).transpose(-1, -2)
         return soft_unit(
             gone + HEADING_MEMORY_M * torch.exp(-way / HEADING_MEMORY_M)[:, None] * horizontal_forward(root)
         )
@@ -130,8 +131,8 @@ class OneStageDenoiser(BodyDenoiser):
     ) -> Float[Tensor, "batch 3 frame"]:
         """Return how far the noisy path is expected to go in each frame, metres."""
         del control
-        strides = (self.share[t.long()][:, None, None] * x[:, :PATH_CHANNELS]).mT * self.velocity_std
-        return expected_steps(strides, self.rate_hz).mT
+        strides = (self.share[t.long()][:, None, None] * x[:, :PATH_CHANNELS]).transpose(-1, -2)
+        return expected_steps(strides * self.velocity_std, self.rate_hz).transpose(-1, -2)
 
 
 def horizontal_forward(root: Float[Tensor, "batch 6 frame"]) -> Float[Tensor, "batch 2 frame"]:

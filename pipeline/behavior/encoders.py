@@ -39,7 +39,7 @@ def beings(
 ) -> Float[Tensor, "batch other past_frame 10"]:
     """Return what encoders read of an observer's poses and of companions, whose rotations are unknown (0)."""
     first = nn.functional.pad(torch.cat([position, rigid_torch.rotation_to_6d(rotation)], dim=-1), (0, 1))
-    place = companions[..., :3] @ new_from_ego.mT[:, None]
+    place = companions[..., :3] @ new_from_ego.transpose(-1, -2)[:, None]
     unknown = place.new_zeros(*place.shape[:3], POSE_CHANNELS - 3)
     return torch.cat([first[:, None], torch.cat([place, unknown, companions[..., 3:]], dim=-1)], dim=1)
 
@@ -70,7 +70,7 @@ class SetEncoder(nn.Module):
         codes = self.layers[1:](hidden)
         if codes.shape[1] == 1:
             return codes[:, 0]
-        weight = (codes @ self.attention.mT + (inside + LEAST_WEIGHT).log()).softmax(1)
+        weight = (codes @ self.attention.transpose(-1, -2) + (inside + LEAST_WEIGHT).log()).softmax(1)
         return (codes.unflatten(-1, (HEADS, -1)) * weight[..., None]).sum(1).flatten(1)
 
 
@@ -100,9 +100,8 @@ class OthersEncoder(SetEncoder):
         moving = torch.cat([velocity, closing], dim=-1) * nearness[..., -1:]
         inside = (nearness * EDGE_SHARPNESS).clamp_max(1)
         close = (CLOSE_RANGE_M - distance).clamp_min(-CLOSE_RANGE_M) * (2 * inside)
-        coming = -(position.diff(dim=-2) * self.rate_hz * direction[..., 1:, :]).sum(-1).clamp(-2, 2) * (
-            APPROACH_SCALE * inside[..., 1:]
-        )
+        step = (position[..., 1:, :] - position[..., :-1, :]) * self.rate_hz
+        coming = -(step * direction[..., 1:, :]).sum(-1).clamp(-2, 2) * (APPROACH_SCALE * inside[..., 1:])
         features = torch.cat([seen, moving.clamp(-2, 2), close, coming], dim=-1)
         return self.code_of_set(features, others[..., -1, -1:], inside[..., -1:], keep)
 
@@ -146,5 +145,5 @@ class PastEncoder(nn.Module):
         if bones_keep is not None:
             bones = bones * bones_keep[:, None]
         root = past[:, :, :9]
-        change = (root.diff(dim=1) * self.CHANGE).clamp(-self.CHANGE, self.CHANGE)
+        change = ((root[:, 1:] - root[:, :-1]) * self.CHANGE).clamp(-self.CHANGE, self.CHANGE)
         return self.layers(torch.cat([root.flatten(1), change.flatten(1), self.bones(bones)], dim=-1))

@@ -82,7 +82,7 @@ class GoalMLP(nn.Module):
         point = torch.cat([x, self.staying(*clean)], dim=-1)
         seen = [point.expand(self.ensemble_size, -1, -1), code_channels]
         if self.map is not None:
-            seen.append(self.map(*clean, code_channels, maps))
+            seen.append(self.map(*clean, code_channels, maps, draws))
         return self.noise(x, self.layers(torch.cat(seen, dim=-1)), t)
 
 
@@ -96,7 +96,7 @@ class EnsembleLinear(nn.Module):
         self.bias = nn.Parameter(torch.stack([layer.bias.detach() for layer in each])[:, None])
 
     def forward(self, rows: Float[Tensor, "member row inner"]) -> Float[Tensor, "member row outer"]:
-        return torch.baddbmm(self.bias, rows, self.weight.mT)
+        return torch.baddbmm(self.bias, rows, self.weight.transpose(-1, -2))
 
 
 class CleanGoalEstimate(nn.Module):
@@ -185,8 +185,11 @@ class MapAttention(nn.Module):
         variance: Float[Tensor, "draw 1"],
         code_channels: Float[Tensor, "member draw code"],
         maps: Float[Tensor, "batch member map"],
+        draws: int,
     ) -> Float[Tensor, "member draw 44"]:
-        """Return what each head reads, where it looks on average, and how far that is from the noisy goal."""
+        """Return what each head reads, where it looks on average, and how far that is from the noisy goal;
+        a batch has ``draws`` goals each.
+        """
         key, value = maps.transpose(0, 1).unflatten(-1, (2, MAP_KEY_CHANNELS, -1)).unbind(2)
         scaled = self.power / self.goal_std[::2]
         cells = torch.cat([self.place, scaled, scaled.square().sum(-1, keepdim=True)], dim=-1)
@@ -197,12 +200,13 @@ class MapAttention(nn.Module):
         near = torch.cat([torch.zeros_like(mean * narrow), mean * narrow, -narrow / 2], dim=-1)
         where = query[..., MAP_KEY_CHANNELS:] + nn.functional.pad(near, (0, 0, 0, self.HEADS - self.LOCAL))
         asked, where = (
-            part.unflatten(1, (maps.shape[0], -1)).flatten(2, 3)
+            part.reshape(part.shape[0], -1, draws * self.HEADS, part.shape[-1])
             for part in (query[..., :MAP_KEY_CHANNELS] * MAP_KEY_CHANNELS**-0.5, where)
         )
-        weight = (asked @ key + where @ cells.mT).softmax(-1)
+        weight = (asked @ key + where @ cells.transpose(-1, -2)).softmax(-1)
         read, looked = (
-            (weight @ rows).flatten(1, 2).unflatten(1, (-1, self.HEADS)) for rows in (value.mT, scaled)
+            (weight @ rows).flatten(1, 2).unflatten(1, (-1, self.HEADS))
+            for rows in (value.transpose(-1, -2), scaled)
         )
         read, place = read.flatten(2), looked.flatten(2)
         return torch.cat([read, place, (looked[:, :, : self.LOCAL] - mean).flatten(2)], dim=-1)

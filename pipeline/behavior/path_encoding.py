@@ -52,7 +52,8 @@ def velocity_channels_from_path(
     path: Float[Tensor, "*batch frame 3"], start: Float[Tensor, "*batch 3"], rate_hz: float = RATE_HZ
 ) -> Float[Tensor, "*batch frame 4"]:
     """Return the strides along a path in metres that begins a frame after ``start``."""
-    velocity = torch.diff(path, dim=-2, prepend=start[..., None, :]) * rate_hz
+    before = torch.cat([start[..., None, :], path[..., :-1, :]], dim=-2)
+    velocity = (path - before) * rate_hz
     moves = torch.where((velocity**2).sum(-1, keepdim=True) > REST_SPEED_M_S**2, 1.0, -1.0)
     return torch.cat([with_powered_length(velocity, VELOCITY_POWER), moves.to(velocity)], dim=-1)
 

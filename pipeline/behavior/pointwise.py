@@ -5,6 +5,8 @@ A variant beside `goal_denoiser.MapAttention`, which looks where it wants to. Po
 expected, given the noisy sample and nothing else: at the noisiest steps all are near the animal.
 """
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -30,10 +32,11 @@ def read_at(
     maps: Float[Tensor, "batch member map"], points: Float[Tensor, "batch point 3"]
 ) -> Float[Tensor, "batch member channel point"]:
     """Return what maps say, bilinear, at points in metres of the ego frame; zeros beyond the edge."""
-    cells = round((maps.shape[-1] / READ) ** 0.5)
+    cells = math.isqrt(int(maps.shape[-1]) // READ)
     chart = maps.flatten(0, 1).unflatten(1, (READ, cells, cells))
     where = (points[:, None, :, None, ::2] / HALF_M).expand(-1, maps.shape[1], -1, -1, -1).flatten(0, 1)
-    return nn.functional.grid_sample(chart, where, align_corners=False)[..., 0].unflatten(0, maps.shape[:2])
+    read = nn.functional.grid_sample(chart, where, align_corners=False)[..., 0]
+    return read.unflatten(0, (-1, maps.shape[1]))
 
 
 class MapAtGoal(nn.Module):
@@ -52,11 +55,12 @@ class MapAtGoal(nn.Module):
         variance: Float[Tensor, "draw 1"],
         code: Float[Tensor, "member draw code"],
         maps: Float[Tensor, "batch member map"],
+        draws: int,
     ) -> Float[Tensor, "member draw 16"]:
         """Return the map's channels there."""
         del code
         goal = with_powered_length(mean / (1 + variance) * self.goal_std, 1 / GOAL_LENGTH_POWER)
-        read = read_at(maps, goal.unflatten(0, (maps.shape[0], -1)))
+        read = read_at(maps, goal.unflatten(0, (-1, draws)))
         return read.permute(1, 0, 3, 2).flatten(1, 2)
 
 
@@ -100,5 +104,5 @@ class WaypointUNet(ControlUNet):
         self, x: Float[Tensor, "batch 4 frame"], t: Float[Tensor, "batch"]
     ) -> Float[Tensor, "batch frame 3"]:
         """Return where noisy strides are expected to lead, metres from the animal."""
-        strides = (self.share[t.long()][:, None, None] * x).mT * self.velocity_std
+        strides = (self.share[t.long()][:, None, None] * x).transpose(-1, -2) * self.velocity_std
         return expected_steps(strides, self.rate_hz).cumsum(1)

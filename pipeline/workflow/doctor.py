@@ -20,7 +20,7 @@ from pipeline.workflow import captures, recipes
 
 LIBRARIES = (
     "torch", "numpy", "scipy", "cv2", "pycolmap", "OpenEXR", "av", "lzfse", "numba", "embreex", "trimesh",
-    "kornia", "onnxruntime", "onnxscript", "pygltflib", "skimage", "safetensors", "matplotlib", "jinja2",
+    "kornia", "onnxruntime", "pygltflib", "skimage", "safetensors", "matplotlib", "jinja2",
 )  # fmt: skip
 OLDEST_PYTHON, TOO_NEW_PYTHON = (3, 11), (3, 14)
 NEEDED_DISK_GB = 10

@@ -73,7 +73,7 @@ def test_local_heads_look_where_the_goal_may_be():
     torch.nn.init.zeros_(attention.query.bias)
     x = attention.power[[2, 9]] @ torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     read = attention(
-        x, torch.zeros(2, 1), torch.zeros(1, 2, 2), torch.zeros(2, 1, 2 * MAP_KEY_CHANNELS * CELLS**2)
+        x, torch.zeros(2, 1), torch.zeros(1, 2, 2), torch.zeros(2, 1, 2 * MAP_KEY_CHANNELS * CELLS**2), 1
     )[0]
     looked = read[:, MapAttention.HEADS * MAP_KEY_CHANNELS :][:, : 2 * MapAttention.HEADS].unflatten(
         1, (-1, 2)

@@ -38,7 +38,7 @@ def test_a_goal_is_read_where_it_is_expected():
     goal = torch.tensor([[0.5, 0.0, -1.0], [-0.3, 0.0, 0.4]])
     scaled = with_powered_length(goal, GOAL_LENGTH_POWER) / reader.goal_std
     exact, noisy = (
-        reader(scaled, torch.full((2, 1), variance), torch.zeros(1, 2, 4), numbered())[0, :, :2]
+        reader(scaled, torch.full((2, 1), variance), torch.zeros(1, 2, 4), numbered(), 2)[0, :, :2]
         for variance in (0.0, 1e6)
     )
     torch.testing.assert_close(exact, goal[:, ::2], atol=1e-4, rtol=0)
