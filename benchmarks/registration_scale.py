@@ -21,6 +21,8 @@ from jaxtyping import Int
 
 from pipeline.data import ply
 from pipeline.data.clips import Clip, Masks
+from pipeline.data.features import open_features
+from pipeline.data.templates import read_vertex_features
 from pipeline.localization import localizer
 from stages.register_videos import registration
 from stages.register_videos.config import Config
@@ -75,6 +77,17 @@ class ThereMasks:
         return self.masks[int(self.order[frame])]
 
 
+@dataclass(frozen=True)
+class ThereRows:
+    """Rows of a table to it, which are read when they are asked for."""
+
+    rows: np.ndarray
+    order: np.ndarray
+
+    def __getitem__(self, frame: int) -> np.ndarray:
+        return self.rows[self.order[frame]]
+
+
 def forth_and_back(length: int, frames: int) -> Int[np.ndarray, "frame"]:
     """Return which frame of a clip of this length is shown when it is walked forth and back."""
     phase = np.arange(frames) % (2 * length - 2)
@@ -91,10 +104,17 @@ def measure(build: Path, video: str, frames: int) -> tuple[float, float, bool]:
         ply.read_ply(build / "agent_template" / "agent.ply"),
         localizer.load(build / "scene_localizer"),
         localizer.load(build / "agent_localizer"),
+        read_vertex_features(build / "scene_template").astype(np.float32),
     )
+    features = open_features(build / "features" / video)
     start = time.process_time()
     found = registration.register(
-        There(clip, order), ThereMasks(masks, order), maps, Config(), np.random.default_rng(0)
+        There(clip, order),
+        ThereMasks(masks, order),
+        maps,
+        Config(),
+        np.random.default_rng(0),
+        ThereRows(features, order),
     )
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return time.process_time() - start, peak_mb, isinstance(found, registration.Registered)

@@ -157,8 +157,7 @@ class _Residual(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         y = torch.relu(self.norm1(self.conv1(x)))
-        y = torch.relu(self.norm2(self.conv2(y)))
-        return torch.relu(self.downsample(x) + y)
+        return torch.relu(self.downsample(x) + torch.relu(self.norm2(self.conv2(y))))
 
 
 class _Encoder(nn.Module):

@@ -60,8 +60,7 @@ class MapAtGoal(nn.Module):
         """Return the map's channels there."""
         del code
         goal = with_powered_length(mean / (1 + variance) * self.goal_std, 1 / GOAL_LENGTH_POWER)
-        read = read_at(maps, goal.unflatten(0, (-1, draws)))
-        return read.permute(1, 0, 3, 2).flatten(1, 2)
+        return read_at(maps, goal.unflatten(0, (-1, draws))).permute(1, 0, 3, 2).flatten(1, 2)
 
 
 class WaypointUNet(ControlUNet):
@@ -97,8 +96,7 @@ class WaypointUNet(ControlUNet):
     ) -> Float[Tensor, "batch channel frame"]:
         """Return the noisy strides and, beside each, what the maps say where it is expected to lead."""
         maps = condition[:, : self.ensemble_size * self.map_numbers].unflatten(1, (self.ensemble_size, -1))
-        read = read_at(maps, self.waypoints(x, t))
-        return torch.cat([x, read.flatten(1, 2)], dim=1)
+        return torch.cat([x, read_at(maps, self.waypoints(x, t)).flatten(1, 2)], dim=1)
 
     def waypoints(
         self, x: Float[Tensor, "batch 4 frame"], t: Float[Tensor, "batch"]

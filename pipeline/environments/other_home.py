@@ -123,8 +123,7 @@ def move_in(own: ReconstructedHome, other: ReconstructedHome, data: BehaviorData
     does, SIM-011 where no moment fits in.
     """
     seen = replace(perceived(own, other), stands_m=own.stands_m)
-    moved = set_down(data, own, seen, np.random.default_rng(seed))
-    return Moved(seen, moved, share_known(own, seen))
+    return Moved(seen, set_down(data, own, seen, np.random.default_rng(seed)), share_known(own, seen))
 
 
 def perceived(own: ReconstructedHome, other: ReconstructedHome) -> ReconstructedHome:

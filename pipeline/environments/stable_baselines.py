@@ -88,8 +88,7 @@ class PersonStableVecEnv(VecEnv):
 
     def env_method(self, method_name: str, *arguments: Any, indices: Any = None, **named: Any) -> list[Any]:
         """Call a method, once for all."""
-        result = getattr(self, method_name)(*arguments, **named)
-        return [result] * len(list(self._get_indices(indices)))
+        return [getattr(self, method_name)(*arguments, **named)] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         """Return that no environment is wrapped."""

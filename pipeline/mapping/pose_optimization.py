@@ -27,6 +27,8 @@ DAMPING = 1e-6
 """Damping of a step, share of each diagonal element and of their mean: what nothing measures stays still."""
 CHI_DAMPING = 1e-3
 """The same in `chi_squares`: what one flat wall does not measure does not count."""
+MOST_ROWS = 2**19
+"""Rows of the Jacobian at a time: a step needs half a gigabyte however long the recording is."""
 MEDIAN_CHI_SQUARE = 5.348
 """Median of the chi-square distribution of six degrees of freedom."""
 PRIOR_PRECISION = 1e-9
@@ -50,9 +52,9 @@ class Correspondences:
         names = [field.name for field in fields(Correspondences)]
         return Correspondences(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
-    def inflated(self, factor: float) -> "Correspondences":
-        """Multiply the deviations."""
-        return replace(self, sigma_m=factor * self.sigma_m)
+    def selected(self, matches: slice | Int[np.ndarray, "some"]) -> "Correspondences":
+        """Return some of the matches."""
+        return Correspondences(*(getattr(self, field.name)[matches] for field in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -201,11 +203,13 @@ def residuals(
 
 def _normal_equations(poses, correspondences, relative_poses, reach):
     """Return matrix and gradient of one Gauss-Newton step."""
-    jacobian, residual = _correspondence_rows(poses, correspondences)
-    robust = (reach**2 / (reach**2 + residual**2)) ** 2
-    weight = robust / correspondences.sigma_m**2
-    normal = (jacobian.T @ sparse.diags_array(weight) @ jacobian).tocsc()
-    gradient = jacobian.T @ (weight * residual)
+    normal, gradient = sparse.csc_array((6 * len(poses),) * 2), np.zeros(6 * len(poses))
+    for start in range(0, len(correspondences.first), MOST_ROWS):
+        part = correspondences.selected(slice(start, start + MOST_ROWS))
+        jacobian, residual = _correspondence_rows(poses, part)
+        weight = (reach**2 / (reach**2 + residual**2)) ** 2 / part.sigma_m**2
+        normal = normal + (jacobian.T @ sparse.diags_array(weight) @ jacobian).tocsc()
+        gradient = gradient + jacobian.T @ (weight * residual)
     if relative_poses is not None and len(relative_poses.first):
         edge_jacobian, edge_residual = _edge_rows(poses, relative_poses)
         normal = normal + edge_jacobian.T @ edge_jacobian

@@ -52,8 +52,7 @@ def joints_minade(samples: Samples, future: Future) -> Float[np.ndarray, "window
     """Return the mean geodesic angle of the bones along the best sample, radians."""
     bones = _predicted(samples.agent_from_bone)
     true = np.broadcast_to(future.agent_from_bone[:, None], bones.shape)
-    angle = rigid.rotation_angle(bones[..., :3, :3], true[..., :3, :3])
-    return angle.mean((-1, -2)).min(1)
+    return rigid.rotation_angle(bones[..., :3, :3], true[..., :3, :3]).mean((-1, -2)).min(1)
 
 
 def _predicted(part: np.ndarray | None) -> np.ndarray:

@@ -201,8 +201,7 @@ def jobs(plan: Plan) -> list[Job]:
         return [video for video in shown if dag.folder_of(node.artifact, video) == node.artifact]
 
     shared = [_job(plan, node, part) for node in plan.nodes for part in parts(node)]
-    own = [job for each in plan.animals for job in jobs(each) if job.home == str(each.home)]
-    return shared + own
+    return shared + [job for each in plan.animals for job in jobs(each) if job.home == str(each.home)]
 
 
 def followed(all_jobs: Sequence[Job]) -> dict[str, list[str]]:

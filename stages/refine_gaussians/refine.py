@@ -128,8 +128,7 @@ class FrameLoss:
         radius = self.splats.agent.means.detach().norm(dim=-1).amax() / REACH
         centre = root[None, :3, 3]
         size = radius.log().expand(1, 3)
-        seen = in_view(centre, size, camera_from_world, target.intrinsics, *target.depth.shape)
-        return len(seen) > 0
+        return len(in_view(centre, size, camera_from_world, target.intrinsics, *target.depth.shape)) > 0
 
     def _pose(self, video: DrawnVideo, frame: int) -> tuple[Tensor, Tensor]:
         root, bones = (

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.core.progress import track
 from pipeline.data.clips import Clip, Masks
-from pipeline.geometry import rigid
+from pipeline.geometry import rigid, subsampling
 from pipeline.geometry.meshes import RayCaster
 from pipeline.mapping import depth_scans, pose_optimization
 from pipeline.mapping.pose_optimization import Correspondences, RelativePoseFactors, optimize_poses
@@ -25,7 +25,8 @@ from stages.register_videos.point_alignment import Walk, WalkTerm
 from stages.register_videos.votes import FrameVotes
 
 MOST_POINTS, LEAST_POINTS = 400_000, 40
-"""Depth points of a recording that take part, so that memory stays bounded, and least number per frame."""
+"""Depth points of a recording that take part, and as many correspondences of flow and of features, so that
+memory stays bounded; least number per frame."""
 DEPTH_INFLATION = 8.0
 """Depth noise is multiplied by this, since neighbouring pixels err together and furniture moves."""
 VOTE_SIGMA_M = 0.15
@@ -106,9 +107,8 @@ def align(
         reach = tuple(np.geomspace(FIRST_REACH_M, LAST_REACH_M, config.rounds))
         poses = optimize_poses(poses, find, odometry, reach_m=reach).world_from_camera
     if config.flow_every_frames:
-        chosen = track(frames[:: config.flow_every_frames], "optical flow")
-        ties = (flow_correspondences(clip, masks, caster, int(frame), poses[frame]) for frame in chosen)
-        by_flow[:] = [tie for tie in ties if tie is not None]
+        chosen = frames[:: config.flow_every_frames]
+        by_flow[:] = _ties(flow_correspondences, "optical flow", clip, masks, caster, chosen, poses)
         poses = optimize_poses(poses, find, odometry, reach_m=last).world_from_camera
     if walk is not None:
         points = WalkTerm(clip, masks, poses, walk)
@@ -116,9 +116,8 @@ def align(
     for _ in range(FEATURE_PASSES if config.feature_every_frames else 0):
         if features is None:
             break
-        chosen = track(frames[:: config.feature_every_frames], "features")
-        ties = (feature_correspondences(clip, masks, features, int(frame), poses[frame]) for frame in chosen)
-        by_features[:] = [tie for tie in ties if tie is not None]
+        chosen = frames[:: config.feature_every_frames]
+        by_features[:] = _ties(feature_correspondences, "features", clip, masks, features, chosen, poses)
         poses = optimize_poses(poses, find, odometry, reach_m=last, term=points).world_from_camera
     covariance = pose_optimization.marginal_covariance(
         poses, find(poses, LAST_REACH_M), odometry, LAST_REACH_M
@@ -171,6 +170,13 @@ def measure_fit(
 def _median(values):
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else float("nan")
+
+
+def _ties(find, label, clip, masks, template, chosen, poses) -> list[Correspondences]:
+    """Return the correspondences of the chosen frames that have any, so many that memory stays bounded."""
+    most = max(MOST_POINTS // len(chosen), LEAST_POINTS)
+    ties = (find(clip, masks, template, frame, poses[frame]) for frame in track(chosen.tolist(), label))
+    return [tie.selected(subsampling.evenly(len(tie.first), most)) for tie in ties if tie is not None]
 
 
 def _static_scan(clip, masks, frame, stride_px, most):

@@ -19,6 +19,8 @@ from pipeline.mapping.bundle_adjustment import PointTerm, chained
 
 POINTS, PEAK_THRESHOLD = 1200, 0.02
 """Points of a picture at most, and SIFT's contrast threshold; plain walls need a low one."""
+MOST_POINTS, LEAST_POINTS = 2_400_000, 120
+"""Points of a recording at most, so that memory stays bounded, and least number per frame."""
 MASK_MARGIN_PX = 15
 """The agent's mask is widened by a square of this size, pixels: SIFT looks at neighbourhoods."""
 PICTURES = 80
@@ -51,27 +53,30 @@ class WalkTerm:
         self._walked = walk.world_from_camera[known]
         poses = np.concatenate([world_from_camera, self._walked])
         pinholes = np.concatenate([clip.intrinsics, walk.clip.intrinsics[known]])
-        points = [_points(clip, frame, masks[frame] > 0) for frame in track(range(len(clip)), "points")]
-        points += [_points(walk.clip, int(frame)) for frame in known]
-        local = [each.points_camera for each in points]
-        pixels = [cameras.project(each, lens)[0] for each, lens in zip(local, pinholes, strict=True)]
-        links = []
-        for frame in range(len(clip)):
-            world = rigid.apply(poses[frame], local[frame])
+        walked = [_points(walk.clip, int(frame), POINTS) for frame in known]
+        most = min(POINTS, max(MOST_POINTS // len(clip), LEAST_POINTS))
+        local, links = [], []
+        for frame in track(range(len(clip)), "points"):
+            points = _points(clip, frame, most, masks[frame] > 0)
+            pixel = cameras.project(points.points_camera, pinholes[frame])[0]
+            world = rigid.apply(poses[frame], points.points_camera)
             seen = [
                 _seen(world, pose, lens, walk.clip.color_size) * (pose[:3, 2] @ poses[frame, :3, 2])
                 for pose, lens in zip(self._walked, pinholes[len(clip) :], strict=True)
             ]
             for key in np.argsort(-np.array(seen), kind="stable")[:MATCHED]:
                 if seen[key] > LEAST_SHARED:
-                    other = len(clip) + int(key)
-                    pairs = sift.matches(points[frame].descriptors, points[other].descriptors)
+                    pairs = sift.matches(points.descriptors, walked[key].descriptors)
                     mine, theirs = pairs.T
-                    met = rigid.apply(rigid.inverse(poses[frame]) @ poses[other], local[other][theirs])
-                    off_px = cameras.project(met, pinholes[frame])[0] - pixels[frame][mine]
+                    frame_from_walked = rigid.inverse(poses[frame]) @ self._walked[key]
+                    met = rigid.apply(frame_from_walked, walked[key].points_camera[theirs])
+                    off_px = cameras.project(met, pinholes[frame])[0] - pixel[mine]
                     near = np.linalg.norm(off_px, axis=1) < REACH_SHARE * clip.color_size[1]
-                    near &= np.abs(met[:, 2] - local[frame][mine, 2]) < REACH_M
-                    links.append((frame, other, pairs[near]))
+                    near &= np.abs(met[:, 2] - points.points_camera[mine, 2]) < REACH_M
+                    links.append((frame, len(clip) + int(key), pairs[near]))
+            local.append(points.points_camera)
+        local += [each.points_camera for each in walked]
+        pixels = [cameras.project(each, lens)[0] for each, lens in zip(local, pinholes, strict=True)]
         lens = np.repeat([0, 1], [len(clip), len(known)])
         tracked = chained(pixels, [each[:, 2] for each in local], pinholes, lens, links)
         self._points = PointTerm(tracked, poses)
@@ -85,12 +90,12 @@ class WalkTerm:
         return normal[:size, :size], gradient[:size]
 
 
-def _points(clip, frame, agent=None) -> sift.SiftPoints:
+def _points(clip, frame, most, agent=None) -> sift.SiftPoints:
     """Describe a frame beside the agent."""
     gray, depth = cv2.cvtColor(clip.color(frame), cv2.COLOR_RGB2GRAY), usable_depth(clip, frame)
     free = None if agent is None else cv2.erode((~agent).astype(np.uint8), np.ones((MASK_MARGIN_PX,) * 2))
     lenses = clip.intrinsics[frame], depth, clip.depth_intrinsics[frame]
-    return sift.lift(sift.describe(gray, POINTS, PEAK_THRESHOLD, free), *lenses)
+    return sift.lift(sift.describe(gray, most, PEAK_THRESHOLD, free), *lenses)
 
 
 def _seen(points_world, world_from_camera, intrinsics, size) -> float:

@@ -101,8 +101,7 @@ class Appearance(nn.Module):
     def log_odds(self, color: UInt8[np.ndarray, "height width channel"]) -> Float[np.ndarray, "height width"]:
         """Judge every pixel of a picture at working resolution, within +-8."""
         height, width = color.shape[:2]
-        found = self.eval()(aligned(color))[0, :height, :width]
-        return found.clamp(-LIMIT, LIMIT).numpy()
+        return self.eval()(aligned(color))[0, :height, :width].clamp(-LIMIT, LIMIT).numpy()
 
 
 def learn(

@@ -108,8 +108,7 @@ class Identities(Appearance):
     def who(self, color: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "class height width"]:
         """Return the log-probability of nobody and of each animal for every pixel."""
         height, width = color.shape[:2]
-        found = self.eval().logits(aligned(color))[0, :, :height, :width]
-        return F.log_softmax(found, dim=0).numpy()
+        return F.log_softmax(self.eval().logits(aligned(color))[0, :, :height, :width], dim=0).numpy()
 
     def save(self, folder: Path) -> None:
         """Write `identities.safetensors`, with the names."""

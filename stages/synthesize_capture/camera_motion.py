@@ -47,8 +47,7 @@ def turnaround(course: AnimalCourse, rng: np.random.Generator) -> Cameras:
     height = 0.82 + 0.22 * np.sin(2 * np.pi * 1.4 * share + 2.0)
     center = course.position + np.array([0.0, 0.2, 0.0])
     eye = center * [1, 0, 1] + np.stack([radius * np.sin(angle), height, radius * np.cos(angle)], axis=-1)
-    sideways = 0.04 * _wander(rng, len(share), 0.6)
-    return _handheld(eye, center + sideways, rng, calm=0.8)
+    return _handheld(eye, center + 0.04 * _wander(rng, len(share), 0.6), rng, calm=0.8)
 
 
 def filming(session: SessionTrajectories, rng: np.random.Generator) -> Cameras:
@@ -60,8 +59,7 @@ def filming(session: SessionTrajectories, rng: np.random.Generator) -> Cameras:
     height = rng.uniform(1.28, 1.42) + 0.05 * _wander(rng, len(ground), 2.0)[:, 0]
     ground = ground + ARM_M * toward
     eye = gaussian_filter1d(np.insert(ground, 1, height, axis=1), 0.08 / STEP_S, axis=0)
-    sideways = 0.10 * _wander(rng, len(ground), 0.9)
-    return _handheld(_inside(eye), looks_at + sideways, rng, calm=1.0)
+    return _handheld(_inside(eye), looks_at + 0.10 * _wander(rng, len(ground), 0.9), rng, calm=1.0)
 
 
 def bystanding(session: SessionTrajectories, room: Room, rng: np.random.Generator) -> Cameras:

@@ -35,8 +35,7 @@ def pose_error(
 
 def lever_of(poses: PoseSpace) -> Float[Tensor, "pose channel"]:
     """Return the matrix from p to channels in metres."""
-    scale = torch.tensor([LEVER_M] * 3 + [1.0] * 3).repeat(len(poses.rest))
-    return poses.basis * scale
+    return poses.basis * torch.tensor([LEVER_M] * 3 + [1.0] * 3).repeat(len(poses.rest))
 
 
 def kl_divergence(

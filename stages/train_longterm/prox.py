@@ -165,8 +165,7 @@ def _scene(
         scene = MotionScene.for_motion(Mesh(vertices, np.asarray(scan.faces, np.int32)), roots_world)
     except (ValueError, TypeError, OSError, KeyError, IndexError, AttributeError) as error:
         raise _damaged(f"is no scan ({error!r})", path) from error
-    file = folder / "sdf" / f"{name}_sdf.npy"
-    return replace(scene, known=_distances(file, world_from_scan, scene))
+    return replace(scene, known=_distances(folder / "sdf" / f"{name}_sdf.npy", world_from_scan, scene))
 
 
 def _distances(file: Path, world_from_scan: np.ndarray, scene: MotionScene) -> SignedDistance | None:
