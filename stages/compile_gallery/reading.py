@@ -10,7 +10,7 @@ from typing import Literal
 from PIL import Image
 
 from pipeline.data import qa
-from pipeline.metrics import words
+from pipeline.metrics import bars, words
 
 PICTURES = ("simulator/qa/visits.webp", "simulator/qa/heat_maps.webp", "splats/qa/frames.webp")
 """Pictures that stand for a build, the best first; all of them are in its report."""
@@ -53,7 +53,7 @@ class Card:
     thumbnail: str | None
     """WebP as a data address"""
     status: qa.Status | Literal["none"]
-    """worst status of its finished artifacts; "none" where none reported a check"""
+    """worst of its artifacts' checks and of the report's bars; "none" where no artifact reported a check"""
     figures: tuple[Figure, ...]
     page: Link
     links: tuple[Link, ...]
@@ -63,7 +63,9 @@ def card(folder: Path, root: Path) -> Card:
     """Read the build in `folder`, whose simulator is finished, for a gallery in `root`."""
     contract = json.loads((folder / "simulator/simulator.json").read_bytes())
     files = [*folder.glob("*/qa.json"), *folder.glob("*/*/qa.json")]
-    checks = [check for file in files for check in json.loads(file.read_bytes())["checks"]]
+    states = [check["status"] for file in files for check in json.loads(file.read_bytes())["checks"]]
+    file = folder / "evaluation/metrics.json"
+    metrics = json.loads(file.read_bytes()) if file.is_file() else {}
     pictures = [folder / name for name in PICTURES if (folder / name).is_file()]
     homes = sorted(folder.glob("homes/*/simulator/index.html"))
     pages = [("report", folder / "report/index.html")]
@@ -76,8 +78,8 @@ def card(folder: Path, root: Path) -> Card:
         name=str(contract["name"]),
         folder=folder.relative_to(root).as_posix(),
         thumbnail=_thumbnail(pictures[0]) if pictures else None,
-        status=qa.worst([check["status"] for check in checks]) if checks else "none",
-        figures=(*_checked(folder), *_measured(folder)),
+        status=qa.worst([*states, bars.worst(bars.judge(metrics, {}))]) if states else "none",
+        figures=(*_checked(folder), *_measured(metrics)),
         page=link("walk with it", folder / "simulator/index.html"),
         links=tuple(link(words, page) for words, page in pages if page.is_file()),
     )
@@ -89,11 +91,9 @@ def _checked(folder: Path) -> list[Figure]:
     return [Figure(each["name"], each["value"], each["unit"]) for each in checks if each["name"] in _CHECKS]
 
 
-def _measured(folder: Path) -> list[Figure]:
-    """Return figures from the evaluation, where there is one and it measured them."""
-    file = folder / "evaluation/metrics.json"
-    metrics = json.loads(file.read_bytes()) if file.is_file() else {}
-    known = [(words.describe(key), metrics[key]) for key in METRICS if metrics.get(key) is not None]
+def _measured(metrics: bars.Metrics) -> list[Figure]:
+    """Return figures that the evaluation measured."""
+    known = [(words.describe(key), value) for key in METRICS if (value := metrics.get(key)) is not None]
     return [Figure(found.text, value, found.unit) for found, value in known]
 
 

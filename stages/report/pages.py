@@ -7,7 +7,7 @@ import jinja2
 
 from pipeline.data import qa
 from pipeline.metrics import words as metric_words
-from stages.report.bars import Judged
+from pipeline.metrics.bars import Judged
 from stages.report.chapters import remedy
 from stages.report.collect import ChapterReport
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from pipeline.core.videos import Video
 from pipeline.data import qa
-from stages.report import bars, collect, crate, methods, pages
+from pipeline.metrics import bars
+from stages.report import collect, crate, methods, pages
 from stages.report.chapters import CHAPTERS
 from stages.report.config import Config
 

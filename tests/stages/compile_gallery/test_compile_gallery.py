@@ -35,7 +35,8 @@ def write_build(folder: Path, name: str, goal_m: float | None, megabytes: float)
         (folder / page).mkdir(parents=True)
         (folder / page / "index.html").write_text("page")
     (folder / "evaluation").mkdir()
-    metrics = {"behavior/ats/goal_minde_m": goal_m, "registration/translation_m_median": None}
+    goals = {"behavior/ats/goal_minde_m": goal_m, "behavior/stand_still/goal_minde_m": 0.45}
+    metrics = goals | {"registration/translation_m_median": None}
     (folder / "evaluation/metrics.json").write_text(json.dumps(metrics))
 
 
@@ -53,7 +54,7 @@ def test_a_card_for_every_finished_simulator(tmp_path: Path) -> None:
     assert len(links) == 4 * 4 and all((tmp_path / link).is_file() for link in links)
     assert "0.432 m" in page and "30 MB" in page and "12.3 MB" in page
     lights = re.findall(r'class="light (\w+)"', page)
-    assert lights == ["ok", "ok", "warn", "ok"], "a page of 30 MB is to be looked at"
+    assert lights == ["ok", "fail", "warn", "fail"], "goals behind standing still, a page of 30 MB"
     assert not re.search(r"https?://|src=\"(?!data:)", page), "nothing from the network"
     assert len(page) < 20_000, "thumbnails are small"
 

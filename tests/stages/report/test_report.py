@@ -12,8 +12,9 @@ import pytest
 
 from pipeline.core.videos import Video
 from pipeline.data import images, qa
+from pipeline.metrics import bars
 from pipeline.workflow import artifact, dag
-from stages.report import bars, collect, pages, stage
+from stages.report import collect, pages, stage
 from stages.report.chapters import CHAPTERS, WORDS, remedy
 from stages.report.config import Config
 from tests.stages.export_simulator import browser

@@ -92,7 +92,7 @@ def _judged(bar: Bar, metrics: Metrics, reasons: Mapping[str, str]) -> Judged:
     return Judged(bar, value, limit, "ok" if holds else "fail", "")
 
 
-def worst(judged: Sequence[Judged]) -> str:
+def worst(judged: Sequence[Judged]) -> Literal["ok", "fail"]:
     """Return the light of all bars together; one that could not be measured does not count."""
     return "fail" if any(row.verdict == "fail" for row in judged) else "ok"
 
