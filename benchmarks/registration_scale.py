@@ -62,30 +62,26 @@ class There:
 
 
 @dataclass(frozen=True)
-class ThereMasks:
+class ThereRows:
+    """Features or masks to it, which are read when they are asked for."""
+
+    rows: np.ndarray | Masks
+    order: np.ndarray
+
+    def __getitem__(self, frame: int):
+        return self.rows[int(self.order[frame])]
+
+
+@dataclass(frozen=True)
+class ThereMasks(ThereRows):
     """The masks to it."""
 
-    masks: Masks
-    order: np.ndarray
+    rows: Masks
 
     @property
     def visible(self) -> np.ndarray:
         """Per frame."""
-        return self.masks.visible[self.order]
-
-    def __getitem__(self, frame: int):
-        return self.masks[int(self.order[frame])]
-
-
-@dataclass(frozen=True)
-class ThereRows:
-    """Rows of a table to it, which are read when they are asked for."""
-
-    rows: np.ndarray
-    order: np.ndarray
-
-    def __getitem__(self, frame: int) -> np.ndarray:
-        return self.rows[self.order[frame]]
+        return self.rows.visible[self.order]
 
 
 def forth_and_back(length: int, frames: int) -> Int[np.ndarray, "frame"]:

@@ -39,7 +39,7 @@ def beings(
 ) -> Float[Tensor, "batch other past_frame 10"]:
     """Return what encoders read of an observer's poses and of companions, whose rotations are unknown (0)."""
     first = nn.functional.pad(torch.cat([position, rigid_torch.rotation_to_6d(rotation)], dim=-1), (0, 1))
-    place = companions[..., :3] @ new_from_ego.transpose(-1, -2)[:, None]
+    place = companions[..., :3] @ new_from_ego.mT[:, None]
     unknown = place.new_zeros(*place.shape[:3], POSE_CHANNELS - 3)
     return torch.cat([first[:, None], torch.cat([place, unknown, companions[..., 3:]], dim=-1)], dim=1)
 

@@ -185,11 +185,9 @@ class MapAttention(nn.Module):
         variance: Float[Tensor, "draw 1"],
         code_channels: Float[Tensor, "member draw code"],
         maps: Float[Tensor, "batch member map"],
-        draws: int,
+        draws: int,  # noisy goals of each of the batch
     ) -> Float[Tensor, "member draw 44"]:
-        """Return what each head reads, where it looks on average, and how far that is from the noisy goal;
-        a batch has ``draws`` goals each.
-        """
+        """Return what each head reads, where it looks on average, and how far that is from the noisy goal."""
         key, value = maps.transpose(0, 1).unflatten(-1, (2, MAP_KEY_CHANNELS, -1)).unbind(2)
         scaled = self.power / self.goal_std[::2]
         cells = torch.cat([self.place, scaled, scaled.square().sum(-1, keepdim=True)], dim=-1)

@@ -56,6 +56,10 @@ class Correspondences:
         """Return some of the matches."""
         return Correspondences(*(getattr(self, field.name)[matches] for field in fields(self)))
 
+    def inflated(self, factor: float) -> "Correspondences":
+        """Multiply the deviations."""
+        return replace(self, sigma_m=factor * self.sigma_m)
+
 
 @dataclass(frozen=True)
 class RelativePoseFactors:

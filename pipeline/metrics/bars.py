@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 Verdict = Literal["ok", "fail", "none"]
-Metrics = Mapping[str, float | None]
 RIVALS = (
     ("location_prior", "the location prior"),
     ("stand_still", "standing still"),
@@ -75,12 +74,12 @@ BARS = (
 )  # fmt: skip
 
 
-def judge(metrics: Metrics, reasons: Mapping[str, str]) -> list[Judged]:
+def judge(metrics: Mapping[str, float | None], reasons: Mapping[str, str]) -> list[Judged]:
     """Compare every bar with its metric."""
     return [_judged(bar, metrics, reasons) for bar in BARS]
 
 
-def _judged(bar: Bar, metrics: Metrics, reasons: Mapping[str, str]) -> Judged:
+def _judged(bar: Bar, metrics: Mapping[str, float | None], reasons: Mapping[str, str]) -> Judged:
     value, limit = _known(metrics.get(bar.metric)), bar.limit
     if isinstance(limit, str):
         other = _known(metrics.get(limit))
@@ -97,7 +96,7 @@ def worst(judged: Sequence[Judged]) -> Literal["ok", "fail"]:
     return "fail" if any(row.verdict == "fail" for row in judged) else "ok"
 
 
-def grouped(metrics: Metrics) -> dict[str, dict[str, float | None]]:
+def grouped(metrics: Mapping[str, float | None]) -> dict[str, dict[str, float | None]]:
     """Sort metrics by the first part of their names."""
     groups: dict[str, dict[str, float | None]] = {}
     for name, value in sorted(metrics.items()):

@@ -5,7 +5,7 @@ between neighbours count by measured variances: points by their reprojection err
 far they contradict cameras from points.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -122,8 +122,7 @@ def refine_keyframes(
     pairs = overlapping(poses, keyframes, config.neighbours)
 
     def find(poses, reach_m):
-        found = depth_correspondences(keyframes, pairs, poses, reach_m)
-        return replace(found, sigma_m=inflation * found.sigma_m)
+        return depth_correspondences(keyframes, pairs, poses, reach_m).inflated(inflation)
 
     if len(tracked.camera):
         term, inflation, reach = PointTerm(tracked, poses), FIRST_INFLATION, (REACH_M[0],) * FIRST_ROUNDS

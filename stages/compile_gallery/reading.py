@@ -91,7 +91,7 @@ def _checked(folder: Path) -> list[Figure]:
     return [Figure(each["name"], each["value"], each["unit"]) for each in checks if each["name"] in _CHECKS]
 
 
-def _measured(metrics: bars.Metrics) -> list[Figure]:
+def _measured(metrics: dict[str, float | None]) -> list[Figure]:
     """Return figures that the evaluation measured."""
     known = [(words.describe(key), value) for key in METRICS if (value := metrics.get(key)) is not None]
     return [Figure(found.text, value, found.unit) for found, value in known]

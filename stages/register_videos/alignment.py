@@ -113,9 +113,7 @@ def align(
     if walk is not None:
         points = WalkTerm(clip, masks, poses, walk)
         poses = optimize_poses(poses, find, odometry, reach_m=2 * last, term=points).world_from_camera
-    for _ in range(FEATURE_PASSES if config.feature_every_frames else 0):
-        if features is None:
-            break
+    for _ in range(FEATURE_PASSES if features is not None and config.feature_every_frames else 0):
         chosen = frames[:: config.feature_every_frames]
         by_features[:] = _ties(feature_correspondences, "features", clip, masks, features, chosen, poses)
         poses = optimize_poses(poses, find, odometry, reach_m=last, term=points).world_from_camera

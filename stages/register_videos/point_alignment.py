@@ -55,7 +55,7 @@ class WalkTerm:
         pinholes = np.concatenate([clip.intrinsics, walk.clip.intrinsics[known]])
         walked = [_points(walk.clip, int(frame), POINTS) for frame in known]
         most = min(POINTS, max(MOST_POINTS // len(clip), LEAST_POINTS))
-        local, links = [], []
+        pixels, depths, links = [], [], []
         for frame in track(range(len(clip)), "points"):
             points = _points(clip, frame, most, masks[frame] > 0)
             pixel = cameras.project(points.points_camera, pinholes[frame])[0]
@@ -74,11 +74,13 @@ class WalkTerm:
                     near = np.linalg.norm(off_px, axis=1) < REACH_SHARE * clip.color_size[1]
                     near &= np.abs(met[:, 2] - points.points_camera[mine, 2]) < REACH_M
                     links.append((frame, len(clip) + int(key), pairs[near]))
-            local.append(points.points_camera)
-        local += [each.points_camera for each in walked]
-        pixels = [cameras.project(each, lens)[0] for each, lens in zip(local, pinholes, strict=True)]
+            pixels.append(pixel)
+            depths.append(points.points_camera[:, 2])
+        for each, lens in zip(walked, pinholes[len(clip) :], strict=True):
+            pixels.append(cameras.project(each.points_camera, lens)[0])
+            depths.append(each.points_camera[:, 2])
         lens = np.repeat([0, 1], [len(clip), len(known)])
-        tracked = chained(pixels, [each[:, 2] for each in local], pinholes, lens, links)
+        tracked = chained(pixels, depths, pinholes, lens, links)
         self._points = PointTerm(tracked, poses)
 
     def normal_equations(

@@ -129,7 +129,5 @@ def test_contradictions_are_measured_in_deviations():
     factor = pose_optimization.variance_factor(np.concatenate(squares))
     assert 0.85 < factor < 1.15, "deviations are those assumed"
     assert pose_optimization.variance_factor(
-        pose_optimization.chi_squares(
-            truth, dataclasses.replace(noisy, sigma_m=2 * noisy.sigma_m), exact.first, 1.0
-        )
+        pose_optimization.chi_squares(truth, noisy.inflated(2.0), exact.first, 1.0)
     ) == pytest.approx(np.median(squares[-1]) / 4 / pose_optimization.MEDIAN_CHI_SQUARE, rel=1e-3)
