@@ -33,7 +33,7 @@ WINDOW_PX = 36
 """side of what a descriptor sees, reduced pixels; that of DAISY"""
 SURFACE_M = 0.05
 """depths that agree within it show the same surface"""
-LEAST_CELLS = 150
+MIN_CELLS = 150
 Describe = Callable[[UInt8[np.ndarray, "height width 3"], int], Float[np.ndarray, "rows columns channel"]]
 
 
@@ -118,7 +118,7 @@ def paired(first: View, second: View) -> Pair | None:
     )
     seen = (z > 0) & (distance > 0.1)
     seen &= np.abs(second.depth_at(np.where(seen[:, None], target, -1)) - distance) < SURFACE_M
-    return Pair(first, second, np.flatnonzero(seen), target[seen]) if seen.sum() >= LEAST_CELLS else None
+    return Pair(first, second, np.flatnonzero(seen), target[seen]) if seen.sum() >= MIN_CELLS else None
 
 
 def drawn(

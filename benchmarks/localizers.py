@@ -177,7 +177,7 @@ def main() -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     settings = tuple(
-        setting for setting in SETTINGS if setting.steps <= given.most_steps and setting.kind in given.kinds
+        setting for setting in SETTINGS if setting.steps <= given.max_steps and setting.kind in given.kinds
     )
     for line in rows(given.build / given.agent, given.queries, given.frames, settings):
         print(line, flush=True)

@@ -32,7 +32,7 @@ from stages.read_trajectories import tables
 from tests.pipeline.recordings import made_formats
 from tests.stages.extract_frames.made_recordings import walk
 
-MOST_S, MOST_KB = 20, 2 << 20
+MAX_S, MAX_KB = 20, 2 << 20
 KEPT = Path("build", "fuzz")
 RESET, STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
 HOSTILE = (
@@ -217,7 +217,7 @@ def _failure(reader: Reader, path: Path) -> str | None:
     time.
     """
     RESET.write_text("5")  # the peak of memory begins anew
-    signal.alarm(MOST_S)
+    signal.alarm(MAX_S)
     try:
         reader.read(path)
     except InputError:
@@ -227,7 +227,7 @@ def _failure(reader: Reader, path: Path) -> str | None:
     finally:
         signal.alarm(0)
     peak_kb = int(re.search(r"VmHWM:\s+(\d+)", STATUS.read_text())[1])
-    return f"{peak_kb} kB of memory" if peak_kb > MOST_KB else None
+    return f"{peak_kb} kB of memory" if peak_kb > MAX_KB else None
 
 
 def _keep(path: Path, folder: Path, why: str) -> None:
@@ -239,7 +239,7 @@ def _keep(path: Path, folder: Path, why: str) -> None:
 
 
 def _expired(*_: object) -> None:
-    raise TimeoutError(f"longer than {MOST_S} s")
+    raise TimeoutError(f"longer than {MAX_S} s")
 
 
 def main(arguments: list[str]) -> int:

@@ -16,7 +16,7 @@ PAST, FUTURE = 8, 12
 """steps of the protocol (Alahi et al. 2016)"""
 HEADING_M = 0.2
 """Shortest way that defines a heading: positions err by centimetres."""
-LEAST_PEOPLE = 2
+MIN_PEOPLE = 2
 """People who must be there throughout a window for the protocol of SGAN to count it (Gupta et al. 2018)."""
 
 
@@ -60,7 +60,7 @@ class Crowd:
     def accompanied(self, walks: list[Walk]) -> Bool[np.ndarray, "walk"]:
         """Return through which windows others walk as well."""
         start = np.array([walk.start for walk in walks], int)
-        return np.bincount(start, minlength=1)[start] >= LEAST_PEOPLE
+        return np.bincount(start, minlength=1)[start] >= MIN_PEOPLE
 
     def heading(self, person: int) -> Float[np.ndarray, "step"]:
         """Return where somebody heads, radians about +y from +z, from no later step than the one at hand.

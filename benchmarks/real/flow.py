@@ -36,7 +36,7 @@ RIVALS = ("OpenCV DIS", "OpenCV Farneback")
 SHARES = (0.2, 0.1, 0.05)
 FARNEBACK = (0.5, 5, 15, 3, 7, 1.5, 0)
 """Ratio of the pyramid, its levels, window, iterations, neighbourhood and smoothing of the polynomial, flags."""
-LEAST_CONFIDENCE = 1 / 255
+MIN_CONFIDENCE = 1 / 255
 """what a stored 0 counts, that paths through it still differ"""
 
 
@@ -65,7 +65,7 @@ def most_certain(step: CertainStep) -> Carry:
                 flow, confidence = step(before, frame)
                 at = place[before]
                 ends.append(at + sampled(flow, at))
-                products.append(certainty[before] * np.maximum(sampled(confidence, at), LEAST_CONFIDENCE))
+                products.append(certainty[before] * np.maximum(sampled(confidence, at), MIN_CONFIDENCE))
             best, each = np.argmax(products, axis=0), np.arange(len(points))
             place[frame], certainty[frame] = np.array(ends)[best, each], np.array(products)[best, each]
         return place[last]

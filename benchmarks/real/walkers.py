@@ -73,7 +73,7 @@ SAMPLING = PlanSamplingConfig(
 """Goals keep the spread that the posterior's variance loses; a path is the mean of those that lead to its goal,
 for noise adds sway that no goal asks for. See `docs/real_benchmark.md`."""
 WINDOWS_AT_ONCE = 512
-MOST_WINDOWS = 2000
+MAX_WINDOWS = 2000
 """Windows that are judged of a scene at most, evenly chosen."""
 
 
@@ -198,7 +198,7 @@ def measured(scene: Path, folder: Path, seeds: int) -> dict[str, dict[str, float
             crowds(scene / "train"), crowds(scene / "test"), folder.parent / "trajectories", folder
         )
         windows = fold.forecast_windows()
-        some = windows[:: -(-len(windows) // MOST_WINDOWS)]
+        some = windows[:: -(-len(windows) // MAX_WINDOWS)]
         accompanied = np.array([window.accompanied for window in some])
         context, future = fold.data.windows(np.array([window.number for window in some]))
         others = others_of(fold, some)

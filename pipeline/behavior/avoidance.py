@@ -11,7 +11,7 @@ UNKNOWN_REACH_M = 0.28
 """From the root to the muzzle of an animal without bones ahead of its root: a cat's."""
 HURRY = 1.5
 """How much longer than planned a step may be that makes up for a detour."""
-LEAST_STEP_M = 0.04
+MIN_STEP_M = 0.04
 """A step that is led around somebody is at least this long: 0.4 m/s at 10 Hz, a walk."""
 
 Points = Float[np.ndarray, "plan 3"]
@@ -43,7 +43,7 @@ def around_person(
     reach = np.minimum(clearance_m, np.linalg.norm(start_world[:, level] - person, axis=1))
     here, before, clear_path = np.array(start_world, float), start_world, []
     for wish in np.moveaxis(path_world, 1, 0):
-        step = np.maximum(LEAST_STEP_M, HURRY * np.linalg.norm((wish - before)[:, level], axis=1))
+        step = np.maximum(MIN_STEP_M, HURRY * np.linalg.norm((wish - before)[:, level], axis=1))
         before = wish
         gap = np.linalg.norm((wish - here)[:, level], axis=1)
         share = np.where(gap > step, step / np.maximum(gap, 1e-12), 1.0)[:, None]

@@ -26,7 +26,7 @@ NoiseCourse = Literal["linear", "rectified"]
 SamplingMethod = Literal["ddpm", "ddpm_large", "ddim"]
 """DDPM adds noise of the posterior's variance at each step, or of the larger one of the forward step (both of
 Ho et al. 2020, Sec. 3.2), which keeps the spread that few steps of the former lose; DDIM adds none."""
-MOST_GUIDANCE = 2.0
+MAX_GUIDANCE = 2.0
 """Largest scale that sliders offer: goals err more from there on."""
 
 

@@ -19,7 +19,7 @@ APPROACH_SCALE = 1.5
 """of approach speeds, at most 2 m/s, among the features: they then have the range of distances, +-3"""
 HEADS = 4
 """attention weights of a being, each for its part of the code"""
-LEAST_WEIGHT = 1e-6
+MIN_WEIGHT = 1e-6
 """of somebody beyond the radius, so that weights can be normalised where nobody is near"""
 
 
@@ -70,7 +70,7 @@ class SetEncoder(nn.Module):
         codes = self.layers[1:](hidden)
         if codes.shape[1] == 1:
             return codes[:, 0]
-        weight = (codes @ self.attention.transpose(-1, -2) + (inside + LEAST_WEIGHT).log()).softmax(1)
+        weight = (codes @ self.attention.transpose(-1, -2) + (inside + MIN_WEIGHT).log()).softmax(1)
         return (codes.unflatten(-1, (HEADS, -1)) * weight[..., None]).sum(1).flatten(1)
 
 

@@ -124,7 +124,7 @@ class RestLikelihood(nn.Module):
     SPREADS = (0.0, 0.05, 0.2, 0.6)
     """standard deviations of goals that count as staying, in scaled units"""
     NUMBERS = 5 * len(SPREADS)
-    LEAST, MOST = -4.0, 5.0
+    MIN, MAX = -4.0, 5.0
     """bounds of its outputs"""
     spread: Tensor
 
@@ -138,8 +138,8 @@ class RestLikelihood(nn.Module):
         """Return likelihoods (not normalised), their logarithms, and where the goal would be expected."""
         odds = -mean.square().sum(-1, keepdim=True) / (2 * (variance + self.spread))
         shrunk = mean[:, None] * (odds.exp() * self.spread / (variance + self.spread))[..., None]
-        likelihood, logarithm = odds.exp(), (odds / 5).clamp_min(self.LEAST)
-        return torch.cat([likelihood, logarithm, shrunk.flatten(1).clamp(-self.MOST, self.MOST)], dim=-1)
+        likelihood, logarithm = odds.exp(), (odds / 5).clamp_min(self.MIN)
+        return torch.cat([likelihood, logarithm, shrunk.flatten(1).clamp(-self.MAX, self.MAX)], dim=-1)
 
 
 class MapAttention(nn.Module):

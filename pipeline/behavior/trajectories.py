@@ -26,7 +26,7 @@ KINDS = ("person", "animal")
 """what the last of the four numbers of a companion counts; the first three are its position"""
 ABSENT_M = 1000.0
 """where somebody is put of whom nothing is known, metres"""
-MOST_COMPANIONS = 15
+MAX_COMPANIONS = 15
 """companions that are perceived at most, the nearest ones: more hardly fit into the radius, and crowds would
 not fit into memory"""
 WINDOWS_AT_ONCE = 8192
@@ -263,7 +263,7 @@ def nearest(
     """
     level = [0, 2]
     distance = np.linalg.norm(companions[:, :, -1, level] - agent[:, None, level], axis=-1)
-    count = min(int(np.isfinite(distance).sum(1).max(initial=0)), MOST_COMPANIONS)
+    count = min(int(np.isfinite(distance).sum(1).max(initial=0)), MAX_COMPANIONS)
     order = np.argsort(np.nan_to_num(distance, nan=np.inf), axis=1, kind="stable")[:, :count]
     some = np.take_along_axis(companions, order[..., None, None], axis=1)
     for frame in range(some.shape[2] - 2, -1, -1):

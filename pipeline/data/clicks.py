@@ -21,7 +21,7 @@ from pipeline.geometry import align, cameras, rigid
 
 WANTED = 7
 """pairs per frame, as in the paper"""
-LEAST = 4
+MIN = 4
 """pairs per frame below which nothing is fitted"""
 MAX_BYTES = 8 << 20
 MAX_FRAMES = 1 << 31
@@ -109,7 +109,7 @@ def fit(
         if mine is not None and theirs is not None and np.isfinite(world_from_reference[frame]).all():
             camera[row], world[row] = mine, rigid.apply(world_from_reference[frame], theirs[None])[0]
     known = np.isfinite(camera).all(1)
-    if known.sum() < LEAST:
+    if known.sum() < MIN:
         return None
     world_from_camera = align.kabsch(camera[known], world[known])
     return ClickFit(world_from_camera, np.linalg.norm(rigid.apply(world_from_camera, camera) - world, axis=1))

@@ -49,7 +49,7 @@ CLIP_KEYS = (
 )  # fmt: skip
 """what `Clip` holds of `frames.npz`"""
 
-LEAST_CONFIDENCE = 1
+MIN_CONFIDENCE = 1
 """depth of less confidence is not used: 0 is what a phone itself calls low"""
 STEP_SHARE = 0.25
 """range of depth over 3 x 3 pixels, as a share of the depth, from which on a pixel lies at a step"""
@@ -173,7 +173,7 @@ def usable_depth(
     depth steps, where a sensor averages two surfaces into flying pixels.
     """
     depth = clip.depth(frame)
-    usable = (clip.confidence(frame) >= LEAST_CONFIDENCE) & (depth >= nearest_m) & (depth <= farthest_m)
+    usable = (clip.confidence(frame) >= MIN_CONFIDENCE) & (depth >= nearest_m) & (depth <= farthest_m)
     if not keep_steps:
         around = np.ones((3, 3), np.uint8)
         low = cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), around)

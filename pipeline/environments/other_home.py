@@ -39,7 +39,7 @@ APART_M = 0.5
 itself."""
 KNOWN_PERCENT = 95.0
 """Percent of the known home's own cells that count as known, judged by its cells elsewhere."""
-MOST_CELLS = 4000
+MAX_CELLS = 4000
 """Surface cells of a home that are compared, evenly chosen."""
 
 
@@ -183,7 +183,7 @@ def _surface(home: ReconstructedHome) -> tuple[Float[np.ndarray, "cell 17"], Flo
     volume = home.volume
     length = np.linalg.norm(volume.features.astype(np.float32), axis=0)
     index = np.argwhere((volume.occupancy == 1) & (length > 0))
-    index = index[subsampling.evenly(len(index), MOST_CELLS)]
+    index = index[subsampling.evenly(len(index), MAX_CELLS)]
     at = tuple(index.T)
     place = volume.origin + (index + 0.5) * volume.voxel_m
     look = volume.features[(slice(None), *at)].astype(np.float32) / length[at]

@@ -36,7 +36,7 @@ START_SATURATION = 0.9
 """share of the truncation that an untrained distance stays below: at 1 its tanh has no gradient"""
 START_LOG_BETA = -5.1
 """of fields supervised by distances: the upper end of the range"""
-LEAST_FEATURE = 1e-4
+MIN_FEATURE = 1e-4
 """shorter features are not brought to unit length: their gradient would explode"""
 CODE_STD = 0.1
 """standard deviation of untrained codes"""
@@ -44,7 +44,7 @@ LATTICE_M = 0.05
 """resolution at which a learned scene is extracted, below its finest cell"""
 CORRECTION_M = 0.1
 """cells of the learned correction of skinning weights"""
-LEAST_PROBABILITY = 0.02
+MIN_PROBABILITY = 0.02
 """fused colors are kept this far from 0 and 1 for their logit"""
 
 
@@ -179,8 +179,8 @@ class Field(nn.Module):
         encoded = encoded[:, :-1] if self.shape.starts_as_box else encoded
         color, feature = self.appearance(encoded).split([3, FEATURE_CHANNELS], dim=-1)
         if self.fused:
-            color = color + encoded[:, 1 - FUSED_CHANNELS : -1].logit(LEAST_PROBABILITY)
-        return color.sigmoid(), functional.normalize(feature, dim=-1, eps=LEAST_FEATURE)
+            color = color + encoded[:, 1 - FUSED_CHANNELS : -1].logit(MIN_PROBABILITY)
+        return color.sigmoid(), functional.normalize(feature, dim=-1, eps=MIN_FEATURE)
 
     def forward(
         self,
@@ -209,14 +209,14 @@ class Field(nn.Module):
         return self.log_beta.exp().clamp(*(START_RANGE_M if self.shape.starts_as_box else SOFTNESS_M))
 
     def density(
-        self, signed_distance: Float[Tensor, "*point"], least_beta_m: float = 0.0
+        self, signed_distance: Float[Tensor, "*point"], min_beta_m: float = 0.0
     ) -> Float[Tensor, "*point"]:
         """Return the density of its signed distances, per metre; saturated ones are free.
 
         A first pass of importance sampling asks for a beta of at least half the spacing of its samples, so
         that no surface is lost between two of them.
         """
-        return density(signed_distance, self.beta_m.clamp_min(least_beta_m), self.shape.truncation_m)
+        return density(signed_distance, self.beta_m.clamp_min(min_beta_m), self.shape.truncation_m)
 
 
 def _head(inputs: int, width: int, outputs: int) -> tuple[nn.Sequential, nn.Linear]:

@@ -9,7 +9,7 @@ BLUR_PX2 = 0.3
 """added to the variance of every footprint, so that none falls between pixels"""
 NEAREST_M = 0.1
 """Gaussians nearer than this to the camera are not drawn"""
-ALPHA_LEAST, ALPHA_MOST = 1 / 255, 0.99
+ALPHA_MIN, ALPHA_MAX = 1 / 255, 0.99
 """opacities below the first are not drawn, those above the second are held there (Kerbl et al. 2023)"""
 REACH = 3.33
 """footprints end at this many standard deviations, where 0.99 has fallen to 1/255"""

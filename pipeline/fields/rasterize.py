@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.fields.footprints import ALPHA_LEAST, ALPHA_MOST, BLUR_PX2, NEAREST_M, REACH, Footprints
+from pipeline.fields.footprints import ALPHA_MAX, ALPHA_MIN, BLUR_PX2, NEAREST_M, REACH, Footprints
 from pipeline.geometry import rigid_torch
 
 Backend = Literal["tiles", "dense", "gsplat"]
@@ -85,8 +85,8 @@ def blend_dense(
     dx, dy = across.unbind(-1)
     a, b, c = (part[:, None, None] for part in footprints.conic[order].unbind(-1))
     energy = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-    alpha = (opacity[order][:, None, None] * torch.exp(-energy)).clamp_max(ALPHA_MOST)
-    alpha = torch.where((alpha < ALPHA_LEAST) | (energy > 0.5 * REACH**2), torch.zeros_like(alpha), alpha)
+    alpha = (opacity[order][:, None, None] * torch.exp(-energy)).clamp_max(ALPHA_MAX)
+    alpha = torch.where((alpha < ALPHA_MIN) | (energy > 0.5 * REACH**2), torch.zeros_like(alpha), alpha)
     through = torch.cumprod(1 - alpha, dim=0)
     weight = alpha * torch.cat([torch.ones_like(through[:1]), through[:-1]])
     return torch.einsum("phw,pc->hwc", weight, values[order]), weight.sum(0)

@@ -12,13 +12,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.fields.footprints import ALPHA_LEAST, ALPHA_MOST, NEAREST_M, REACH, Footprints
+from pipeline.fields.footprints import ALPHA_MAX, ALPHA_MIN, NEAREST_M, REACH, Footprints
 
 TILE = 8
 PARTS = 4
 """buffers of gradients; tiles are dealt to them in turn"""
-THROUGH_LEAST = np.float32(1e-4)
-_LEAST, _MOST, _ENERGY = np.float32(ALPHA_LEAST), np.float32(ALPHA_MOST), np.float32(0.5 * REACH**2)
+THROUGH_MIN = np.float32(1e-4)
+_MIN, _MAX, _ENERGY = np.float32(ALPHA_MIN), np.float32(ALPHA_MAX), np.float32(0.5 * REACH**2)
 _HALF, _ONE = np.float32(0.5), np.float32(1.0)
 
 
@@ -56,9 +56,9 @@ def _alpha(pixel, conic, opacity, i, x, y):
     if energy > _ENERGY or energy < 0:
         return np.float32(0), np.float32(0), dx, dy
     raw = opacity[i] * np.float32(math.exp(-energy))
-    if raw < _LEAST:
+    if raw < _MIN:
         return np.float32(0), raw, dx, dy
-    return min(_MOST, raw), raw, dx, dy
+    return min(_MAX, raw), raw, dx, dy
 
 
 @numba.njit(cache=True, parallel=True)
@@ -83,7 +83,7 @@ def _forward(pixel, conic, opacity, values, start, ids, height, width):
                         image[row, column, channel] += alpha * left_over * values[i, channel]
                     left_over *= _ONE - alpha
                     end = k + 1
-                    if left_over < THROUGH_LEAST:
+                    if left_over < THROUGH_MIN:
                         break
                 through[row, column] = left_over
                 last[row, column] = end
@@ -124,7 +124,7 @@ def _backward(pixel, conic, opacity, values, start, ids, through, last, grad_ima
                                 left_over * values[i, channel] - behind[channel] / (_ONE - alpha)
                             ) * upstream
                             behind[channel] += weight * values[i, channel]
-                        if raw < _MOST:
+                        if raw < _MAX:
                             grads[part, i, 5] += slope * raw / opacity[i]
                             pull = -slope * raw
                             grads[part, i, 0] -= pull * (conic[i, 0] * dx + conic[i, 1] * dy)

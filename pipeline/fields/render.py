@@ -18,9 +18,9 @@ from pipeline.fields.fields import Field, Reconstruction, Values
 from pipeline.geometry import cameras, rigid_torch
 from pipeline.geometry.meshes import Mesh, RayCaster
 
-LEAST_OPACITY = 0.5
+MIN_OPACITY = 0.5
 """rendered depth is known where the fields are at least this opaque"""
-LEAST_TOTAL = 1e-4
+MIN_TOTAL = 1e-4
 """opacity below which depth is not divided by it: keeps the quotient finite"""
 RAYS_AT_ONCE = 4096
 """rays rendered together, for memory"""
@@ -40,19 +40,19 @@ class Layer:
     feature: Float[Tensor, "ray sample 16"]
 
     @classmethod
-    def of(cls, field: Field, values: Values, shape: tuple[int, ...], least_beta_m: float = 0.0) -> "Layer":
-        """Lay out what a field holds at samples; `Field.density` explains ``least_beta_m``."""
-        density = field.density(values.signed_distance, least_beta_m).view(shape)
+    def of(cls, field: Field, values: Values, shape: tuple[int, ...], min_beta_m: float = 0.0) -> "Layer":
+        """Lay out what a field holds at samples; `Field.density` explains ``min_beta_m``."""
+        density = field.density(values.signed_distance, min_beta_m).view(shape)
         return cls(density, values.color.view(*shape, 3), values.feature.view(*shape, -1))
 
     @classmethod
     def of_agent(
-        cls, field: Field, rest: Float[Tensor, "*batch 3"], shape: tuple[int, ...], least_beta_m: float = 0.0
+        cls, field: Field, rest: Float[Tensor, "*batch 3"], shape: tuple[int, ...], min_beta_m: float = 0.0
     ) -> "Layer":
         """Evaluate the agent's field at samples in the rest shape; it is empty outside its box."""
         low, high = (rest.new_tensor(corner) for corner in (field.shape.low_m, field.shape.high_m))
         inside = ((rest > low) & (rest < high)).all(-1).view(shape)
-        layer = cls.of(field, field(rest.reshape(-1, 3)), shape, least_beta_m)
+        layer = cls.of(field, field(rest.reshape(-1, 3)), shape, min_beta_m)
         return replace(layer, density=layer.density * inside)
 
 
@@ -140,7 +140,7 @@ def composite(
         feature = feature + share[..., None] * (agent.feature - feature)
     weight = ray_weights(depth_m, length, density)
     opacity = weight.sum(-1)
-    depth = (weight * depth_m).sum(-1) / opacity.clamp_min(LEAST_TOTAL)
+    depth = (weight * depth_m).sum(-1) / opacity.clamp_min(MIN_TOTAL)
     color, feature = ((weight[..., None] * values).sum(-2) for values in (color, feature))
     return Rendered(color, feature, depth, (weight * share).sum(-1), opacity, weight, share)
 
@@ -165,7 +165,7 @@ def render_depth(
     importance samples are composited. Without the agent's pose the scene alone is rendered.
 
     Returns:
-        Expected z in metres (0 where the fields are less opaque than `LEAST_OPACITY`), and the agent's
+        Expected z in metres (0 where the fields are less opaque than `MIN_OPACITY`), and the agent's
         opacity, 0..1.
     """
     device = reconstruction.scene.log_beta.device
@@ -192,7 +192,7 @@ def render_depth(
         fine = importance_depths(depth, length, both)
         depth = torch.cat([depth, fine], dim=1).sort(dim=1).values
         rendered = composite(depth, length, *rays.layers(depth))
-        depths.append(torch.where(rendered.opacity >= LEAST_OPACITY, rendered.depth, 0))
+        depths.append(torch.where(rendered.opacity >= MIN_OPACITY, rendered.depth, 0))
         agents.append(rendered.agent)
     depth_map, agent_map = (torch.cat(part).view(height, width).cpu().numpy() for part in (depths, agents))
     return depth_map, agent_map
@@ -211,19 +211,19 @@ class _PosedRays:
     """agent from camera, and agent from bones"""
 
     def layers(
-        self, depth: Float[Tensor, "ray sample"], least_beta_m: float = 0.0
+        self, depth: Float[Tensor, "ray sample"], min_beta_m: float = 0.0
     ) -> tuple[Layer, Layer | None]:
         """Evaluate scene and posed agent at samples, z in metres; `Field.density` explains the least beta."""
         scene, agent, body = self.reconstruction.scene, self.reconstruction.agent, self.reconstruction.body
         points_camera = (self.direction[:, None] * depth[..., None]).reshape(-1, 3)
         world = rigid_torch.apply(self.world_from_camera, points_camera)
         values = scene(world, torch.full((len(world),), self.code, device=world.device))
-        scene_layer = Layer.of(scene, values, depth.shape, least_beta_m)
+        scene_layer = Layer.of(scene, values, depth.shape, min_beta_m)
         if self.agent_pose is None:
             return scene_layer, None
         agent_from_camera, bones = self.agent_pose
         rest = body.unpose(rigid_torch.apply(agent_from_camera, points_camera)[None], bones[None])[0]
-        return scene_layer, Layer.of_agent(agent, rest, depth.shape, least_beta_m)
+        return scene_layer, Layer.of_agent(agent, rest, depth.shape, min_beta_m)
 
 
 @dataclass(frozen=True)

@@ -44,12 +44,12 @@ def ransac_rigid(
     iterations: int,
     rng: np.random.Generator,
     weights: Float[np.ndarray, "point"] | None = None,
-    least_side_m: float = 0.2,
+    min_side_m: float = 0.2,
 ) -> tuple[Float[np.ndarray, "4 4"], Bool[np.ndarray, "point"]]:
     """Return ``target_from_source`` and its inliers among correspondences of which many are wrong.
 
     Triplets are drawn by weight; those whose side lengths disagree or whose sides are shorter than
-    ``least_side_m`` are dropped before the closed form. The best hypothesis minimises the truncated distance
+    ``min_side_m`` are dropped before the closed form. The best hypothesis minimises the truncated distance
     and is refitted on its inliers. With fewer than 3 points the identity and no inliers are returned.
     """
     count = len(source)
@@ -60,7 +60,7 @@ def ransac_rigid(
     sides_source = np.linalg.norm(source[triplets] - source[np.roll(triplets, 1, axis=1)], axis=-1)
     sides_target = np.linalg.norm(target[triplets] - target[np.roll(triplets, 1, axis=1)], axis=-1)
     plausible = (np.abs(sides_source - sides_target).max(1) < SIDE_TOLERANCE * threshold_m) & (
-        sides_source.min(1) > least_side_m
+        sides_source.min(1) > min_side_m
     )
     if plausible.sum() < 4:
         plausible = sides_source.min(1) > 0

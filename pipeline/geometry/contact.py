@@ -18,7 +18,7 @@ LEVEL_COSINE = 0.8
 """Surface that carries is level above this cosine of its slope."""
 BORDER_PX = 2
 """A mask that comes so near to the picture's lower border may go on beyond it, pixels."""
-LEAST_AREA_PX = 12
+MIN_AREA_PX = 12
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ def find(
 ) -> Contact | None:
     """Find where the lowest pixels of a mask touch the surface; None where they meet none."""
     rows, columns = np.nonzero(mask)
-    if len(rows) < LEAST_AREA_PX:
+    if len(rows) < MIN_AREA_PX:
         return None
     lowest = float(np.quantile(rows, 1 - LOWEST_SHARE))
     pixel = np.array([np.median(columns[rows >= lowest]) + 0.5, lowest + 1.0])
@@ -81,10 +81,10 @@ def depth_of(
 
 
 def between(
-    timestamp_s: Float[np.ndarray, "frame"], found: list[Contact | None], most_s: float
+    timestamp_s: Float[np.ndarray, "frame"], found: list[Contact | None], max_s: float
 ) -> Float[np.ndarray, "frame 3"]:
     """Return the contact of each frame; where it is not certain, one interpolated between certain ones at
-    most ``most_s`` away, NaN where there is none."""
+    most ``max_s`` away, NaN where there is none."""
     certain = np.array([frame for frame, each in enumerate(found) if each is not None and each.certain], int)
     points = np.full((len(found), 3), np.nan)
     if not len(certain):
@@ -92,5 +92,5 @@ def between(
     known = np.stack([found[frame].point_world for frame in certain])
     for axis in range(3):
         points[:, axis] = np.interp(timestamp_s, timestamp_s[certain], known[:, axis])
-    points[np.abs(timestamp_s[:, None] - timestamp_s[certain]).min(1) > most_s] = np.nan
+    points[np.abs(timestamp_s[:, None] - timestamp_s[certain]).min(1) > max_s] = np.nan
     return points

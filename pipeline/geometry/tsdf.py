@@ -64,9 +64,9 @@ class Volume:
             self.truncation_m,
         )
 
-    def surface(self, least_weight: float) -> Mesh:
+    def surface(self, min_weight: float) -> Mesh:
         """Extract the zero crossing between voxels seen often enough; what was never seen stays open."""
-        seen = self.weight > least_weight
+        seen = self.weight > min_weight
         if not seen.any() or self.distance[seen].min() > 0:
             return Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8))
         vertices, faces, _, _ = measure.marching_cubes(

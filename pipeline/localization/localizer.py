@@ -31,9 +31,9 @@ from pipeline.localization.patches import (
 
 Net = TypeVar("Net", bound=nn.Module)
 Kind = Literal["bank", "coordinates", "regression"]
-LEAST_INLIERS = 4
+MIN_INLIERS = 4
 """Fewer agreeing patches give no pose: three fit any."""
-LEAST_SECTOR = 6
+MIN_SECTOR = 6
 """Patches without which an azimuth sector is not queried."""
 REGRESSED_POINTS = 60
 """Patches that a regressed pose keeps as points."""
@@ -75,7 +75,7 @@ class RansacSolver:
 
     threshold_m: float
     """Patches within this of their match agree, metres."""
-    least_side_m: float
+    min_side_m: float
     """Least side of a RANSAC triplet, metres."""
     iterations: int
     """RANSAC triplets."""
@@ -120,7 +120,7 @@ class Localizer:
                 answers = [
                     self._solve(patches, *bank.match(query, part))
                     for part in parts
-                    if part is None or len(part) >= LEAST_SECTOR
+                    if part is None or len(part) >= MIN_SECTOR
                 ]
             case SceneCoordinateNet() as net:
                 answers = [self._solve(patches, *net.match(query))]
@@ -140,9 +140,9 @@ class Localizer:
             iterations=solver.iterations,
             rng=np.random.default_rng(0),
             weights=weight,
-            least_side_m=solver.least_side_m,
+            min_side_m=solver.min_side_m,
         )
-        if inlier.sum() < LEAST_INLIERS:
+        if inlier.sum() < MIN_INLIERS:
             return None
         ratio, points_camera = float(inlier.mean()), patches.points_camera[inlier]
         return self._hypothesis(map_from_camera, ratio, matched[inlier], points_camera)

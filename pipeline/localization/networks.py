@@ -15,13 +15,13 @@ from torch import Tensor, nn
 
 from pipeline.geometry import rigid, rigid_torch
 
-LEAST_LOG_M, MOST_LOG_M = -4.0, 3.0
+MIN_LOG_M, MAX_LOG_M = -4.0, 3.0
 """Bounds of the predicted log distance (2 cm to 20 m)."""
 GRID = 16
 """The descriptors are laid on a square grid of so many cells."""
 GROUPS, HIDDEN = 8, 256
 """Groups of the normalisation, and units of the hidden layer of the head."""
-LEAST_LOG, MOST_LOG = -6.0, 3.0
+MIN_LOG, MAX_LOG = -6.0, 3.0
 """Bounds of the predicted log error (radians + metres)."""
 IDENTITY_BIAS = 1e-3
 """Added to the quaternion's real part, so that zero output is a rotation."""
@@ -47,7 +47,7 @@ class SceneCoordinateNet(nn.Module):
     ) -> tuple[Float[Tensor, "patch 3"], Float[Tensor, "patch"]]:
         """Return points (metres) and log distances."""
         out = self.net(descriptors * descriptors.shape[-1] ** 0.5)
-        return self.middle + self.extent * out[:, :3], out[:, 3].clamp(LEAST_LOG_M, MOST_LOG_M)
+        return self.middle + self.extent * out[:, :3], out[:, 3].clamp(MIN_LOG_M, MAX_LOG_M)
 
     @torch.no_grad()
     def match(
@@ -114,7 +114,7 @@ class PoseRegressor(nn.Module):
         return (
             rigid_torch.rotation_from_quaternion(quaternion),
             self.middle + self.extent * out[:, 4:7],
-            out[:, 7].clamp(LEAST_LOG, MOST_LOG),
+            out[:, 7].clamp(MIN_LOG, MAX_LOG),
         )
 
     @torch.no_grad()

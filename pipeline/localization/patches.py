@@ -19,9 +19,9 @@ Describe = Callable[[np.ndarray, int], np.ndarray]
 """``describe(color, stride_px) -> [rows columns channel]`` at cell centres, as
 `pipeline.backends.descriptors` opens it."""
 
-LEAST_PATCHES = 6
+MIN_PATCHES = 6
 """A picture with fewer patches gives no answer."""
-LEAST_MASK_PX, LEAST_DEPTH_PX, DEPTH_SAMPLES = 30, 10, 400
+MIN_MASK_PX, MIN_DEPTH_PX, DEPTH_SAMPLES = 30, 10, 400
 """Agent: least pixels of the mask, least of them with depth, and mask pixels that measure its depth."""
 NEAREST_M = 0.1
 """Depth below this is none, metres."""
@@ -31,10 +31,10 @@ KEYPOINT_PX = 8.0
 """Size of DAISY's key points, pixels; without effect on unrotated descriptors."""
 BASIS_SAMPLES = 20_000
 """Descriptors that fit the principal axes."""
-LEAST_NORM = 1e-6
+MIN_NORM = 1e-6
 BLOCK = 4096
 """Patches of the bank compared at once: their similarities stay in the processor's cache."""
-LEAST_SIMILARITY = 0.05
+MIN_SIMILARITY = 0.05
 """Cosine similarities below count as this, so that every match keeps some weight."""
 
 
@@ -74,7 +74,7 @@ class PcaBasis:
     def project(self, descriptors: Float[np.ndarray, "patch channel"]) -> Float[np.ndarray, "patch axis"]:
         """Project descriptors onto the axes and normalise them to unit length."""
         low = (descriptors.astype(np.float32) - self.mean) @ self.components.T
-        return low / np.maximum(np.linalg.norm(low, axis=1, keepdims=True), LEAST_NORM)
+        return low / np.maximum(np.linalg.norm(low, axis=1, keepdims=True), MIN_NORM)
 
 
 def fit_pca(descriptors: Float[np.ndarray, "patch channel"], axes: int, rng: np.random.Generator) -> PcaBasis:
@@ -112,7 +112,7 @@ class PatchBank:
             score = table[np.arange(len(query)), best]
             nearest = np.where(score > similarity, best + first, nearest)
             similarity = np.maximum(similarity, score)
-        return points[nearest].astype(float), np.clip(similarity, LEAST_SIMILARITY, 1).astype(float) ** 2
+        return points[nearest].astype(float), np.clip(similarity, MIN_SIMILARITY, 1).astype(float) ** 2
 
     def sectors(self, count: int) -> list[Int[np.ndarray, "part"]]:
         """Split the patches by the azimuth their view was taken from."""
@@ -195,19 +195,19 @@ def extract_patches(
     if mask is not None:
         column, row = np.clip(pixel.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
         known &= mask[row, column] & (pixel >= 0).all(1) & (pixel < mask.shape[::-1]).all(1)
-    enough = known.sum() >= LEAST_PATCHES
+    enough = known.sum() >= MIN_PATCHES
     return Patches(descriptors[known], points[known], cell[known]) if enough else None
 
 
 def _crop(color, depth, depth_intrinsics, intrinsics, mask, sampling):
     """Cut a square of fixed size in metres around the mask, grey outside it; None without depth in it."""
     row, column = np.nonzero(mask)
-    if len(row) < LEAST_MASK_PX:
+    if len(row) < MIN_MASK_PX:
         return None
     sample = np.stack([column, row], 1)[:: max(1, len(row) // DEPTH_SAMPLES)] + 0.5
     points = _lift(sample, depth, depth_intrinsics, intrinsics)
     known = points[:, 2] > NEAREST_M
-    if known.sum() < LEAST_DEPTH_PX:
+    if known.sum() < MIN_DEPTH_PX:
         return None
     scale = sampling.focal_px * float(np.median(points[known, 2])) / intrinsics[0, 0]
     half = sampling.window_px / 2 / scale

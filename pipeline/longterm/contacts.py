@@ -72,7 +72,7 @@ class ContactVertices:
 
 
 def find_contact_vertices(
-    body: SkinnedBody, motions: list[BodyMotion], scenes: list[SignedDistance], *, most_frames: int = 400
+    body: SkinnedBody, motions: list[BodyMotion], scenes: list[SignedDistance], *, max_frames: int = 400
 ) -> ContactVertices:
     """Find the contact vertices of a body from motions, each in its scene, and group them to feet.
 
@@ -80,7 +80,7 @@ def find_contact_vertices(
     a root that hovers or sinks a little does not matter.
     """
     surface = PosedSurface(body)
-    every = max(1, sum(map(len, motions)) // most_frames)
+    every = max(1, sum(map(len, motions)) // max_frames)
     touches, frames = np.zeros(len(body.mesh.vertices)), 0
     for motion, scene in zip(motions, scenes, strict=True):
         part = motion[:: min(every, len(motion))]

@@ -88,7 +88,7 @@ STRIDE = 3
 """Frames (30 fps) between the starts of clips."""
 RESTING_SHARE = 0.3
 """Share of the clips that end within `MOVED_M` of their start: without any, a model never learns to rest."""
-MOST_CLIPS = 6000
+MAX_CLIPS = 6000
 """Clips at most; beyond that they are subsampled evenly."""
 LEVEL_SHARE = 0.5
 """Share of static bodies whose place is given without tilt and exact height, as a user gives it."""
@@ -129,7 +129,7 @@ def select_clips(
     *,
     stride: int = STRIDE,
     resting: float = RESTING_SHARE,
-    most: int = MOST_CLIPS,
+    most: int = MAX_CLIPS,
 ) -> ClipSelection:
     """Choose short motions: those that travel and a share ``resting`` of clips that rest."""
     starts = [np.arange(0, len(stretch) - STEPS, stride) for stretch in dataset.stretches]

@@ -38,7 +38,7 @@ class Plausibility:
     """deepest vertex of any frame, a positive number"""
     slide_m_s: float
     """median speed along the ground of feet while they stand, or should; NaN where none does"""
-    least_slide_m_s: float
+    min_slide_m_s: float
     """median speed over the ground of the slowest foot near the scene: one should stand"""
 
 
@@ -90,7 +90,7 @@ class PlausibilityMeter:
             penetration_m=float((-depth).clamp_min(0).mean()),
             deepest_m=float((-depth).clamp_min(0).max()),
             slide_m_s=float(np.median(slide)) if len(slide) else float("nan"),
-            least_slide_m_s=float(np.median(least)) if len(least) else float("nan"),
+            min_slide_m_s=float(np.median(least)) if len(least) else float("nan"),
         )
 
 

@@ -81,8 +81,8 @@ def smooth_seams(motion: BodyMotion, every: int = STEPS, reach: int = 6) -> Body
     return _interpolate(anchors, motion[anchors], frame)
 
 
-def limit_turn_rate(motion: BodyMotion, most_rad: float) -> BodyMotion:
-    """Spread turns of the root that are faster than ``most_rad`` a frame over the frames before and after;
+def limit_turn_rate(motion: BodyMotion, max_rad: float) -> BodyMotion:
+    """Spread turns of the root that are faster than ``max_rad`` a frame over the frames before and after;
     positions and poses stay.
 
     Asked to face about within two seconds, networks that give orientations as two vectors flip within a frame
@@ -91,7 +91,7 @@ def limit_turn_rate(motion: BodyMotion, most_rad: float) -> BodyMotion:
     rotation = Rotation.from_matrix(motion.world_from_agent[:, :3, :3])
     turned = np.concatenate([[0.0], np.cumsum((rotation[:-1].inv() * rotation[1:]).magnitude())])
     frame = np.arange(len(motion))
-    ramp = max(most_rad, turned[-1] / max(len(motion) - 1, 1)) * frame
+    ramp = max(max_rad, turned[-1] / max(len(motion) - 1, 1)) * frame
     late = np.minimum.accumulate(turned - ramp) + ramp
     early = np.maximum.accumulate((turned - ramp)[::-1])[::-1] + ramp
     wanted = np.clip((late + early) / 2, turned[-1] - ramp[::-1], ramp)

@@ -17,9 +17,9 @@ from pipeline.mapping.depth_scans import depth_noise
 
 ROBUST_SIGMAS = 3.0
 """Width of the robust weight, standard deviations."""
-FIRST_SIGMA_PX, LEAST_SIGMA_PX = 1.0, 0.3
+FIRST_SIGMA_PX, MIN_SIGMA_PX = 1.0, 0.3
 """Deviation of a pixel that the first points assume, and the least: SIFT is no better."""
-DEPTH_CORRELATION, LEAST_DEPTH_INFLATION = 2.0, 2.0
+DEPTH_CORRELATION, MIN_DEPTH_INFLATION = 2.0, 2.0
 """Depth errs together over a picture: its deviation counts so many times, and is at least so many times the
 assumed one."""
 MAD_TO_SIGMA = 1.4826
@@ -30,7 +30,7 @@ POINT_DAMPING = 1e-6
 """Damping of a point's step, share of its matrix's trace: points that parallel rays see stay solvable."""
 NEAREST_M = 0.05
 """Observations of points nearer than this do not count, metres."""
-RADIAL_SIGMA, LEAST_BEND_PX = 0.05, 0.5
+RADIAL_SIGMA, MIN_BEND_PX = 0.05, 0.5
 """Deviation of a lens's radial distortion from none, and the distortion at its outermost point below which it
 counts as none: what noise finds in a pinhole."""
 
@@ -108,7 +108,7 @@ class PointTerm:
     def __init__(self, tracked: TrackedPoints, world_from_camera: Float[np.ndarray, "camera 4 4"]):
         """Begin with the points where depth and these cameras place them."""
         self.tracked, self.points_world = tracked, tracked.lifted(world_from_camera)
-        self.sigma_px, self.depth_inflation = FIRST_SIGMA_PX, LEAST_DEPTH_INFLATION
+        self.sigma_px, self.depth_inflation = FIRST_SIGMA_PX, MIN_DEPTH_INFLATION
         self.radial = np.zeros(int(tracked.lens.max(initial=0)) + 1)
         """Per lens: what it shows r focal lengths from the centre belongs at r (1 + radial r^2)."""
         flat = (tracked.pixel - tracked.center_px) / tracked.focal_px
@@ -157,12 +157,12 @@ class PointTerm:
     def _measure(self, world_from_camera):
         t, local = self.tracked, self._local(world_from_camera)
         error_px = self._error_px(local)
-        self.sigma_px = max(LEAST_SIGMA_PX, MAD_TO_SIGMA * float(np.median(np.abs(error_px))))
+        self.sigma_px = max(MIN_SIGMA_PX, MAD_TO_SIGMA * float(np.median(np.abs(error_px))))
         known = np.isfinite(t.depth_m)
         if known.any():
             error = np.abs(local[known, 2] - t.depth_m[known]) / t.depth_sigma_m[known]
             measured = DEPTH_CORRELATION * MAD_TO_SIGMA * float(np.median(error))
-            self.depth_inflation = max(LEAST_DEPTH_INFLATION, measured)
+            self.depth_inflation = max(MIN_DEPTH_INFLATION, measured)
 
     def _linearized(self, world_from_camera):
         """Return weighted residuals [observation 3], their derivative by the point, and the local points."""
@@ -212,7 +212,7 @@ class PointTerm:
             self.radial = self.radial - step
             self.points_world = self.points_world - np.einsum("pij,pj->pi", inverse, gradient - cross @ step)
         most = (np.abs(self.radial) * np.linalg.norm(self._bend_px, axis=1)[:, None] * own).max(0, initial=0)
-        self.radial = np.where(most < LEAST_BEND_PX, 0.0, self.radial)
+        self.radial = np.where(most < MIN_BEND_PX, 0.0, self.radial)
 
 
 def _damped(hessian):

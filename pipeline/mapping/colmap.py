@@ -17,7 +17,7 @@ GLOBAL_ADJUSTMENT_GROWTH = 1.3
 """Global bundle adjustment after the model grew by this factor; COLMAP's 1.1 takes twice as long."""
 FIRST_PAIR_DEG = 6.0
 """Least triangulation angle of the first pair, degrees: walks through a room have small baselines."""
-LEAST_POSE_INLIERS = 20
+MIN_POSE_INLIERS = 20
 """Points a picture must share with the model to be registered; plain walls have few."""
 
 
@@ -75,7 +75,7 @@ def mapping_options(seed: int, *, calibrate: bool = False) -> pycolmap.Increment
     mapping.mapper.num_threads, mapping.mapper.random_seed, mapping.triangulation.random_seed = 1, seed, seed
     mapping.mapper.abs_pose_refine_focal_length = mapping.mapper.abs_pose_refine_extra_params = calibrate
     mapping.mapper.init_min_tri_angle = FIRST_PAIR_DEG
-    mapping.mapper.abs_pose_min_num_inliers = LEAST_POSE_INLIERS
+    mapping.mapper.abs_pose_min_num_inliers = MIN_POSE_INLIERS
     return mapping
 
 

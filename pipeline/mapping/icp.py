@@ -14,7 +14,7 @@ from pipeline.geometry import cameras, rigid
 
 NEAREST_M = 0.05
 """Points nearer to the target camera than this are not projected, metres."""
-LEAST_COSINE = 0.7
+MIN_COSINE = 0.7
 """Normals of a pair must agree within 45 degrees."""
 POINTS_PER_MEASUREMENT = 20
 """Neighbouring depth pixels err together: so many count as one independent measurement."""
@@ -143,7 +143,7 @@ def _accumulate(
             d = p - q
             turned = rotation @ normal_source
             cosine = turned[0] * n[0] + turned[1] * n[1] + turned[2] * n[2]
-            if d[0] * d[0] + d[1] * d[1] + d[2] * d[2] > 4 * reach * reach or cosine < LEAST_COSINE:
+            if d[0] * d[0] + d[1] * d[1] + d[2] * d[2] > 4 * reach * reach or cosine < MIN_COSINE:
                 continue
             error = d[0] * n[0] + d[1] * n[1] + d[2] * n[2]
             if abs(error) >= reach:

@@ -44,7 +44,7 @@ SIGMA_RAD, SIGMA_M = 0.002, 0.004
 """Odometry's standard deviation from one frame to the next, radians and metres (ARKit at 10 Hz)."""
 JUMP_INFLATION = 60.0
 """A step over a tracking jump may err by so many times the usual deviation."""
-LEAST_OVERLAP = 0.4
+MIN_OVERLAP = 0.4
 """Share of the points that must meet for an alignment to count."""
 LARGEST_RESIDUAL = 0.3
 """Residual beyond which an alignment does not count, share of `REACH_M`."""
@@ -54,7 +54,7 @@ CACHED_VIEWS = 256
 """Depth images kept in memory at once."""
 UP_CONES = (0.75, 0.9, 0.97, 0.985, 0.985)
 """Cosines of the narrowing cones of surface normals that `align_gravity` averages."""
-LEAST_NORMALS = 100
+MIN_NORMALS = 100
 """Fewer normals in a cone end the search for up."""
 GRAVITY_VIEWS = 20
 """Depth images that vote on up."""
@@ -123,7 +123,7 @@ def chain_alignments(
 
 
 def _credible(result: IcpResult) -> bool:
-    return result.overlap > LEAST_OVERLAP and result.residual_m < LARGEST_RESIDUAL * REACH_M
+    return result.overlap > MIN_OVERLAP and result.residual_m < LARGEST_RESIDUAL * REACH_M
 
 
 def _keyframe_pairs(poses: Float[np.ndarray, "frame 4 4"], loops: int) -> list[tuple[int, int]]:
@@ -157,7 +157,7 @@ def align_gravity(
     normals = np.concatenate(normals)
     for cosine in UP_CONES:
         facing = normals[normals @ up > cosine]
-        if len(facing) < LEAST_NORMALS:
+        if len(facing) < MIN_NORMALS:
             break
         up = facing.mean(0) / np.linalg.norm(facing.mean(0))
     return rigid.make(rotation_between(up, np.array([0.0, 1.0, 0.0])), np.zeros(3)) @ world_from_camera

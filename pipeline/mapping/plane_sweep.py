@@ -17,7 +17,7 @@ from pipeline.mapping.colmap import SparseModel
 PATHS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 BASELINE_DEG = (2.0, 25.0)
 """angles between rays to a shared point that pictures are chosen for, degrees"""
-LEAST_SHARED = 8
+MIN_SHARED = 8
 """points that two pictures must share to be compared"""
 DEPTH_QUANTILES, DEPTH_MARGINS = (0.01, 0.99), (0.6, 1.6)
 """the sweep reaches from the nearest to the farthest point in view, and so much beyond"""
@@ -54,7 +54,7 @@ def neighbours(sparse: SparseModel, most: int) -> list[Int[np.ndarray, "source"]
     for key in range(count):
         shared = seen & seen[key]
         score = np.zeros(count)
-        for other in np.flatnonzero(shared.sum(1) >= LEAST_SHARED):
+        for other in np.flatnonzero(shared.sum(1) >= MIN_SHARED):
             if other != key:
                 points = sparse.points_model[shared[other]]
                 rays, theirs = centres[key] - points, centres[other] - points

@@ -19,7 +19,7 @@ from pipeline.geometry import rigid
 
 MAP = -1
 """Stands for the fixed map in ``Correspondences.second``; its points are in world axes."""
-LEAST_SIGMA = 0.001
+MIN_SIGMA = 0.001
 """Deviation of odometry at zero time, radians and metres."""
 SHORTEST_S = 1e-3
 """Least time between frames, seconds."""
@@ -27,7 +27,7 @@ DAMPING = 1e-6
 """Damping of a step, share of each diagonal element and of their mean: what nothing measures stays still."""
 CHI_DAMPING = 1e-3
 """The same in `chi_squares`: what one flat wall does not measure does not count."""
-MOST_ROWS = 2**19
+MAX_ROWS = 2**19
 """Rows of the Jacobian at a time: a step needs half a gigabyte however long the recording is."""
 MEDIAN_CHI_SQUARE = 5.348
 """Median of the chi-square distribution of six degrees of freedom."""
@@ -110,7 +110,7 @@ def odometry_factors(
     first = np.arange(len(timestamp_s) - 1)
     gap_s = np.maximum(np.diff(timestamp_s), SHORTEST_S)
     first_from_second = rigid.inverse(odometry_from_camera[:-1]) @ odometry_from_camera[1:]
-    sigma_rad, sigma_m = (drift * gap_s + LEAST_SIGMA for drift in (drift_rad_s, drift_m_s))
+    sigma_rad, sigma_m = (drift * gap_s + MIN_SIGMA for drift in (drift_rad_s, drift_m_s))
     return RelativePoseFactors(first, first + 1, first_from_second, sigma_rad, sigma_m)
 
 
@@ -208,8 +208,8 @@ def residuals(
 def _normal_equations(poses, correspondences, relative_poses, reach):
     """Return matrix and gradient of one Gauss-Newton step."""
     normal, gradient = sparse.csc_array((6 * len(poses),) * 2), np.zeros(6 * len(poses))
-    for start in range(0, len(correspondences.first), MOST_ROWS):
-        part = correspondences.selected(slice(start, start + MOST_ROWS))
+    for start in range(0, len(correspondences.first), MAX_ROWS):
+        part = correspondences.selected(slice(start, start + MAX_ROWS))
         jacobian, residual = _correspondence_rows(poses, part)
         weight = (reach**2 / (reach**2 + residual**2)) ** 2 / part.sigma_m**2
         normal = normal + (jacobian.T @ sparse.diags_array(weight) @ jacobian).tocsc()

@@ -10,7 +10,7 @@ from pipeline.geometry import cameras
 
 RATIO = 0.8
 """Ratio test: the best match must be this much nearer than the second (Lowe 2004)."""
-LEAST_NORM = 1e-6
+MIN_NORM = 1e-6
 PEAK_THRESHOLD = 0.04
 """OpenCV's contrast threshold."""
 
@@ -47,7 +47,7 @@ def describe(
     keypoints, descriptors = sift.detectAndCompute(gray, usable)
     if not keypoints:
         return Keypoints(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
-    rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), LEAST_NORM))
+    rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), MIN_NORM))
     return Keypoints(np.array([point.pt for point in keypoints]) + 0.5, rooted.astype(np.float32))
 
 

@@ -26,11 +26,11 @@ AGREE_DEPTH_M, NEAREST_SCALE = 2.0, 0.5
 RANSAC_TRIPLETS = 100
 REFINE_ROUNDS = 5
 """Reweighted closed forms after RANSAC; the weights have settled by then."""
-LEAST_PAIRS = 20
+MIN_PAIRS = 20
 """Fewer pairs with depth give no motion."""
 NEAREST_M = 0.1
 """Depth below this is none, metres."""
-LEAST_SHARE = 0.35
+MIN_SHARE = 0.35
 """Share of the pairs that must agree; below, the motion counts as unknown (a tracking jump)."""
 ENOUGH_SHARE = 0.7
 """With this share no other explanation is searched."""
@@ -116,7 +116,7 @@ def _motion_from_guess(first, second, guess, rng):
     target = first.points_camera[row[inside], column[inside]]
     known = (source[:, 2] > NEAREST_M) & (target[:, 2] > NEAREST_M)
     source, target = source[known], target[known]
-    if len(source) < LEAST_PAIRS:
+    if len(source) < MIN_PAIRS:
         return np.eye(4), 0.0
     scale = np.maximum(target[:, 2] / AGREE_DEPTH_M, NEAREST_SCALE)
     first_from_second, _ = align.ransac_rigid(
@@ -168,7 +168,7 @@ def chain_motions(frames: Iterable[FlowFrame], rng: np.random.Generator) -> Odom
         if before is not None:
             last_motion = None if jumps[-1] or not steps else steps[-1]
             step, share = relative_motion(before, frame, rng, last_motion)
-            jumps.append(share < LEAST_SHARE)
+            jumps.append(share < MIN_SHARE)
             steps.append(np.eye(4) if jumps[-1] else step)
         before = frame
     inflation = np.where(jumps[1:], JUMP_INFLATION, 1.0)

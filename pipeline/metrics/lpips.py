@@ -26,7 +26,7 @@ POOLED_BEFORE = (3, 6)
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """ImageNet's mean and deviation, for colours in -1 .. 1."""
 EPSILON = 1e-10
-MOST_LETTERS = 200
+MAX_LETTERS = 200
 """Of what torch says of a damaged file."""
 SMALLEST_PX = 63
 """Pictures must be at least so high and wide: below, AlexNet's last maps are empty."""
@@ -58,7 +58,7 @@ class Lpips(nn.Module):
             for number, weight in enumerate(model.weights):
                 weight.data.copy_(channels[f"lin{number}.model.1.weight"].reshape(weight.shape))
         except (KeyError, RuntimeError) as error:
-            what = f"no weights of LPIPS with AlexNet ({str(error)[:MOST_LETTERS]})"
+            what = f"no weights of LPIPS with AlexNet ({str(error)[:MAX_LETTERS]})"
             raise InputError("MOD-003", what, str(folder), "download them again") from error
         return model.to(device).eval().requires_grad_(False)
 
@@ -109,4 +109,4 @@ def _read(path: Path) -> dict[str, Tensor]:
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # whatever a damaged file makes torch raise
-        raise InputError("MOD-003", f"no weights ({str(error)[:MOST_LETTERS]})", str(path), remedy) from error
+        raise InputError("MOD-003", f"no weights ({str(error)[:MAX_LETTERS]})", str(path), remedy) from error

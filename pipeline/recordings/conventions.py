@@ -29,7 +29,7 @@ GAP_FRAMES = 2.5
 """pairs may lie this many frames apart where frames are rare"""
 NEAREST_M = 0.05
 """points nearer to the second camera are not compared"""
-LEAST_COMPARED = 50
+MIN_COMPARED = 50
 """points that a pair must share to be judged"""
 UNIT_TOLERANCE = 0.05
 """quaternions as lengths: what rounding to a few digits leaves"""
@@ -198,7 +198,7 @@ def compare(
     column, row = np.floor(pixel[inside]).astype(int).T
     measured = second.depth[row, column]
     difference = np.abs(depth[inside] - measured)[measured > 0]
-    if len(difference) < LEAST_COMPARED:
+    if len(difference) < MIN_COMPARED:
         return np.inf, 0.0, TOLERANCE_M
     typical_m = float(np.median(measured[measured > 0]))
     return (

@@ -28,7 +28,7 @@ from pipeline.recordings.upright import (
 JPEG = b"\xff\xd8"
 MAX_DEPTH_SIDE_PX = 640
 """larger depth was enlarged by the app; it is sampled down again"""
-LEAST_TRACKED = 0.8
+MIN_TRACKED = 0.8
 """share of frames with a device pose below which device poses are not used at all"""
 MEASURED, RELATIVE = "measured", "relative"
 UPRIGHT_VIEWS = 12
@@ -37,7 +37,7 @@ UNIT_VIEWS = 5
 """frames on which the unit of the depth is checked"""
 NEAREST_TYPICAL_M, FARTHEST_TYPICAL = 0.1, 2.0
 """typical depth is not below the one, metres, nor above the other, in units of the farthest that is used"""
-MOST_STRETCHED = 0.03
+MAX_STRETCHED = 0.03
 """difference in shape of pictures and depth, as a share, beyond which they cannot show the same"""
 SHARPNESS_WIDTH_PX = 240
 DARK = 0.15
@@ -173,7 +173,7 @@ def _refuse_other_shape(color_size: tuple[int, int], depth_size: tuple[int, int]
     (height, width), (depth_height, depth_width) = color_size, depth_size
     stretched_px = abs(depth_height - depth_width * height / width)
     rounding_px = 0.5 * (1 + height / width)
-    if stretched_px > max(MOST_STRETCHED * depth_height, rounding_px):
+    if stretched_px > max(MAX_STRETCHED * depth_height, rounding_px):
         sizes = f"depth of {depth_width} x {depth_height}", f"pictures of {width} x {height}"
         remedy = "crop the one to what the other shows, turned as the pictures are stored"
         raise InputError("CAP-008", " cannot show the same as ".join(sizes), where, remedy)
@@ -198,7 +198,7 @@ def _tracked(recording: Recording) -> tuple[Int[np.ndarray, "used"], Float[np.nd
         return everything, None, ""
     known = np.isfinite(recording.pose).all(1)
     lost = "" if known.all() else f"{100 * (1 - known.mean()):.0f} % of the frames have no device pose"
-    used = known if known.mean() >= LEAST_TRACKED else np.ones_like(known)
+    used = known if known.mean() >= MIN_TRACKED else np.ones_like(known)
     return everything[used], recording.pose[used], lost
 
 

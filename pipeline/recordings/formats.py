@@ -22,7 +22,7 @@ UNDERSTOOD = (
     "folder, a folder with a video, depth/ and intrinsics.txt, a video alone for the walk-through"
 )
 
-MOST_SCALE_SOURCES = 3
+MAX_SCALE_SOURCES = 3
 """sessions that are read for scale; each costs half a minute"""
 
 
@@ -105,7 +105,7 @@ def scale_sources(folder: Path, video: Video, videos: Iterable[Video]) -> list[V
     if video.role != "walkthrough" or has_depth(folder / video.file):
         return []
     sessions = (other for other in videos if other.role == "session" and other.split == "train")
-    return [other for other in sessions if has_depth(folder / other.file)][:MOST_SCALE_SOURCES]
+    return [other for other in sessions if has_depth(folder / other.file)][:MAX_SCALE_SOURCES]
 
 
 def has_depth(path: Path) -> bool:

@@ -30,7 +30,7 @@ CAPTURE_RATE = "com.android.capture.fps"
 """tag of Android: pictures taken per second, however many are shown per second"""
 CLEARLY_SLOWED = 3.0
 """dim light halves the rate of an ordinary video; from this factor on it is slow motion, or time lapse"""
-MOST_ASPECT = 2.0
+MAX_ASPECT = 2.0
 """of a pixel's sides; a camera's are less unequal, more is a broken header"""
 
 
@@ -52,7 +52,7 @@ class Movie:
         self._decoder: Iterator[av.VideoFrame] | None = None
         self._position = 0
         first = self._first()
-        stretch = aspect if 1 / MOST_ASPECT <= aspect <= MOST_ASPECT else 1.0
+        stretch = aspect if 1 / MAX_ASPECT <= aspect <= MAX_ASPECT else 1.0
         self.size = (first.height, round(first.width * stretch))
         self.quarter_turns = round(-first.rotation / 90) % 4
 

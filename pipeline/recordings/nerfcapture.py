@@ -22,7 +22,7 @@ from pipeline.recordings.recording import (
 )
 
 COEFFICIENTS = ("fl_x", "fl_y", "cx", "cy")
-LEAST_REACH_M = 4.0
+MIN_REACH_M = 4.0
 """depth beyond what 16 bits reach comes back as near: what reaches less is refused, metres"""
 LARGEST_UNIT = 65535
 """of 16 bits"""
@@ -68,7 +68,7 @@ def _meters_per_unit(table: dict[str, Any], container: Container) -> float:
     scale = table.get("integer_depth_scale")
     if not isinstance(scale, int | float) or not 0 < scale < 1:
         raise broken_metadata(container.where, "'integer_depth_scale' (metres per unit of depth) is missing")
-    if LARGEST_UNIT * scale < LEAST_REACH_M:
+    if LARGEST_UNIT * scale < MIN_REACH_M:
         what = f"depth beyond {LARGEST_UNIT * scale:.3g} m was written as if it were near"
         remedy = "stream again with a depth_scale of 10, if need be as the default of nerfcapture_dataset.py"
         raise InputError("CAP-010", what, container.where, remedy)

@@ -42,7 +42,7 @@ FACE_ID, LIDAR = 0, 1
 """the app's numbers of the cameras at the front and at the back"""
 MAX_SIDE_PX = 16384
 """a picture with a longer side is none that a phone takes"""
-LEAST_TIMED = 0.5
+MIN_TIMED = 0.5
 """share of frames whose times increase below which the times are not used"""
 LZFSE_HEADER_BYTES = {b"bvxn": 12, b"bvx1": 772}
 """of a block of LZVN, and of LZFSE with unpacked tables"""
@@ -140,7 +140,7 @@ class _Metadata:
             return (index - index[0]) / self._numbers("fps", (), positive=True)
         timestamp_s = self._rows("frameTimestamps", (), index)
         good = timestamp_s > np.fmax.accumulate(np.r_[-np.inf, timestamp_s[:-1]])
-        if good.mean() < LEAST_TIMED:
+        if good.mean() < MIN_TIMED:
             raise self._broken("'frameTimestamps' must increase")
         self._remark(~good, "are left out: their times are missing or do not increase")
         return np.where(good, timestamp_s - timestamp_s[good][0], np.nan)

@@ -19,7 +19,7 @@ LEVEL_COSINE = 0.95
 """surfaces within 18 degrees of level are floor (facing up) or ceiling"""
 SIDE_PX = 200
 """longer side that depth is thinned to: directions over fewer pixels than that are noise"""
-LEAST_POINTS = 100
+MIN_POINTS = 100
 """points with a surface direction that the room must show"""
 
 
@@ -57,7 +57,7 @@ def up_from_room(
         for view, odometry in zip(views, odometry_from_camera[seen], strict=True)
     ]
     towards_camera = np.concatenate(normals)
-    if len(towards_camera) < LEAST_POINTS:
+    if len(towards_camera) < MIN_POINTS:
         return None
     directions, scores = [], []
     for turns in range(4):
@@ -100,5 +100,5 @@ def quarter_turns_from_surfaces(
 
     Floors and tables are seen from above: surfaces face up more than to any other side of the pictures.
     """
-    lean = [found.mean(0) for found in (_normals(*view) for view in views) if len(found) >= LEAST_POINTS]
+    lean = [found.mean(0) for found in (_normals(*view) for view in views) if len(found) >= MIN_POINTS]
     return quarter_turns_from_gravity(np.eye(4)[None], up_odometry=np.mean(lean, axis=0)) if lean else 0

@@ -19,7 +19,7 @@ from pipeline.workflow import artifact, dag, jobs
 
 FRAMES_UNKNOWN = 1000
 """Frames reckoned per recording that has not been extracted yet: 100 s at 10 Hz."""
-LEAST_RUNTIME_MIN = 60
+MIN_RUNTIME_MIN = 60
 """What every job is granted on its first attempt, minutes."""
 RUNTIME_FACTOR = 4
 """How much slower than the measured machine a node may be."""
@@ -107,7 +107,7 @@ def runtime_min(node: dag.Node) -> Callable[..., int]:
 
     def of(wildcards: Any, attempt: int) -> int:
         seconds = RUNTIME_FACTOR * node.seconds_per_frame * _frames(wildcards.home, _id(node, wildcards))
-        return math.ceil((LEAST_RUNTIME_MIN + seconds / 60) * attempt)
+        return math.ceil((MIN_RUNTIME_MIN + seconds / 60) * attempt)
 
     return of
 

@@ -33,7 +33,7 @@ from pipeline.core import processes
 from pipeline.core.errors import InputError, exit_code, printable
 from pipeline.workflow import artifact, jobs, sources, stamps
 
-LEAST_FREE_BYTES = 1 << 29
+MIN_FREE_BYTES = 1 << 29
 """A stage does not begin on a disk with less than this free."""
 LONGEST_S = 7 * 24 * 3600
 """A stage that takes longer hangs."""
@@ -152,7 +152,7 @@ def _do(job: dict[str, Any], key: str, resume: Path, engine: Engine) -> int:
         what = f"there is no stage program {job['stage']!r}"
         raise InputError("RUN-002", what, "stages/", "this build is incomplete")
     free = shutil.disk_usage("build").free
-    if free < LEAST_FREE_BYTES:
+    if free < MIN_FREE_BYTES:
         what, remedy = f"only {free >> 20} MB free on the disk", "free some space and run the same again"
         raise InputError("SYS-001", what, job["out"], remedy)
     arguments = [*job["arguments"], "--key", key, "--threads", str(job["threads"])]

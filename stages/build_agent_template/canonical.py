@@ -22,7 +22,7 @@ ROUNDS = 6
 """rounds of k-medoids after spreading the seeds"""
 CELLS = 5000
 """cells of the body that are used"""
-WIDEN, LEAST_SCALE_M = 1.3, 0.012
+WIDEN, MIN_SCALE_M = 1.3, 0.012
 """scale of a bone in standard deviations of its cells (larger blends softer), and the smallest scale"""
 NEAR_M = 0.04
 """cells count by how few others lie this near: limbs are thin"""
@@ -88,7 +88,7 @@ def lay_bones(
         axes *= np.where(axes[np.abs(axes).argmax(0), range(3)] < 0, -1, 1)
         axes[:, 0] = np.cross(axes[:, 1], axes[:, 2])
         frames.append(rigid.make(axes, middle))
-        scales.append(np.maximum(WIDEN * np.sqrt(np.maximum(variance, 0)), LEAST_SCALE_M))
+        scales.append(np.maximum(WIDEN * np.sqrt(np.maximum(variance, 0)), MIN_SCALE_M))
     order = np.argsort([-frame[2, 3] for frame in frames])
     return Bones(np.stack(frames)[order], np.stack(scales)[order])
 

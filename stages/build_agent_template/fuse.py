@@ -34,7 +34,7 @@ SMOOTH_VOXELS, SMOOTH_ROUNDS = 0.8, 6
 """standard deviation of the smoothing of the signed distance; rounds of Taubin smoothing of the surface"""
 STRAY, STRAY_QUANTILE = 1.6, 0.98
 """points farther from the middle than so many times this quantile are strays"""
-LEAST_DISTANCE = 0.05
+MIN_DISTANCE = 0.05
 """cells inside and outside keep at least this signed distance, in units of the truncation"""
 AGGRESSIVENESS = 4
 """of edge collapse: lower keeps shape better"""
@@ -46,7 +46,7 @@ LOWEST_M = 0.02
 """or nearer to the ground than this"""
 ALIKE_M = 0.03
 """frames are alike that saw the limb within this of one place"""
-LEAST_POINTS, LEAST_FRAMES = 3, 12
+MIN_POINTS, MIN_FRAMES = 3, 12
 """with at least so many points; fewer alike frames do not determine its shape"""
 AROUND_M = 0.03
 """the limb's space reaches this far around all that was measured of it"""
@@ -168,7 +168,7 @@ def extract(
     group, count = cast("tuple[np.ndarray, int]", scipy.ndimage.label(distance < 0))
     own = group == (np.bincount(group.ravel())[1:].argmax() + 1 if count else -1)
     own = np.asarray(scipy.ndimage.binary_fill_holes(own))
-    distance = np.where(own, np.minimum(distance, -LEAST_DISTANCE), np.maximum(distance, LEAST_DISTANCE))
+    distance = np.where(own, np.minimum(distance, -MIN_DISTANCE), np.maximum(distance, MIN_DISTANCE))
     distance = scipy.ndimage.gaussian_filter(distance, SMOOTH_VOXELS)
     cells = int((own & scipy.ndimage.binary_dilation(distance < 0)).sum())
     # Smoothing eats what is round, and should eat scraps alone.
@@ -229,8 +229,8 @@ def find_limb(
         return None
     place = _common_place(points, frame, body.query(points)[0])
     seen, count = np.unique(frame[np.linalg.norm(points - place, axis=1) < ALIKE_M], return_counts=True)
-    matching = seen[count >= LEAST_POINTS]
-    return Limb(matching, points) if len(matching) >= LEAST_FRAMES else None
+    matching = seen[count >= MIN_POINTS]
+    return Limb(matching, points) if len(matching) >= MIN_FRAMES else None
 
 
 def _common_place(points, frame, away_m) -> Float[np.ndarray, "3"]:

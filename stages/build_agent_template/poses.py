@@ -19,7 +19,7 @@ GROUND_FRAMES, REACH_M = 40, 0.4
 """frames that show the ground, and how far from the animal it counts"""
 LEVEL_COSINE = 0.9
 """surfaces within 26 degrees of level are ground"""
-LEAST_POINTS = 200
+MIN_POINTS = 200
 """points of depth, over some 40 frames at that stride, without which no template is built"""
 
 
@@ -59,7 +59,7 @@ def walk_around(clip: Clip, masks: Masks) -> Circle:
         animal.append(points[known & (label == 255)])
         floor.append(points[known & (label == 0) & (up > LEVEL_COSINE)])
     on_animal, on_floor = np.concatenate(animal), np.concatenate(floor)
-    if min(len(on_animal), len(on_floor)) < LEAST_POINTS:
+    if min(len(on_animal), len(on_floor)) < MIN_POINTS:
         what = f"only {len(on_animal)} depth points lie on the animal and {len(on_floor)} on level ground"
         remedy = "circle it from 1.2 m, in light, with the floor in view; sensors miss what is black or wet"
         raise InputError("AGT-001", what, str(masks.folder), remedy)

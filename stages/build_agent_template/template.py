@@ -18,7 +18,7 @@ from stages.build_agent_template.config import Config
 from stages.build_agent_template.fuse import fuse
 from stages.build_agent_template.poses import walk_around
 
-LEAST_FRAMES = 10
+MIN_FRAMES = 10
 """frames that show the animal without which nothing is built"""
 
 
@@ -47,7 +47,7 @@ def build(
     rng: np.random.Generator,
 ) -> CanonicalTemplate:
     """Build the template from one turnaround. Raises InputError AGT-001 if too few frames show the animal."""
-    if masks.visible.sum() < LEAST_FRAMES:
+    if masks.visible.sum() < MIN_FRAMES:
         what = f"the animal is seen in {int(masks.visible.sum())} frames"
         remedy = "circle the resting animal once, the whole of it in view"
         raise InputError("AGT-001", what, str(masks.folder), remedy)

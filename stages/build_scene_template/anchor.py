@@ -16,17 +16,17 @@ from pipeline.mapping.colmap import SparseModel
 from stages.build_scene_template.refine import Keyframe
 from stages.build_scene_template.sfm import points_under
 
-LEAST_REGISTERED = 0.6
+MIN_REGISTERED = 0.6
 """Share of the keyframes that must be in the largest model; with less, odometry explains more of the walk."""
-MOST_SCALE_DEVIATION = 0.06
+MAX_SCALE_DEVIATION = 0.06
 """Robust relative deviation of depth over SfM depth beyond which it is refuted; sound models have 1-3 %."""
-MOST_GAP_M, MOST_GAP_RATIO = 0.06, 1.5
+MAX_GAP_M, MAX_GAP_RATIO = 0.06, 1.5
 """Gap between depth images that refutes the model, metres, if so many times the gap under the odometry."""
-LEAST_RATIOS = 20
+MIN_RATIOS = 20
 """Tracks with depth below which there is no scale."""
 HOPS = (1, 3, 8)
 """Keyframes that many apart have their depth images compared."""
-GAP_QUANTILE, LEAST_OVERLAP = 0.75, 50
+GAP_QUANTILE, MIN_OVERLAP = 0.75, 50
 """Quantile of a pair's gaps that counts, and least number of overlapping points of a pair."""
 NEAREST_M = 0.1
 """Depth below this is none, metres."""
@@ -59,7 +59,7 @@ def metric_scale(sparse: SparseModel, clip: Clip) -> tuple[float, float] | None:
         model = rigid.apply(camera_from_model, sparse.points_model[sparse.observed_point[row]])[:, 2]
         ratios.append((measured / model)[np.isfinite(measured) & (model > 0)])
     ratio = np.concatenate(ratios)
-    if len(ratio) < LEAST_RATIOS:
+    if len(ratio) < MIN_RATIOS:
         return None
     scale = float(np.median(ratio))
     return scale, float(MAD_TO_SIGMA * np.median(np.abs(ratio - scale)) / scale)
@@ -78,7 +78,7 @@ def depth_gap(keyframes: list[Keyframe], world_from_camera: Float[np.ndarray, "k
             column, row = np.floor(pixel[inside]).astype(int).T
             measured = target.depth[row, column]
             gap = np.abs(measured - z[inside])[measured > 0]
-            gaps.append(np.quantile(gap, GAP_QUANTILE) if len(gap) > LEAST_OVERLAP else np.nan)
+            gaps.append(np.quantile(gap, GAP_QUANTILE) if len(gap) > MIN_OVERLAP else np.nan)
     return float(np.nanmean(gaps)) if np.isfinite(gaps).any() else np.inf
 
 
@@ -134,11 +134,11 @@ def choose_start(
 
 def _refutation(registered, deviation, gap):
     """Return why depth or coverage contradicts the sparse model; empty when nothing does."""
-    if registered < LEAST_REGISTERED:
+    if registered < MIN_REGISTERED:
         return f"only {registered:.0%} of the keyframes were registered"
-    if deviation > MOST_SCALE_DEVIATION:
+    if deviation > MAX_SCALE_DEVIATION:
         return f"its scale varies by {deviation:.1%} against depth"
-    if gap["colmap"] > max(MOST_GAP_M, MOST_GAP_RATIO * gap.get("odometry", 0.0)):
+    if gap["colmap"] > max(MAX_GAP_M, MAX_GAP_RATIO * gap.get("odometry", 0.0)):
         return f"overlapping depth images are {gap['colmap'] * 100:.1f} cm apart under its poses"
     return ""
 

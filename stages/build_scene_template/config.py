@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 class SfmConfig:
     """How keyframes are chosen and matched."""
 
-    most_keyframes: int = 90
+    max_keyframes: int = 90
     """Upper bound; steps are widened until it holds."""
     features: int = 1500
     """SIFT features per keyframe."""

@@ -17,17 +17,17 @@ from pipeline.mapping import depth_scans, pose_optimization
 from stages.build_scene_template.config import FusionConfig
 from stages.build_scene_template.refine import DEPTH_INFLATION, odometry_factors
 
-MOST_VOXELS = 150_000_000
+MAX_VOXELS = 150_000_000
 """More would take over 4 GB."""
 CONFIDENCE_WEIGHT = (0.2, 0.6, 1.0)
 """Weight of depth of low, medium and high confidence; rims and thin legs have low confidence only."""
-LEAST_WEIGHT = 0.15
+MIN_WEIGHT = 0.15
 """A voxel needs this weight, in views from one metre, to carry surface."""
 EXTENT_STRIDE_PX, EXTENT_STEP, EXTENT_TRIM = 12, 4, 0.001
 """Pixels and keyframes that measure the room's extent, and the share of points cut at each end."""
 ALIGN_REACH_M = (0.1, 0.04)
 """Width of the robust weight in the first and last round of the alignment to the surface, metres."""
-ALIGN_POINTS, ALIGN_LEAST_POINTS = 400_000, 40
+ALIGN_POINTS, ALIGN_MIN_POINTS = 400_000, 40
 """Depth points that take part, so that memory stays bounded, and least number per frame."""
 NO_KEYFRAMES = np.zeros(0, int)
 NEAREST_M, SEEN_WITHIN_M = 0.2, 0.06
@@ -48,7 +48,7 @@ def fuse(
         points.append(rigid.apply(world_from_camera[frame], scan.points_camera))
     points = np.concatenate(points)
     extent_m = np.ptp(np.quantile(points, [EXTENT_TRIM, 1 - EXTENT_TRIM], axis=0), axis=0)
-    if np.prod(extent_m / config.voxel_m) > MOST_VOXELS:
+    if np.prod(extent_m / config.voxel_m) > MAX_VOXELS:
         spans = " x ".join(f"{side:.0f}" for side in extent_m)
         what = f"the walk-through spans {spans} m: too much for voxels of {config.voxel_m:g} m"
         remedy = "walk through one room, or set a larger voxel_m in [build_scene_template.fusion]"
@@ -60,7 +60,7 @@ def fuse(
         weight = np.array(CONFIDENCE_WEIGHT, np.float32)[clip.confidence(frame)]
         depth_camera, color_camera = clip.depth_intrinsics[frame], clip.intrinsics[frame]
         volume.integrate(depth, depth_camera, color, color_camera, world_from_camera[frame], weight)
-    return volume.surface(LEAST_WEIGHT)
+    return volume.surface(MIN_WEIGHT)
 
 
 def align_frames(
@@ -75,7 +75,7 @@ def align_frames(
     Depth counts by how far it contradicts the keyframes; they stay if that is more than its noise explains.
     """
     surface, frames = depth_scans.SurfaceMap(mesh), np.arange(len(clip))
-    most = max(ALIGN_POINTS // len(clip), ALIGN_LEAST_POINTS)
+    most = max(ALIGN_POINTS // len(clip), ALIGN_MIN_POINTS)
     scans = [
         depth_scans.scan(
             clip.depth(f),

@@ -18,7 +18,7 @@ from stages.build_scene_template.template import REGISTERED_WITHIN_M, SceneTempl
 
 EDGE_M, SUBDIVISIONS = 0.05, 12
 """Longer edges are divided, at most so often, so that vertices can carry colours, metres."""
-MOST_SCALE_ERROR, MOST_GAP_M, LEAST_AGREE = 0.03, 0.05, 0.7
+MAX_SCALE_ERROR, MAX_GAP_M, MIN_AGREE = 0.03, 0.05, 0.7
 """Bounds on its relative scale error, its median distance from depth (metres) and the share of depth that
 meets it; Polycam's meshes have 1 %, 2 cm and 0.85."""
 SEEN_WITHIN_M, NEAREST_M = 0.08, 0.1
@@ -43,7 +43,7 @@ def build(
     scale, agree = depth_against(clip, fine, upright_from_world @ odometry, SEEN_WITHIN_M)
     poses, gap = fuse.align_frames(clip, fine, upright_from_world @ odometry, config.fusion)
     off_m = float(np.nanmedian(gap)) if np.isfinite(gap).any() else np.inf
-    if not abs(scale - 1) < MOST_SCALE_ERROR or agree < LEAST_AGREE or off_m > MOST_GAP_M:
+    if not abs(scale - 1) < MAX_SCALE_ERROR or agree < MIN_AGREE or off_m > MAX_GAP_M:
         measured = f"depth / mesh {scale:.3f}, {agree:.0%} of depth agrees"
         log(f"the recording's own mesh is refuted, one is fused instead: {measured}")
         return None

@@ -28,15 +28,15 @@ CANDIDATE_REACH = 1.5
 """Point pairs up to so many reaches apart are candidates."""
 NEAREST_M = 0.1
 """Depth below this is none, metres."""
-LEAST_COSINE = 0.7
+MIN_COSINE = 0.7
 """Normals of a pair, both known, agree within 45 degrees: rims and backs of thin walls are other surfaces."""
 FIRST_ROUNDS, FIRST_INFLATION = 6, 3.0
 """Steps that place keyframes by points and odometry, and factor on the deviation of depth in them."""
-SHARED_POINTS, LEAST_PAIRS = 30, 10
+SHARED_POINTS, MIN_PAIRS = 30, 10
 """Depth of pairs that share so many points is judged by them; fewer pairs judge nothing."""
-LEAST_VARIANCE = 0.25
+MIN_VARIANCE = 0.25
 """Least factor on the assumed variance of depth: neighbouring pixels err together more than pairs show."""
-OVERLAP_STEP, LEAST_OVERLAP = 7, 0.3
+OVERLAP_STEP, MIN_OVERLAP = 7, 0.3
 """One point in so many measures the overlap of two keyframes; the least share that makes them neighbours."""
 
 
@@ -79,7 +79,7 @@ def _pair_correspondences(keyframes, first, second, world_from_camera, reach_m):
     normal = target.normals[row, column]
     gap = np.abs(np.einsum("ci,ci->c", moved[inside] - met, normal))
     own = keyframes[first].normals.reshape(-1, 3)[source.pixel_index[inside]] @ second_from_first[:3, :3].T
-    good = (np.einsum("ci,ci->c", own, normal) > LEAST_COSINE) & (gap < CANDIDATE_REACH * reach_m)
+    good = (np.einsum("ci,ci->c", own, normal) > MIN_COSINE) & (gap < CANDIDATE_REACH * reach_m)
     inside, met = inside[good], met[good]
     sigma = DEPTH_INFLATION * np.hypot(source.sigma_m[inside], depth_scans.depth_noise(met[:, 2]))
     direction = normal[good] @ world_from_camera[second, :3, :3].T
@@ -102,7 +102,7 @@ def overlapping(
             seen[second] = inside.mean() if len(points) else 0
         seen[first] = 0
         ranked = np.argsort(-seen, kind="stable")
-        best = ranked[seen[ranked] > LEAST_OVERLAP]
+        best = ranked[seen[ranked] > MIN_OVERLAP]
         chosen = {first + 1, *best[:: max(1, len(best) // neighbours)][:neighbours].tolist()}
         pairs += [(first, second) for second in sorted(chosen) if second < len(keyframes)]
     return np.array(pairs).reshape(-1, 2)
@@ -154,12 +154,12 @@ def depth_variance(
     judged = [(int(a), int(b)) for a, b in pairs if shared[a, b] >= SHARED_POINTS]
     parts = [_pair_correspondences(keyframes, a, b, world_from_camera, REACH_M[0]) for a, b in judged]
     parts = [part for part in parts if len(part.first) >= SHARED_POINTS]
-    if len(parts) < LEAST_PAIRS:
+    if len(parts) < MIN_PAIRS:
         return 1.0
     group = np.repeat(np.arange(len(parts)), [len(part.first) for part in parts])
     joined = pose_optimization.Correspondences.join(*parts)
     squares = pose_optimization.chi_squares(world_from_camera, joined, group, REACH_M[0])
-    return max(LEAST_VARIANCE, pose_optimization.variance_factor(squares))
+    return max(MIN_VARIANCE, pose_optimization.variance_factor(squares))
 
 
 def odometry_factors(

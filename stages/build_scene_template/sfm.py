@@ -33,16 +33,16 @@ LOOP_M, LOOP_DEG = 1.0, 35.0
 FIRST_STEP, SECOND_STEP = 5, 3
 """Without odometry every fifth keyframe is matched with every third one."""
 DATABASE = "database.db"
-LEAST_KEYFRAMES = 3
+MIN_KEYFRAMES = 3
 """A smaller model is none."""
 AGREE_M = 0.06
 """Matched depth points this close after one rigid motion agree, metres: twice the depth noise at 4 m."""
-LEAST_SHARE, LEAST_MATCHES = 0.5, 8
+MIN_SHARE, MIN_MATCHES = 0.5, 8
 """Share and number of the matches with depth that must agree."""
-MOST_DEG, MOST_M = 6.0, 0.3
+MAX_DEG, MAX_M = 6.0, 0.3
 """The motion may differ by this much from the odometry's, degrees and metres: drift, not another tile."""
 RANSAC_TRIPLETS = 80
-LEAST_SIDE_M = 0.15
+MIN_SIDE_M = 0.15
 """Least side of a RANSAC triplet, metres."""
 NEAREST_M = 0.1
 """Depth below this is none, metres."""
@@ -57,7 +57,7 @@ def choose_keyframes(clip: Clip, config: SfmConfig) -> Int[np.ndarray, "key"]:
         moved = np.linalg.norm(np.diff(pose[:, :3, 3], axis=0), axis=1) / KEYFRAME_M
         rotated = np.rad2deg(rigid.rotation_angle(pose[:-1, :3, :3], pose[1:, :3, :3])) / KEYFRAME_DEG
         progress = np.concatenate([[0.0], np.cumsum(np.maximum(moved, rotated))])
-    progress = progress * min(1.0, (config.most_keyframes - 2) / max(progress[-1], 1e-6))
+    progress = progress * min(1.0, (config.max_keyframes - 2) / max(progress[-1], 1e-6))
     step = np.floor(progress).astype(int)
     starts = np.flatnonzero(np.diff(step, prepend=-1) > 0)
     bounds = np.append(starts, len(step))
@@ -100,7 +100,7 @@ def reconstruct(clip: Clip, config: SfmConfig, workspace: Path, seed: int) -> Sp
     if not models:
         return None
     largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    return read_sparse_model(largest) if largest.num_reg_images() >= LEAST_KEYFRAMES else None
+    return read_sparse_model(largest) if largest.num_reg_images() >= MIN_KEYFRAMES else None
 
 
 def points_under(
@@ -162,19 +162,19 @@ def _confirmed(clip, frames, points, first, second, matches, rng) -> Num[np.ndar
         return matches
     source, target = points[second][matches[:, 1]], points[first][matches[:, 0]]
     known = np.isfinite(source[:, 0]) & np.isfinite(target[:, 0])
-    if known.sum() < LEAST_MATCHES:
+    if known.sum() < MIN_MATCHES:
         return matches[:0]
     first_from_second, inlier = align.ransac_rigid(
         source[known], target[known],
-        threshold_m=AGREE_M, iterations=RANSAC_TRIPLETS, rng=rng, least_side_m=LEAST_SIDE_M,
+        threshold_m=AGREE_M, iterations=RANSAC_TRIPLETS, rng=rng, min_side_m=MIN_SIDE_M,
     )  # fmt: skip
-    if inlier.sum() < max(LEAST_MATCHES, LEAST_SHARE * known.sum()):
+    if inlier.sum() < max(MIN_MATCHES, MIN_SHARE * known.sum()):
         return matches[:0]
     if clip.odometry_from_camera is not None:
         odometry = clip.odometry_from_camera
         expected = rigid.inverse(odometry[frames[first]]) @ odometry[frames[second]]
         turned = np.rad2deg(rigid.rotation_angle(expected[:3, :3], first_from_second[:3, :3]))
-        if turned > MOST_DEG or np.linalg.norm(expected[:3, 3] - first_from_second[:3, 3]) > MOST_M:
+        if turned > MAX_DEG or np.linalg.norm(expected[:3, 3] - first_from_second[:3, 3]) > MAX_M:
             return matches[:0]
     known[known] = inlier
     return matches[known]

@@ -16,7 +16,7 @@ from pipeline.mapping.colmap import SparseModel
 from stages.build_scene_template import anchor, fuse, refine, sfm
 from stages.build_scene_template.config import Config
 
-LEAST_POINTS = 100
+MIN_POINTS = 100
 """Measured points with a normal, and faces of the fused mesh, below which there is no surface."""
 REGISTERED_WITHIN_M = 0.1
 """A frame whose median depth gap is larger is not registered, metres."""
@@ -65,11 +65,11 @@ def build(
     keys = refine.refine_keyframes(clip, frames, keyframes, keys, tracked, config.refinement)
     poses = anchor.propagate(clip, frames, keys)
     points, normals = _measured(keyframes, keys)
-    if len(points) < LEAST_POINTS:
+    if len(points) < MIN_POINTS:
         raise _no_surface(clip)
     upright_from_world, gravity = anchor.upright(clip, poses, points, normals)
     mesh = fuse.fuse(clip, frames, upright_from_world @ poses, config.fusion)
-    if len(mesh.faces) < LEAST_POINTS:
+    if len(mesh.faces) < MIN_POINTS:
         raise _no_surface(clip)
     poses, gap = fuse.align_frames(clip, mesh, upright_from_world @ poses, config.fusion, frames)
     mesh = fuse.fuse(clip, np.arange(len(clip)), poses, config.fusion)

@@ -13,7 +13,7 @@ from stages.check_captures.sampling import SampledFrame
 
 POINTS = 600
 WITHIN_M = 0.06
-LEAST = 10
+MIN = 10
 """points that must agree for a frame to be placed"""
 AGREE = (15.0, 0.6)
 """degrees and metres within which two frames mean the same place"""
@@ -34,7 +34,7 @@ def describe(shots: Sequence[SampledFrame]) -> list[DescribedFrame]:
     for shot in shots:
         keypoints = sift.describe(shot.gray, POINTS)
         points = sift.lift(keypoints, shot.intrinsics, shot.depth, shot.depth_intrinsics)
-        if len(points.points_camera) >= LEAST:
+        if len(points.points_camera) >= MIN:
             found.append(DescribedFrame(shot, points))
     return found
 
@@ -61,7 +61,7 @@ def _best_place(
     walkthrough: Sequence[DescribedFrame], frame: DescribedFrame, rng: np.random.Generator
 ) -> Float[np.ndarray, "4 4"] | None:
     """Return where one frame puts its odometry in the walk-through's, None where no frame of that fits."""
-    best, place = LEAST - 1, None
+    best, place = MIN - 1, None
     for known in walkthrough:
         mine, theirs = sift.matches(frame.points.descriptors, known.points.descriptors).T
         if len(mine) <= best:

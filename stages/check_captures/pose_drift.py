@@ -9,7 +9,7 @@ from stages.check_captures.sampling import SampledFrame
 
 LATER_S = 5.0
 MIN_OVERLAP = 0.3
-MOST_PAIRS = 60
+MAX_PAIRS = 60
 SAME_DIRECTION, NEAR_M = 0.8, 1.5
 """Cosine between optical axes, and distance, of cameras that can see the same."""
 
@@ -25,7 +25,7 @@ def drift_m(shots: Sequence[SampledFrame]) -> float:
         if second.timestamp_s - first.timestamp_s >= LATER_S and _similar_views(first, second)
     ]
     found = []
-    for first, second in pairs[:: max(1, len(pairs) // MOST_PAIRS)]:
+    for first, second in pairs[:: max(1, len(pairs) // MAX_PAIRS)]:
         views = [DepthPicture(shot.depth, shot.depth_intrinsics) for shot in (first, second)]
         second_from_first = second.camera_from_odometry @ first.odometry_from_camera
         residual_m, overlap, _ = compare(*views, second_from_first=second_from_first)

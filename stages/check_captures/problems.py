@@ -37,12 +37,12 @@ class CaptureMeasurements:
 
 
 SHORTEST_S: dict[Role, float] = {"walkthrough": 30.0, "turnaround": 8.0, "session": 15.0, "heldout": 5.0}
-MOST_DARK, MOST_BLURRED, LEAST_DEPTH, MOST_BEYOND, MOST_DAMAGED = 0.2, 0.25, 0.5, 0.2, 0.0
-MOST_DRIFT_M = 0.10
-LEAST_PLACED = 0.05
-LEAST_SEEN = 0.25
-LEAST_LINKED, LEAST_PARALLAX = 0.6, 0.3
-MOST_SEVERAL = 0.5
+MAX_DARK, MAX_BLURRED, MIN_DEPTH, MAX_BEYOND, MAX_DAMAGED = 0.2, 0.25, 0.5, 0.2, 0.0
+MAX_DRIFT_M = 0.10
+MIN_PLACED = 0.05
+MIN_SEEN = 0.25
+MIN_LINKED, MIN_PARALLAX = 0.6, 0.3
+MAX_SEVERAL = 0.5
 LONGEST_GAP_S = 1.0
 SPARSE_HZ = 5.0
 REMEDIES = {
@@ -75,13 +75,13 @@ def problems(seen: CaptureMeasurements, role: Role) -> list[CaptureProblem]:
 
 def _of_pictures(sample: RecordingSample, role: Role) -> dict[str, str]:
     found = {}
-    if sample.damaged > MOST_DAMAGED:
+    if sample.damaged > MAX_DAMAGED:
         found["CAP-030"] = f"{sample.damaged:.0%} of the pictures are damaged"
     if sample.duration_s < SHORTEST_S[role]:
         found["CAP-031"] = f"only {sample.duration_s:.0f} s long"
-    if sample.dark > MOST_DARK:
+    if sample.dark > MAX_DARK:
         found["CAP-032"] = f"{sample.dark:.0%} of the pictures are dark"
-    if sample.blurred > MOST_BLURRED:
+    if sample.blurred > MAX_BLURRED:
         found["CAP-033"] = f"{sample.blurred:.0%} of the pictures are blurred"
     if sample.longest_gap_s > LONGEST_GAP_S and sample.rate_hz > 1:
         found["CAP-034"] = f"frames are missing for {sample.longest_gap_s:.1f} s"
@@ -94,9 +94,9 @@ def _of_depth(seen: CaptureMeasurements, role: Role) -> dict[str, str]:
     sample, found = seen.sample, {}
     if sample.plan is None:
         return _of_pictures_alone(seen.parallax, role)
-    if sample.depth_valid < LEAST_DEPTH:
+    if sample.depth_valid < MIN_DEPTH:
         found["CAP-037"] = f"{1 - sample.depth_valid:.0%} of the depth is unknown"
-    if sample.beyond > MOST_BEYOND:
+    if sample.beyond > MAX_BEYOND:
         found["CAP-038"] = f"{sample.beyond:.0%} of the depth is beyond the sensor's range"
     return found
 
@@ -107,7 +107,7 @@ def _of_pictures_alone(parallax: Parallax | None, role: Role) -> dict[str, str]:
         return {"CAP-036": what}
     mapped = "there is no depth: the room is mapped from pictures"
     found = {"CAP-039": f"{mapped}; without a session that has depth its scale is relative"}
-    if parallax is not None and (parallax.linked < LEAST_LINKED or parallax.with_parallax < LEAST_PARALLAX):
+    if parallax is not None and (parallax.linked < MIN_LINKED or parallax.with_parallax < MIN_PARALLAX):
         linked = f"{parallax.linked:.0%} of neighbouring pictures show the same things"
         found["CAP-056"] = f"{linked}, {parallax.with_parallax:.0%} of these from elsewhere"
     return found
@@ -121,18 +121,18 @@ def _of_poses(seen: CaptureMeasurements) -> dict[str, str]:
         return {"CAP-050": f"device poses are not used: {plan.pose_check.reason}"}
     if plan.pose_check.verdict == "other":
         found["CAP-051"] = plan.pose_check.reason
-    if seen.drift_m > MOST_DRIFT_M:
+    if seen.drift_m > MAX_DRIFT_M:
         found["CAP-052"] = f"device poses drift: {100 * seen.drift_m:.0f} cm between visits of one place"
     return found
 
 
 def _of_content(seen: CaptureMeasurements, role: Role) -> dict[str, str]:
     found = {}
-    if seen.placed is not None and seen.placed < LEAST_PLACED:
+    if seen.placed is not None and seen.placed < MIN_PLACED:
         found["CAP-053"] = f"{seen.placed:.0%} of the frames are found in the walk-through"
     if seen.moving is not None and role == "session":
-        if seen.moving.seen < LEAST_SEEN:
+        if seen.moving.seen < MIN_SEEN:
             found["CAP-054"] = f"something of an animal's size moves in {seen.moving.seen:.0%} of the frames"
-        if seen.moving.several > MOST_SEVERAL:
+        if seen.moving.several > MAX_SEVERAL:
             found["CAP-055"] = f"two things move far apart in {seen.moving.several:.0%} of the frames"
     return found

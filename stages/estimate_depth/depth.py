@@ -32,7 +32,7 @@ SWEPT_PX, SOURCES, PLANES, ANGLES_DEG = 224, 4, 96, (3.0, 22.0)
 and the angles, at the middle of the view, under which the frames see it, degrees."""
 NEAREST_M, FARTHEST_SHARE = 0.25, 1.3
 """Nearest plane, metres, and the farthest, in units of the farthest of the map's depth."""
-LEAST_AGREEING = 2
+MIN_AGREEING = 2
 """Other frames that must confirm a depth; one more makes it certain."""
 
 Learned = Callable[[int, Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]], np.ndarray]
@@ -95,7 +95,7 @@ def _parts(mask: Bool[np.ndarray, "height width"]) -> list[Bool[np.ndarray, "hei
     count, label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     sizes = np.bincount(label.ravel(), minlength=count)[1:]
     order = 1 + np.argsort(-sizes, kind="stable")
-    return [label == part for part in order if sizes[part - 1] >= contact.LEAST_AREA_PX]
+    return [label == part for part in order if sizes[part - 1] >= contact.MIN_AREA_PX]
 
 
 def _with_animal(frame, target: ColorView, parts, touched, carried, length_m, learned) -> FrameDepth:
@@ -142,12 +142,12 @@ def of_turnaround(shown: Sequence[ColorView], room: MapViews, walk: Sequence[Col
         size = target.view.gray.shape[::-1]
         agree = cv2.resize(agree, size, interpolation=cv2.INTER_NEAREST)
         several = cv2.resize(swept[number], size, interpolation=cv2.INTER_NEAREST)
-        known = agree >= LEAST_AGREEING
+        known = agree >= MIN_AGREEING
         seen = [by_view[id(view)] for view in tracking.walk_views(target.view, room)]
         before = cv2.dilate(foreground.foreground(target, seen, []).astype(np.uint8), RIM) > 0
         mapped = of_map(target)
         depth = np.where(known, several, np.where(before, 0, mapped.depth))
-        sure = np.clip(agree.astype(int) - LEAST_AGREEING + 1, 0, 2)
+        sure = np.clip(agree.astype(int) - MIN_AGREEING + 1, 0, 2)
         confidence = np.where(known, sure, np.where(depth > 0, 1, 0))
         found.append(FrameDepth(depth.astype(np.float32), confidence.astype(np.uint8), False))
     return found

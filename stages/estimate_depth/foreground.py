@@ -24,7 +24,7 @@ SLACK_PX, SOFTNESS_PX = 2, 0.8
 DIFFERS, MAY_DIFFER = 22.0, 9.0
 """Differences of colours (CIE Lab, 0 to 255 each, summed) beyond the slack that are no noise, and that are
 none beside such."""
-LEAST_SEEN, WALK_SHARE, LEAST_TIMES, TIMES_SHARE = 2, 0.5, 2, 0.1
+MIN_SEEN, WALK_SHARE, MIN_TIMES, TIMES_SHARE = 2, 0.5, 2, 0.1
 """Pictures of other times that must have seen a place, share of the walk-through's pictures that must differ,
 and number and share of those of other times: an animal may rest at one place for most of a recording."""
 OPENED, CLOSED = np.ones((3, 3), np.uint8), np.ones((7, 7), np.uint8)
@@ -53,7 +53,7 @@ def difference(
     warped = views.warp(target.view, source.view)
     shown = cv2.remap(source.lab, warped.there[..., 0] - 0.5, warped.there[..., 1] - 0.5, cv2.INTER_LINEAR)
     known = warped.known
-    if known.sum() < LEAST_SEEN:
+    if known.sum() < MIN_SEEN:
         return np.zeros(known.shape, np.float32), np.zeros(known.shape, bool)
     # exposure and white balance change between recordings
     shown = shown + np.median((target.lab - shown)[known], axis=0)
@@ -82,9 +82,9 @@ def _differing(by_walk, by_times, limit: float) -> Bool[np.ndarray, "height widt
     walked, seen_walk = _votes(by_walk, limit)
     timed, seen = _votes(by_times, limit)
     unlike_walk = (seen_walk == 0) | (walked >= WALK_SHARE * seen_walk)
-    enough = np.maximum(TIMES_SHARE * seen, np.minimum(LEAST_TIMES, seen))
-    unlike_times = (seen < LEAST_SEEN) | (timed >= enough)
-    return unlike_walk & unlike_times & ((seen_walk > 0) | (seen >= LEAST_SEEN))
+    enough = np.maximum(TIMES_SHARE * seen, np.minimum(MIN_TIMES, seen))
+    unlike_times = (seen < MIN_SEEN) | (timed >= enough)
+    return unlike_walk & unlike_times & ((seen_walk > 0) | (seen >= MIN_SEEN))
 
 
 def _votes(compared, limit: float):

@@ -18,9 +18,9 @@ FOCAL_SHARE = 0.85
 """Focal length that calibration begins from, share of the picture's longer side: a phone's main camera."""
 FRAMES = 40
 """Frames that calibrate the lens, those with the most points of the map."""
-LEAST_MATCHES = 6
+MIN_MATCHES = 6
 """Matches without which there is no camera: with fewer, three wrong ones may agree."""
-LEAST_INLIERS, LEAST_SHARE = 25, 0.25
+MIN_INLIERS, MIN_SHARE = 25, 0.25
 """Matches that must agree on a pose, and their share of all, for a frame to be sure of its place."""
 PIXELS_SHARE = 0.008
 """Share of the picture's longer side within which a match agrees: the noise of a map of centimetres."""
@@ -30,7 +30,7 @@ LOSS_PX = 1.0
 """Residual from which on a match counts less in the calibration, pixels."""
 RADIAL_SIGMA = 0.05
 """Deviation of the distortion from none, in units of a match's: phones straighten their videos."""
-LEAST_BEND_PX = 0.5
+MIN_BEND_PX = 0.5
 """Distortion at the corner below which pictures stay as they are, pixels."""
 
 
@@ -64,7 +64,7 @@ class Lens:
     def bends(self) -> bool:
         """Return whether pictures must be undistorted."""
         corner = np.hypot(*self.size) / 2 / self.focal_px
-        return abs(self.radial) * corner**3 * self.focal_px > LEAST_BEND_PX
+        return abs(self.radial) * corner**3 * self.focal_px > MIN_BEND_PX
 
     def straightened(self, color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
         """Return a picture as the pinhole alone would have taken it."""
@@ -89,7 +89,7 @@ class Located:
     @property
     def sure(self) -> bool:
         """Return whether enough matches agree to believe it without neighbours."""
-        return len(self.matches.pixel) >= LEAST_INLIERS and self.share >= LEAST_SHARE
+        return len(self.matches.pixel) >= MIN_INLIERS and self.share >= MIN_SHARE
 
 
 def locate(
@@ -99,7 +99,7 @@ def locate(
 
     None where too few matches agree on any.
     """
-    if len(matches.pixel) < LEAST_MATCHES:
+    if len(matches.pixel) < MIN_MATCHES:
         return None
     estimation = pycolmap.AbsolutePoseEstimationOptions()
     refinement = pycolmap.AbsolutePoseRefinementOptions()

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float
 
 ROUNDS = 8
 """Reweighted least-squares fits; the weights have settled by then."""
-LEAST_PIXELS = 50
+MIN_PIXELS = 50
 """Pixels of the map without which a frame cannot be scaled."""
 NEAREST_M, FARTHEST_M = 0.1, 20.0
 """Depth beyond these is none, metres."""
@@ -21,7 +21,7 @@ def aligned(
     Scale and shift are fitted to the map's depth (metres) where it ``counts``, Cauchy weights at the median
     residual; 0 where there is none, and everywhere where too little counts or the scale is not positive.
     """
-    if counts.sum() < LEAST_PIXELS:
+    if counts.sum() < MIN_PIXELS:
         return np.zeros(inverse.shape, np.float32)
     known, target = inverse[counts].astype(float), 1 / mapped[counts].astype(float)
     design, weight = np.stack([known, np.ones_like(known)], axis=1), np.ones(len(known))

@@ -25,7 +25,7 @@ from stages.estimate_depth.foreground import ColorView
 from stages.estimate_depth.lens import Lens
 from stages.estimate_depth.tracking import MapViews, Tracked, TrackingInput
 
-LEAST_PLACED, LEAST_FRAMES = 0.3, 10
+MIN_PLACED, MIN_FRAMES = 0.3, 10
 """Share of the frames, and their number, that must find a place in the map."""
 
 
@@ -58,7 +58,7 @@ def run(
     room = MapViews(caster, [each.view for each in walked])
     found, tracked = _placed(pictures, known, room, config)
     placed = np.flatnonzero(tracked.placed)
-    if len(placed) < max(LEAST_FRAMES, LEAST_PLACED * len(pictures)):
+    if len(placed) < max(MIN_FRAMES, MIN_PLACED * len(pictures)):
         raise _unrecognized(pictures, f"{len(placed)} of {len(pictures)} frames find a place in the map")
     log(f"focal length {found.focal_px:.1f} px; {len(placed)} of {len(pictures)} frames placed")
     shown = []
@@ -77,7 +77,7 @@ def run(
             assert_never(role)
     chosen = [number for number, each in enumerate(depths) if each is not None]
     known = [each for each in depths if each is not None]
-    if len(chosen) < LEAST_FRAMES:
+    if len(chosen) < MIN_FRAMES:
         raise _unrecognized(pictures, "its pictures differ from what the map shows nearly everywhere")
     log(f"{len(placed) - len(chosen)} frames left out that differ from the map nearly everywhere")
     estimated = writing.Estimated(placed[chosen], tracked, found, known)

@@ -32,7 +32,7 @@ PROBES = 60
 TRACKED_SHARE, ENOUGH_SHARE = 0.35, 0.7
 """Share of the flow between frames that must agree on a camera for it to be placed, and with which no other
 explanation is searched."""
-LEAST_SURE = 3
+MIN_SURE = 3
 """Frames placed by landmarks that a piece between two jumps needs."""
 FASTEST_M_S, FASTEST_RAD_S = 3.0, 4.0
 """A camera that moves faster than this between frames was misplaced."""
@@ -114,7 +114,7 @@ def forget_strays(
     poses: Float[np.ndarray, "frame 4 4"],
     sure: Bool[np.ndarray, "frame"],
 ) -> None:
-    """Forget, in place, pieces between jumps that fewer than `LEAST_SURE` frames placed by landmarks hold.
+    """Forget, in place, pieces between jumps that fewer than `MIN_SURE` frames placed by landmarks hold.
 
     On floors that repeat, flow locks on to the wrong board.
     """
@@ -126,7 +126,7 @@ def forget_strays(
     fast |= rigid.rotation_angle(poses[known[:-1], :3, :3], poses[known[1:], :3, :3]) > FASTEST_RAD_S * gap_s
     piece = np.r_[0, np.cumsum(fast)]
     held = np.bincount(piece, sure[known], minlength=piece[-1] + 1)
-    poses[known[(held < min(LEAST_SURE, held.max()))[piece]]] = np.nan
+    poses[known[(held < min(MIN_SURE, held.max()))[piece]]] = np.nan
 
 
 def _view(frame: int, footage: TrackingInput, pose, room: MapViews) -> View:

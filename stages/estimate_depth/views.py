@@ -22,7 +22,7 @@ LONGEST_PX = 20.0
 """Longer flow between pictures of one camera is none, pixels."""
 OCCLUDED_SHARE, OCCLUDED_M = 0.03, 0.03
 """A point is hidden where the surface lies nearer by this share of its depth and this many metres."""
-LEAST_KNOWN = 0.05
+MIN_KNOWN = 0.05
 """Share of a picture that must be known from the other's camera for both to be compared."""
 CLAHE_CLIP, CLAHE_TILES = 4.0, (6, 8)
 """Local contrast equalisation before flow: clip limit and tiles (columns, rows)."""
@@ -86,7 +86,7 @@ def flow_matches(target: View, source: View) -> Matches:
     The target's camera is a guess: the source's picture is brought there, flow measures how far off it is.
     """
     warped = warp(target, source)
-    if warped.known.mean() < LEAST_KNOWN:
+    if warped.known.mean() < MIN_KNOWN:
         return Matches(np.zeros((0, 2)), np.zeros((0, 3)))
     shown = cv2.remap(source.gray, warped.there[..., 0] - 0.5, warped.there[..., 1] - 0.5, cv2.INTER_LINEAR)
     shown = np.where(warped.known, shown, target.gray)

@@ -13,7 +13,7 @@ from pipeline.data.flow import STRIDE_PX, open_confidence, open_flow
 from pipeline.geometry import subsampling
 
 SHOWN_FRAMES = 6
-LEAST_AGREEMENT = {1: 0.6, 2: 0.5, 4: 0.35, 8: 0.2}
+MIN_AGREEMENT = {1: 0.6, 2: 0.5, 4: 0.35, 8: 0.2}
 """share of vectors that should agree, by the gap"""
 CERTAIN = 128
 """stored confidence (of 255) that counts as agreement"""
@@ -52,7 +52,7 @@ def report_quality(folder: Path, reviews: Sequence[Review]) -> None:
     """Write the stage's own judgement."""
     checks = []
     for each in reviews:
-        name, least = f"both directions agree, {each.gap} apart", 100 * LEAST_AGREEMENT[each.gap]
+        name, least = f"both directions agree, {each.gap} apart", 100 * MIN_AGREEMENT[each.gap]
         checks.append(qa.Check(name, 100 * each.agreement, "%", warn=least, better="higher"))
     checks += [qa.Check(f"mean motion, {each.gap} apart", each.speed_px, "px") for each in reviews]
     pictures, key = [], "(hue = direction, as the disc shows), dark where uncertain"

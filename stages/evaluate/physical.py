@@ -66,7 +66,7 @@ def _sampled(made: Samples) -> list[BodyMotion]:
 def _put(metrics: Metrics, kind: str, meter: PlausibilityMeter, motions: Sequence[BodyMotion]) -> None:
     resampled = [resample_motion(np.arange(len(motion)) / RATE_HZ, motion) for motion in motions]
     found = [meter.plausibility(motion, meter.stance(motion)) for motion in resampled]
-    slide = np.array([each.least_slide_m_s for each in found])
+    slide = np.array([each.min_slide_m_s for each in found])
     no_foot = "no foot ever comes near the scene"
     metrics.put(f"behavior/{kind}/penetration_m", float(np.mean([each.penetration_m for each in found])))
     metrics.put(f"behavior/{kind}/foot_slide_m_s", median(slide[np.isfinite(slide)]), no_foot)

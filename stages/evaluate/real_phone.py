@@ -23,7 +23,7 @@ LOCALIZED = 40
 """frames that vote where registration places the phone"""
 AGREE = (5.0, 0.2)
 """degrees and metres within which two frames mean the same place"""
-LEAST_VOTES = 4
+MIN_VOTES = 4
 UNPLACED = "the held-out phone was neither clicked (`make annotate`) nor could registration place it"
 NO_MASKS = "the held-out phone of a real capture has no masks"
 PARTS_WITHOUT_MASKS = tuple(name for name in NAMES if name.endswith(("_agent", "_scene")))
@@ -56,13 +56,13 @@ def cameras_of(
 
 def agreement(votes: Float[np.ndarray, "vote 4 4"]) -> tuple[Float[np.ndarray, "4 4"], int] | None:
     """Return the mean of the largest group of votes that agree, and its size; None below four."""
-    if len(votes) < LEAST_VOTES:
+    if len(votes) < MIN_VOTES:
         return None
     degrees = np.degrees(rigid.rotation_angle(votes[:, None, :3, :3], votes[None, :, :3, :3]))
     meters = np.linalg.norm(votes[:, None, :3, 3] - votes[None, :, :3, 3], axis=-1)
     near = (degrees < AGREE[0]) & (meters < AGREE[1])
     group = near[near.sum(1).argmax()]
-    if group.sum() < LEAST_VOTES:
+    if group.sum() < MIN_VOTES:
         return None
     shift = np.median(votes[group][:, :3, 3], axis=0)
     return rigid.make(rigid.mean_rotation(votes[group][:, :3, :3]), shift), int(group.sum())

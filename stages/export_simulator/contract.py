@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.behavior.config import MOST_GUIDANCE, ReplanningConfig
+from pipeline.behavior.config import MAX_GUIDANCE, ReplanningConfig
 from pipeline.geometry import rigid
 from stages.export_simulator.actions import SessionClip
 from stages.export_simulator.export import SimulatorParts
@@ -26,7 +26,7 @@ _DEFAULT_PACE_M_S = 0.4
 """Pace of an animal that no recording shows walking."""
 
 
-LEAST_SUPPORTED = 0.9
+MIN_SUPPORTED = 0.9
 """Share of recorded frames above something solid or filled floor below which the page and the report warn."""
 _UNSUPPORTED = "Little of this floor was recorded: the animal may float or sink."
 
@@ -39,7 +39,7 @@ def contract(
     ``labels`` of recordings go by their id; ``remark`` is what a visitor should know of the home.
     """
     motions, setting, skin = parts.motions, parts.setting, parts.skin
-    carried = behavior.supported is not None and behavior.supported >= LEAST_SUPPORTED
+    carried = behavior.supported is not None and behavior.supported >= MIN_SUPPORTED
     warning = " ".join(filter(None, (remark, None if carried else _UNSUPPORTED)))
     observers = np.concatenate([motion.world_from_camera[:, :3, 3] for motion in motions])
     heights = np.concatenate([motion.world_from_agent[:, 1, 3] for motion in motions])
@@ -89,7 +89,7 @@ def controls(sampling: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return what a visitor sets, its range and default; `interactivity` is the scale of guidance."""
     steps = int(sampling["sequence_steps"])
     return {
-        "interactivity": {"least": 0.0, "most": MOST_GUIDANCE, "default": float(sampling["guidance"])},
+        "interactivity": {"least": 0.0, "most": MAX_GUIDANCE, "default": float(sampling["guidance"])},
         "samples": {"choices": list(GOAL_CHOICES), "default": GOALS},
         "steps": {"choices": sorted({steps, FINE_STEPS}), "default": steps},
     }

@@ -11,7 +11,7 @@ from pipeline.data import glb, npz
 from pipeline.data.qa import Check, Picture
 from stages.export_simulator import page, pictures
 from stages.export_simulator.config import Config, Layout
-from stages.export_simulator.contract import LEAST_SUPPORTED, contract
+from stages.export_simulator.contract import MIN_SUPPORTED, contract
 from stages.export_simulator.export import SimulatorParts
 from stages.export_simulator.page import Asset
 from stages.export_simulator.reading import BehaviorAssets
@@ -120,7 +120,7 @@ def quality(parts: SimulatorParts, size_mb: float, supported: float | None) -> d
             Check("skinning loss, mean", float(residual_mm.mean()), "mm", warn=2.0, fail=10.0),
             Check("skinning loss, 99th percentile", float(np.percentile(residual_mm, 99)), "mm", warn=10.0),
             Check("skinning loss, largest", float(residual_mm.max()), "mm", warn=15.0),
-            Check(carried, supported, "share", LEAST_SUPPORTED, better="higher"),
+            Check(carried, supported, "share", MIN_SUPPORTED, better="higher"),
             Check("sessions to replay", len(parts.motions), "", warn=1, better="higher"),
         ],
         "pictures": [Picture("visits", visits, about), Picture("heat_maps", heat, about_heat)],

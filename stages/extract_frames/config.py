@@ -9,7 +9,7 @@ class PhotogrammetryConfig:
 
     keyframe_share: float = 0.06
     """A keyframe follows the last one when the picture has moved by this share of its width."""
-    most_keyframes: int = 120
+    max_keyframes: int = 120
     """Upper bound on keyframes; steps are widened until it holds."""
     features: int = 2000
     """SIFT features kept per keyframe."""

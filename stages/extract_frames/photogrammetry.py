@@ -29,9 +29,9 @@ from stages.extract_frames.structure import Structure
 
 LISTED = 12
 """lost pictures that the log names at most"""
-LEAST_AGREEING = 2
+MIN_AGREEING = 2
 """pictures that must confirm a depth; one more makes it trusted"""
-LEAST_MAPPED = 0.3
+MIN_MAPPED = 0.3
 """share of the keyframes below which the largest model is no map of the walk"""
 TYPICAL_DEPTH_M = 2.0
 """median depth that a model without metric scale is given: a room's, metres"""
@@ -86,7 +86,7 @@ def _write_keyframes(
             motion.add(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY))
             rows.append(row)
             sharpness.append(extraction.picture_statistics(color)[0])
-    if len(rows) < structure.LEAST_KEYFRAMES:
+    if len(rows) < structure.MIN_KEYFRAMES:
         raise no_map(recording, f"only {len(rows)} pictures can be read")
     keys = structure.choose_keyframes(np.array(motion.travelled), np.array(sharpness), config)
     chosen = np.array(rows)[keys]
@@ -104,7 +104,7 @@ def _solved(
     config: PhotogrammetryConfig,
     workspace: Path,
 ) -> Structure:
-    if len(rows) < structure.LEAST_KEYFRAMES:
+    if len(rows) < structure.MIN_KEYFRAMES:
         raise no_map(recording, "the camera hardly moves")
     known = recording.intrinsics
     if known is not None:
@@ -113,7 +113,7 @@ def _solved(
     solved = structure.solve(workspace / "pictures", names, known, config, workspace, SEED)
     if solved is None:
         raise no_map(recording, "its pictures do not fit together to one model")
-    if len(solved.sparse.frame) < LEAST_MAPPED * len(rows):
+    if len(solved.sparse.frame) < MIN_MAPPED * len(rows):
         raise no_map(recording, f"its largest model holds {len(solved.sparse.frame)} of {len(rows)} pictures")
     return solved
 
@@ -154,8 +154,8 @@ def _depths(
     for key, view in enumerate(views):
         near = [(swept[other], views[other]) for other in others[key]]
         agree = plane_sweep.agreement(swept[key], view, near)
-        depth.append(np.where(agree >= LEAST_AGREEING, swept[key], 0))
-        confidence.append(np.clip(agree.astype(int) - LEAST_AGREEING + 1, 0, 2).astype(np.uint8))
+        depth.append(np.where(agree >= MIN_AGREEING, swept[key], 0))
+        confidence.append(np.clip(agree.astype(int) - MIN_AGREEING + 1, 0, 2).astype(np.uint8))
     return depth, confidence
 
 

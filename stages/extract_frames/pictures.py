@@ -13,7 +13,7 @@ from pipeline.geometry import cameras
 from pipeline.recordings import extraction
 from pipeline.recordings.recording import Recording, damaged
 from stages.extract_frames.config import Config
-from stages.extract_frames.writing import LEAST_FRAMES, MOST_LOST
+from stages.extract_frames.writing import MAX_LOST, MIN_FRAMES
 
 SHEET_FRAMES, SHEET_HEIGHT_PX = 12, 200
 
@@ -36,10 +36,10 @@ def write(folder: Path, recording: Recording, config: Config) -> None:
         if row in shown:
             width = round(color.shape[1] * SHEET_HEIGHT_PX / color.shape[0])
             strip.append(cv2.resize(color, (width, SHEET_HEIGHT_PX), interpolation=cv2.INTER_AREA))
-    if len(rows) - len(chosen) > MOST_LOST * len(rows):
+    if len(rows) - len(chosen) > MAX_LOST * len(rows):
         raise damaged(recording.where, f"{len(rows) - len(chosen)} of {len(rows)} pictures cannot be decoded")
-    if len(chosen) < LEAST_FRAMES:
-        what = f"{len(chosen)} pictures, {LEAST_FRAMES} are the least"
+    if len(chosen) < MIN_FRAMES:
+        what = f"{len(chosen)} pictures, {MIN_FRAMES} are the least"
         raise InputError("CAP-007", what, recording.where, "record some seconds at least")
     sharpness, brightness = np.array(statistics, np.float32).T
     time_s = recording.timestamp_s[chosen]

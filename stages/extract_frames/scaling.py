@@ -24,11 +24,11 @@ POINTS = 800
 """SIFT points per frame"""
 WITHIN_M = 0.08
 """matched points this close after the fit agree, metres: the noise of phone depth at some metres"""
-LEAST_EXTENT_M = 5 * WITHIN_M
+MIN_EXTENT_M = 5 * WITHIN_M
 """the points that agree must reach this far along some axis, or their scale is uncertain"""
-LEAST_POINTS = 15
+MIN_POINTS = 15
 """points that must agree for a pair of frames to count"""
-LEAST_PAIRS = 4
+MIN_PAIRS = 4
 """pairs that must agree for the scale to be believed"""
 AGREE_SHARE = 0.1
 """relative difference of scale within which pairs agree"""
@@ -46,7 +46,7 @@ def meters_per_unit(mapped: Sequence[SiftPoints], measured: Recording, seed: int
         return None
     centre = float(np.median(scales))
     agreeing = np.abs(np.array(scales) / centre - 1) < AGREE_SHARE
-    if agreeing.sum() < max(LEAST_PAIRS, 0.5 * len(scales)):
+    if agreeing.sum() < max(MIN_PAIRS, 0.5 * len(scales)):
         return None
     return float(np.median(np.array(scales)[agreeing]))
 
@@ -65,7 +65,7 @@ def _described(recording: Recording) -> Iterator[SiftPoints]:
 def _scale(known: SiftPoints, frame: SiftPoints, seed: int) -> float | None:
     """Return metres per unit by one pair of frames, None where too few points agree."""
     mine, theirs = sift.matches(frame.descriptors, known.descriptors).T
-    if len(mine) < LEAST_POINTS:
+    if len(mine) < MIN_POINTS:
         return None
     source, target = known.points_camera[theirs], frame.points_camera[mine]
     ransac = pycolmap.RANSACOptions(max_error=WITHIN_M, random_seed=seed, max_num_trials=RANSAC_TRIALS)
@@ -74,6 +74,6 @@ def _scale(known: SiftPoints, frame: SiftPoints, seed: int) -> float | None:
     if fitted is None:
         return None
     close = target[np.asarray(fitted["inlier_mask"], bool)]
-    if len(close) < LEAST_POINTS or np.ptp(close, axis=0).max() < LEAST_EXTENT_M:
+    if len(close) < MIN_POINTS or np.ptp(close, axis=0).max() < MIN_EXTENT_M:
         return None
     return float(fitted["tgt_from_src"].scale)

@@ -18,21 +18,21 @@ from pipeline.mapping import colmap
 from pipeline.mapping.colmap import SparseModel, read_sparse_model
 from stages.extract_frames.config import PhotogrammetryConfig
 
-LEAST_KEYFRAMES = 8
+MIN_KEYFRAMES = 8
 """a model with fewer pictures is none"""
 PEAK_THRESHOLD = 0.004
 """SIFT's contrast threshold; plain walls need a low one (COLMAP's default is 0.0067)"""
 VISUAL_WORDS, DESCRIPTORS_PER_WORD = 256, 40
 """learned from so many descriptors of the recording itself"""
-LEAST_PARALLAX_PAIRS = 0.03
+MIN_PARALLAX_PAIRS = 0.03
 """share of the matched pairs that must show parallax, not a mere rotation or one plane"""
 MOTION_WIDTH_PX = 240
 """width to which pictures are reduced before corners are followed"""
 LOST_STEP = 0.1
 """share of the width by which a picture counts as moved where too few corners survive"""
-MOST_CORNERS, FOLLOWED_PX = 200, (15, 15)
+MAX_CORNERS, FOLLOWED_PX = 200, (15, 15)
 """corners of a picture, and the window by which they are found again"""
-LEAST_CORNERS, LEAST_FOLLOWED = 12, 0.4
+MIN_CORNERS, MIN_FOLLOWED = 12, 0.4
 """corners in a picture, and share of them found again, below which the tracking is lost"""
 
 
@@ -65,15 +65,15 @@ class PictureMotion:
 
     @staticmethod
     def _step(before: np.ndarray, after: np.ndarray) -> float:
-        corners = cv2.goodFeaturesToTrack(before, MOST_CORNERS, 0.01, 6)
-        if corners is None or len(corners) < LEAST_CORNERS:
+        corners = cv2.goodFeaturesToTrack(before, MAX_CORNERS, 0.01, 6)
+        if corners is None or len(corners) < MIN_CORNERS:
             return LOST_STEP
         no_guess = np.zeros(0, np.float32)
         moved, found, _ = cv2.calcOpticalFlowPyrLK(
             before, after, corners, no_guess, winSize=FOLLOWED_PX, maxLevel=3
         )
         good = found[:, 0] == 1
-        if good.sum() < LEAST_FOLLOWED * len(corners):
+        if good.sum() < MIN_FOLLOWED * len(corners):
             return LOST_STEP
         return float(np.median(np.linalg.norm((moved - corners)[good, 0], axis=1)) / before.shape[1])
 
@@ -82,7 +82,7 @@ def choose_keyframes(
     travelled: Float[np.ndarray, "frame"], sharpness: Float[np.ndarray, "frame"], config: PhotogrammetryConfig
 ) -> Int[np.ndarray, "key"]:
     """Pick the sharpest frame of every step of motion."""
-    steps = min(travelled[-1] / config.keyframe_share, config.most_keyframes - 1)
+    steps = min(travelled[-1] / config.keyframe_share, config.max_keyframes - 1)
     step = np.floor(travelled / max(travelled[-1], 1e-9) * steps).astype(int)
     starts = np.flatnonzero(np.diff(step, prepend=-1) > 0)
     bounds = np.append(starts, len(step))
@@ -108,15 +108,15 @@ def solve(
     colmap.extract(database, pictures, names, reader, sift)
     pairs = _pairs(_descriptors(database, names), config, seed)
     colmap.match(database, ((names[first], names[second]) for first, second in pairs), seed)
-    if _parallax_share(database) < LEAST_PARALLAX_PAIRS:
+    if _parallax_share(database) < MIN_PARALLAX_PAIRS:
         log("between none of the pictures the camera moves sideways: it turns on the spot")
         return None
     mapping = colmap.mapping_options(seed, calibrate=intrinsics is None)
-    mapping.min_model_size = LEAST_KEYFRAMES
+    mapping.min_model_size = MIN_KEYFRAMES
     models = pycolmap.incremental_mapping(database, pictures, workspace, mapping)
     sizes = sorted((model.num_reg_images() for model in models.values()), reverse=True)
     log(f"COLMAP: {len(pairs)} pairs of {len(names)} keyframes; models of {sizes or 'no'} pictures")
-    if not sizes or sizes[0] < LEAST_KEYFRAMES:
+    if not sizes or sizes[0] < MIN_KEYFRAMES:
         return None
     largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
     camera = next(iter(largest.cameras.values()))

@@ -15,9 +15,9 @@ from pipeline.recordings import extraction
 from pipeline.recordings.extraction import DARK, MEASURED, RELATIVE, ExtractedFrame, ExtractionPlan
 from pipeline.recordings.recording import Recording, damaged
 
-MOST_LOST = 0.5
+MAX_LOST = 0.5
 """share of damaged pictures (0..1) beyond which a recording is refused"""
-LEAST_FRAMES = 5
+MIN_FRAMES = 5
 """frames below which there is no motion to speak of: half a second"""
 BLURRED_SHARE = 0.4
 """a frame less sharp than this share of the median is blurred"""
@@ -65,11 +65,11 @@ def write_frames(
         images.write_gray(folder / "confidence" / f"{name}.png", frame.confidence)
         statistics.append((frame.sharpness, frame.brightness, frame.depth_valid))
         usable[number] = True
-    if lost > MOST_LOST * total:
+    if lost > MAX_LOST * total:
         raise damaged(where, f"{lost} of {total} pictures cannot be decoded")
-    if len(statistics) < LEAST_FRAMES:
+    if len(statistics) < MIN_FRAMES:
         known = f"{min_depth_valid:.0%} of the depth is known in {len(statistics)} of {total} frames"
-        what = f"{known}; {LEAST_FRAMES} are the least"
+        what = f"{known}; {MIN_FRAMES} are the least"
         remedy = "record some seconds at least, things within 5 m, in light, with the LiDAR camera"
         raise InputError("CAP-007", what, where, remedy)
     color_strip, depth_strip = (np.concatenate(pictures, axis=1) for pictures in zip(*strip, strict=True))

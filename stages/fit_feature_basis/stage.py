@@ -12,9 +12,9 @@ from pipeline.data.clips import Clip
 from stages.fit_feature_basis.config import Config
 from stages.fit_feature_basis.sampling import sample_descriptors
 
-LEAST_VARIANCE_PERCENT = 35.0
+MIN_VARIANCE_PERCENT = 35.0
 """variance that 16 axes hold of DAISY on any textured room; noise and plain pictures hold less"""
-LEAST_DESCRIPTORS = 2000
+MIN_DESCRIPTORS = 2000
 """a tenth of what four short recordings give"""
 
 
@@ -41,8 +41,8 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
         good="the 16 axes hold most of the variance",
         bad="less than a third of it: the pictures are noise, or have no texture",
         checks=[
-            qa.Check("variance held", held_percent, "%", warn=LEAST_VARIANCE_PERCENT, better="higher"),
-            qa.Check("descriptors", float(len(descriptors)), "", warn=LEAST_DESCRIPTORS, better="higher"),
+            qa.Check("variance held", held_percent, "%", warn=MIN_VARIANCE_PERCENT, better="higher"),
+            qa.Check("descriptors", float(len(descriptors)), "", warn=MIN_DESCRIPTORS, better="higher"),
             qa.Check("recordings", float(len(clips))),
         ],
     )

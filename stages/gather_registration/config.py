@@ -7,5 +7,5 @@ from dataclasses import dataclass
 class Config:
     """What the rest of the flow needs."""
 
-    least_registered: int = 1
+    min_registered: int = 1
     """Sessions that must be registered for the flow to go on."""

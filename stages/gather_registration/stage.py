@@ -33,7 +33,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
         outcomes.append(gather.SessionOutcome(video, status, poses, names.get(video, "")))
     summary = gather.summarise(outcomes)
     rejected = [outcome.description for outcome in outcomes if outcome.poses is None]
-    if summary["registered"] < config.least_registered:
+    if summary["registered"] < config.min_registered:
         raise InputError(
             "REG-001",
             f"{summary['registered']} of {summary['total']} sessions fit the walk-through "

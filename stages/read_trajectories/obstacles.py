@@ -16,7 +16,7 @@ MARGIN_M = 1.0
 HEADROOM_M = 1.0
 OBSTACLE_TOP_M = 1.0
 """Height of obstacles whose table has none, metres above the floor: as high as furniture."""
-MOST_VOXELS = 10_000_000
+MAX_VOXELS = 10_000_000
 
 
 def no_scene() -> FeatureVolume:
@@ -46,7 +46,7 @@ def volume_from_csv(path: Path, visited: Float[np.ndarray, "frame 3"], cell_m: f
     low[1] = floor - 2 * cell_m
     high = np.nanmax(corners, axis=0) + around + [0.0, HEADROOM_M, 0.0]
     size = np.ceil((high - low) / cell_m)
-    if size.prod() > MOST_VOXELS:
+    if size.prod() > MAX_VOXELS:
         span = " x ".join(f"{metres:g}" for metres in high - low)
         what = f"tracks and obstacles span {span} m, too much for cells of {cell_m:g} m"
         raise InputError("TRJ-001", what, str(path), "write metres; or set cell_m in the recipe")

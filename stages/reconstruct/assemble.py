@@ -28,7 +28,7 @@ from stages.reconstruct.problem import (
 )
 from stages.reconstruct.rays import RaySource, RayStore, Views, join
 
-LEAST_CONFIDENCE = 0.1
+MIN_CONFIDENCE = 0.1
 """frames whose camera is less certain give no rays"""
 DOUBTFUL_ROOT = 0.4
 """roots of less confidence may be given up"""
@@ -42,7 +42,7 @@ WHOLE_QUANTILE = 0.8
 """quantile of the masks' areas that stands for the whole animal in view"""
 WHOLE_SHARE = 0.6
 """masks count fully from this share of that area on, as seen from one metre"""
-LEAST_MASK_WEIGHT = 0.03
+MIN_MASK_WEIGHT = 0.03
 """and at least so much: where the animal hides, neighbouring frames know better"""
 GRID_CHANNELS = 4
 """channels of each grid"""
@@ -85,7 +85,7 @@ class RegisteredVideo:
     @property
     def certain_cameras(self) -> Bool[np.ndarray, "frame"]:
         """Return the frames whose camera is known and not doubtful."""
-        return np.isfinite(self.world_from_camera).all((1, 2)) & (self.confidence >= LEAST_CONFIDENCE)
+        return np.isfinite(self.world_from_camera).all((1, 2)) & (self.confidence >= MIN_CONFIDENCE)
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,7 @@ def mask_weights(views: Views) -> Float[Tensor, "frame"]:
     if not (area > 0).any():
         return torch.ones_like(area)
     share = area / area[area > 0].quantile(WHOLE_QUANTILE)
-    return torch.where(area > 0, (share / WHOLE_SHARE).clamp(LEAST_MASK_WEIGHT, 1), 1.0)
+    return torch.where(area > 0, (share / WHOLE_SHARE).clamp(MIN_MASK_WEIGHT, 1), 1.0)
 
 
 def interpolated(

@@ -30,15 +30,15 @@ TRUNCATION_VOXELS = 2.0
 """signed distances saturate at so many voxels"""
 RING_PX = 10
 """left out around the agent's mask, color pixels"""
-LEAST_WEIGHT = 0.1
+MIN_WEIGHT = 0.1
 """evidence below which a voxel counts as unseen: one frame from one metre is 1"""
-MOST_WEIGHT = 6e4
+MAX_WEIGHT = 6e4
 """evidence is cut here, just below the largest half float"""
 MOVED = (0.3, 0.7)
 """a video goes over from the shared scene to its own between these differences, in units of the truncation"""
 MOVED_VOXELS = 8
 """from so many voxels beyond the middle of these on, a block counts as changed"""
-LEAST_SURFACE = 0.99
+MIN_SURFACE = 0.99
 """blocks with a signed distance below this, in units of the truncation, are stored"""
 
 
@@ -113,16 +113,16 @@ class SceneFuser:
             total += gain
             share = gain / np.maximum(total, 1e-9)
             mean += (new - mean) * (share if mean.ndim == 3 else share[..., None])
-        packed = volume.distance.astype(np.float16), np.minimum(volume.weight, MOST_WEIGHT).astype(np.float16)
+        packed = volume.distance.astype(np.float16), np.minimum(volume.weight, MAX_WEIGHT).astype(np.float16)
         packed += (volume.color + 0.5).astype(np.uint8), volume.color_weight > 0
         self.videos.append(_PackedVolume(*(npz.Column(self.scratch).append(part).array() for part in packed)))
 
     def finish(self) -> FusedGeometry:
         """Return the blocks of the shared scene, and of each video where it saw something else."""
         shared = self.shared
-        seen = shared.weight > LEAST_WEIGHT
+        seen = shared.weight > MIN_WEIGHT
         shared.distance[~seen] = 1
-        occupied = self._count(shared.distance < LEAST_SURFACE) > 0
+        occupied = self._count(shared.distance < MIN_SURFACE) > 0
         empty = np.zeros((1, NODES, NODES, NODES, CHANNELS))
         empty[..., 0] = 1
         blocks = [empty]
@@ -131,7 +131,7 @@ class SceneFuser:
         blocks += list(self._cut(occupied, shared.distance, shared.color / 255, shared.color_weight > 0))
         low, high = MOVED
         for row, video in enumerate(self.videos):
-            seen = video.weight > LEAST_WEIGHT
+            seen = video.weight > MIN_WEIGHT
             other = np.clip((np.abs(video.distance - shared.distance) - low) / (high - low), 0, 1) * seen
             changed = self._count(other > 0.5) >= MOVED_VOXELS
             table[row][changed] = sum(len(part) for part in blocks) + np.arange(changed.sum())

@@ -34,7 +34,7 @@ EIKONAL_STEP_M = 0.01
 """step of finite differences, below the finest cell of the agent's grids"""
 TEMPLATE_COLOR, TEMPLATE_FEATURE = 20.0, 0.3
 """weights of color and features against signed distance while the field copies the template"""
-LEAST_FLOW_CONFIDENCE, LEAST_OPACITY = 25, 0.5
+MIN_FLOW_CONFIDENCE, MIN_OPACITY = 25, 0.5
 """flow is compared where its confidence (of 255) and the rendered opacity are above these"""
 
 
@@ -76,11 +76,11 @@ class JointLoss:
         code_of = swap(video, problem.scene.shape.videos, probability, generator)
         frame = torch.arange(len(pose.frame), device=problem.device).repeat_interleave(number)
 
-        def density_of(index: Tensor, depth: Tensor, least_beta_m: float = 0.0) -> Tensor:
+        def density_of(index: Tensor, depth: Tensor, min_beta_m: float = 0.0) -> Tensor:
             there = pose.at(frame[index])
             world, points_agent = sample_points(there, rays.at(index), depth)
-            scene = scene_density(problem, world, video[index], code_of[index], least_beta_m)
-            agent = agent_layer(problem, there, points_agent, depth.shape, least_beta_m)[0].density
+            scene = scene_density(problem, world, video[index], code_of[index], min_beta_m)
+            agent = agent_layer(problem, there, points_agent, depth.shape, min_beta_m)[0].density
             return scene * has_scene[index, None] + agent
 
         if self.scene_loss.rendered:
@@ -114,12 +114,12 @@ def agent_layer(
     pose: Pose,
     points_agent: Float[Tensor, "frame point 3"],
     shape: tuple[int, ...],
-    least_beta_m: float = 0.0,
+    min_beta_m: float = 0.0,
 ) -> tuple[Layer, Float[Tensor, "frame point 3"]]:
-    """Evaluate the agent's field along rays (`Field.density` explains ``least_beta_m``); also return the
+    """Evaluate the agent's field along rays (`Field.density` explains ``min_beta_m``); also return the
     samples in the rest shape. It is empty outside its box."""
     rest = problem.body.unpose(points_agent, pose.agent_from_bone)
-    return Layer.of_agent(problem.agent, rest, shape, least_beta_m), rest
+    return Layer.of_agent(problem.agent, rest, shape, min_beta_m), rest
 
 
 def compare(
@@ -180,8 +180,8 @@ def later_pixels(
     point = (rendered.weight[..., None] * mixed).sum(1) / rendered.opacity.clamp_min(1e-3)[:, None]
     pixel, ahead = cameras.project(point, problem.store.views.intrinsics[later].repeat_interleave(number, 0))
     return pixel, usable.repeat_interleave(number) & (ahead > body.NEAREST_M) & (
-        rays.flow_confidence > LEAST_FLOW_CONFIDENCE
-    ) & (rendered.opacity.detach() > LEAST_OPACITY)
+        rays.flow_confidence > MIN_FLOW_CONFIDENCE
+    ) & (rendered.opacity.detach() > MIN_OPACITY)
 
 
 def field_terms(problem: Problem, weights: LossWeights, generator: Generator) -> Terms:

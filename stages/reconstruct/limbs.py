@@ -13,9 +13,9 @@ from torch import Tensor, nn
 
 from pipeline.geometry import rigid_torch
 
-LEAST_SHARE = 1e-9
+MIN_SHARE = 1e-9
 """shared skin below this counts as none; keeps logarithms finite"""
-MOST_SHARE = 0.999
+MAX_SHARE = 0.999
 """bones share no more skin than this: an edge of length 0 is none to the spanning tree"""
 LOW, GROUND = 0.45, 0.15
 """legs are below this share of the animal's height, and reach below this"""
@@ -47,14 +47,14 @@ class KinematicTree:
         agent_from_bone_rest: Float[Tensor, "bone 4 4"],
     ) -> "KinematicTree":
         """Make the tree of most shared skin, rooted at the bone nearest to the agent's origin."""
-        cost = -np.log(shared_skin(weights).double().numpy().clip(LEAST_SHARE, MOST_SHARE))
+        cost = -np.log(shared_skin(weights).double().numpy().clip(MIN_SHARE, MAX_SHARE))
         tree = minimum_spanning_tree(cost)
         centre = agent_from_bone_rest[:, :3, 3]
         order, parent = breadth_first_order(tree + tree.T, int(centre.norm(dim=-1).argmin()), directed=False)
         order = torch.from_numpy(order).long()
         parent = torch.from_numpy(parent).long()[order]
         parent[0] = order[0]
-        both = weights[:, order] * weights[:, parent] + LEAST_SHARE
+        both = weights[:, order] * weights[:, parent] + MIN_SHARE
         return cls(order, order.argsort()[parent], both.T @ points / both.sum(0)[:, None])
 
     def motion(self, turn: Float[Tensor, "frame bone 3"]) -> Float[Tensor, "frame bone 4 4"]:

@@ -16,7 +16,7 @@ DISTANCE_KNEE, COLOR_KNEE, FLOW_KNEE, DEPTH_KNEE = 0.3, 0.2, 0.5, 1.0
 """where Huber losses go over from squares to lines, in the units of each loss"""
 FLOW_UNIT_PX, DEPTH_UNIT_M = 10.0, 0.1
 """units of flow and of rendered depth"""
-LEAST_PROBABILITY = 1e-3
+MIN_PROBABILITY = 1e-3
 """keeps the logarithms of opacities finite"""
 
 
@@ -50,7 +50,7 @@ def feature(
 
 def silhouette(predicted: Float[Tensor, "*ray"], agent: Float[Tensor, "*ray"]) -> Float[Tensor, "*ray"]:
     """Compare the agent's rendered opacity with the mask (0 or 1)."""
-    finite = predicted.clamp(LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)
+    finite = predicted.clamp(MIN_PROBABILITY, 1 - MIN_PROBABILITY)
     return functional.binary_cross_entropy(finite, agent, reduction="none")
 
 

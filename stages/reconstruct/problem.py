@@ -18,10 +18,10 @@ from stages.reconstruct.rays import RayStore
 
 TRUSTED = 0.1
 """frames whose mask weighs less are left out of runs of consecutive frames"""
-MOST_PRECISE = 100.0
+MAX_PRECISE = 100.0
 """prior precision of a camera that registration is certain of, relative to one at even odds; losses alone err
 by a millimetre and 0.05 degrees"""
-MOST_JOINTS, LEAST_SKIN = 4, 0.02
+MAX_JOINTS, MIN_SKIN = 4, 0.02
 """joints of a bone, and the share of skin that two bones must have in common to be tied"""
 SOLE, SOLES = 0.07, 32
 """soles are below this share of the animal's height; so many points of them are looked at"""
@@ -135,11 +135,11 @@ class Joints:
 
     @classmethod
     def of(cls, points: Float[Tensor, "point 3"], weights: Float[Tensor, "point bone"]) -> "Joints":
-        """Tie each bone to at most `MOST_JOINTS` with which it shares most skin, but always to one."""
+        """Tie each bone to at most `MAX_JOINTS` with which it shares most skin, but always to one."""
         share = shared_skin(weights)
         ranked = share.argsort(dim=1, descending=True)
-        tied = torch.zeros_like(share, dtype=torch.bool).scatter_(1, ranked[:, :MOST_JOINTS], True)
-        tied = (tied & (share > LEAST_SKIN)).scatter_(1, ranked[:, :1], True)
+        tied = torch.zeros_like(share, dtype=torch.bool).scatter_(1, ranked[:, :MAX_JOINTS], True)
+        tied = (tied & (share > MIN_SKIN)).scatter_(1, ranked[:, :1], True)
         first, second = torch.nonzero((tied | tied.T).triu(1), as_tuple=True)
         both = weights[:, first] * weights[:, second]
         return cls(first, second, both.T @ points / both.sum(0).clamp_min(1e-9)[:, None])
@@ -193,8 +193,8 @@ class TemplateSurface:
 
 
 def prior_precision(motion: MotionTable, confidence: Float[np.ndarray, "frame"]) -> Float[Tensor, "knot"]:
-    """Return the prior precision of each camera knot: 1 up to even odds, `MOST_PRECISE` if certain."""
-    precision = 1 + (MOST_PRECISE - 1) * (2 * torch.from_numpy(confidence).float() - 1).clamp(0, 1).square()
+    """Return the prior precision of each camera knot: 1 up to even odds, `MAX_PRECISE` if certain."""
+    precision = 1 + (MAX_PRECISE - 1) * (2 * torch.from_numpy(confidence).float() - 1).clamp(0, 1).square()
     total, count = torch.zeros(2, len(motion.camera))
     for knot in (motion.knot, motion.knot + 1):
         total.index_add_(0, knot, precision)

@@ -31,7 +31,7 @@ AGENT, UNKNOWN, NOT_AGENT = 255, 128, 0
 """values of a mask"""
 RING_PX, RING_SHARE = 10, 0.25
 """width of the ring around the mask, color pixels, and its share of the pixels kept for the agent"""
-LEAST_SLOPE = 0.15
+MIN_SLOPE = 0.15
 """surfaces are taken as no more oblique than this: normals of noisy depth err"""
 EDGE_M, EDGE_SHARE = 0.1, 0.05
 """depth that changes by more than this within 3 pixels, plus this share of itself, is an edge"""
@@ -207,7 +207,7 @@ def trusted_depth(
     slope = np.abs((normal * directions).sum(-1)) / np.maximum(np.linalg.norm(normal, axis=-1), 1e-9)
     change = cv2.dilate(smooth, np.ones((3, 3))) - cv2.erode(smooth, np.ones((3, 3)))
     depth[change > EDGE_M + EDGE_SHARE * depth] = 0
-    return depth, np.clip(slope, LEAST_SLOPE, None).astype(np.float32)
+    return depth, np.clip(slope, MIN_SLOPE, None).astype(np.float32)
 
 
 def thin_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:

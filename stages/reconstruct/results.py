@@ -31,7 +31,7 @@ AGENT_STEP_M = 0.01
 """resolution of the extracted agent: at 0.02 a tail is lost"""
 SEEN_WITHIN_M = 0.045
 """the scene's surface is cut where nothing was measured this near: backs of thin shells, rims"""
-MOST_POINTS, MOST_FRAMES = 3_000_000, 300
+MAX_POINTS, MAX_FRAMES = 3_000_000, 300
 """measured points, and frames that show free space, are thinned to about so many"""
 
 
@@ -108,7 +108,7 @@ def measured_points(problem: Problem) -> Float[np.ndarray, "point 3"]:
     """Return measured points of the scene in the world, thinned."""
     rays = problem.store.scene
     index = torch.nonzero(rays.depth > 0)[:, 0]
-    rays = rays.at(index[:: max(1, len(index) // MOST_POINTS)])
+    rays = rays.at(index[:: max(1, len(index) // MAX_POINTS)])
     pose = problem.motion.world_from_camera(rays.frame)
     points = (pose[:, :3, :3] @ (rays.direction * rays.depth[:, None])[..., None])[..., 0] + pose[:, :3, 3]
     return points.cpu().numpy()
@@ -138,7 +138,7 @@ def feature_volume(problem: Problem) -> SceneFeatures:
 def seen_free(problem: Problem, points_world: Float[Tensor, "point 3"]) -> Bool[Tensor, "point"]:
     """Return which points some trusted camera saw through: depth at their pixel lies clearly behind them."""
     views, frames = problem.store.views, torch.unique(problem.store.scene.frame).long()
-    frames = frames[:: max(1, len(frames) // MOST_FRAMES)]
+    frames = frames[:: max(1, len(frames) // MAX_FRAMES)]
     camera_from_world = torch.linalg.inv(problem.motion.world_from_camera(frames).double()).float()
     through = torch.zeros(len(points_world), dtype=torch.bool, device=points_world.device)
     height, width = views.depth.shape[1:]

@@ -22,7 +22,7 @@ NEAR, FREE = 4, 3
 """samples of a ray near its measured depth, and in the free space before it"""
 BEHIND_M = 0.06
 """samples behind a measured surface; deeper ones would fill thin things and what lies behind edges"""
-LEAST_SLOPE = 0.3
+MIN_SLOPE = 0.3
 """reach of the samples near depth grows on oblique surfaces, but no further than at this slope"""
 REACH_M = 0.15
 """half of the samples of rendered rays lie this near to measured depth"""
@@ -66,7 +66,7 @@ def sample_depths(rays: Rays, reach_m: float, generator: Generator) -> Float[Ten
     """Return the depth, `NEAR` samples from ``reach_m`` before to just behind it, `FREE` before; metres."""
     depth = rays.depth[:, None]
     place = torch.rand(len(rays), NEAR, generator=generator).to(depth.device)
-    around = place * (reach_m / rays.slope[:, None].clamp_min(LEAST_SLOPE) + BEHIND_M) - BEHIND_M
+    around = place * (reach_m / rays.slope[:, None].clamp_min(MIN_SLOPE) + BEHIND_M) - BEHIND_M
     before = FREE_FROM_M + (depth - reach_m - FREE_FROM_M).clamp_min(0) * strata(rays, FREE, generator)
     return torch.cat([depth, depth - around, before], dim=1)
 
@@ -157,14 +157,14 @@ def scene_density(
     points: Float[Tensor, "ray sample 3"],
     video: Int[Tensor, "ray"],
     code_of: Int[Tensor, "ray"],
-    least_beta_m: float = 0.0,
+    min_beta_m: float = 0.0,
 ) -> Float[Tensor, "ray sample"]:
     """Return the scene's density along rays, per metre; arguments as of `scene_layer` and `Field.density`."""
     field, (rays, samples) = problem.scene, points.shape[:2]
     distance = field.distance_at(
         points.reshape(-1, 3), video.repeat_interleave(samples), code_of.repeat_interleave(samples)
     )
-    return field.density(distance, least_beta_m).view(rays, samples)
+    return field.density(distance, min_beta_m).view(rays, samples)
 
 
 def render_depths(

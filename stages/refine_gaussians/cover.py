@@ -36,7 +36,7 @@ EVEN = 0.4
 """share of the Gaussians that is spread evenly"""
 SHELL_M = 0.12
 """unseen points this near to a seen one are its back, and left out"""
-LEAST_SEEN = 100
+MIN_SEEN = 100
 """points without which a video's exposure is not fitted"""
 RIDGE = 0.001
 """pulls exposures to the identity where colors do not determine them"""
@@ -44,7 +44,7 @@ NEAREST_M = 0.2
 """nearer points are not looked at"""
 NEIGHBOURS = 6
 """of a point, over which its color gradient is averaged"""
-SPACING_NEIGHBOUR, LEAST_SPACING_M = 4, 0.001
+SPACING_NEIGHBOUR, MIN_SPACING_M = 4, 0.001
 """the distance to this neighbour is a point's spacing, at least this"""
 CURVE_CELL_M, CURVE_BITS = 0.005, 20
 """cells of the space-filling curve, and bits of their numbers"""
@@ -158,7 +158,7 @@ def observe(
             weights[look.shown] += look.shown_weight
             through[look.through] += look.through_weight
         shown = weights > 0
-        if shown.sum() < LEAST_SEEN:
+        if shown.sum() < MIN_SEEN:
             continue
         mean = sums[shown] / weights[shown, None]
         ours = exposure(color[shown], mean, weights[shown])
@@ -246,7 +246,7 @@ def subsample(
         here = points[chosen[own]]
         distance_m = KDTree(here).query(here, min(SPACING_NEIGHBOUR + 1, len(here)))[0]
         fourth_m[own] = distance_m.reshape(len(here), -1)[:, -1]
-    return chosen, np.clip(fourth_m, LEAST_SPACING_M, np.quantile(fourth_m, WIDEST))
+    return chosen, np.clip(fourth_m, MIN_SPACING_M, np.quantile(fourth_m, WIDEST))
 
 
 def _along_a_curve(points: Float[np.ndarray, "point 3"]) -> np.ndarray:

@@ -34,9 +34,9 @@ LAST_RATE = 0.1
 """learning rates fall to this share"""
 DEPTH_UNIT_M, MOTION_UNIT = 0.2, 0.1
 """units of the losses of depth, and of corrections of motion (metres and radians)"""
-MOST_FLOW_PX = 100.0
+MAX_FLOW_PX = 100.0
 """rendered flow is clamped to this, drawn pixels: points at the camera's side project anywhere"""
-MOST_FLOW_LOSS, LEAST_COVERAGE = 4.0, 0.5
+MAX_FLOW_LOSS, MIN_COVERAGE = 4.0, 0.5
 """flow errors saturate, and count where the Gaussians cover so much of a pixel"""
 
 
@@ -159,7 +159,7 @@ class FrameLoss:
             cameras.project(rigid_torch.apply(self.camera(video, at), points), target.intrinsics)[0]
             for at, points in ((frame, cloud.means), (later, means))
         )
-        return (then - now).clamp(-MOST_FLOW_PX, MOST_FLOW_PX)
+        return (then - now).clamp(-MAX_FLOW_PX, MAX_FLOW_PX)
 
     def _flow_errors(
         self, video: DrawnVideo, target: Target, drawn: Tensor, coverage: Tensor, everywhere: Tensor
@@ -171,8 +171,8 @@ class FrameLoss:
         row, column = (index.to(self.device) for index in lattice)
         found = drawn[row, column] / coverage[row, column].clamp_min(0.1)[..., None]
         error = functional.huber_loss(found, target.flow_px, reduction="none", delta=1.0).sum(-1)
-        counted = (coverage[row, column] > LEAST_COVERAGE) & everywhere[row, column]
-        return (error.clamp_max(MOST_FLOW_LOSS) * target.flow_confidence)[counted]
+        counted = (coverage[row, column] > MIN_COVERAGE) & everywhere[row, column]
+        return (error.clamp_max(MAX_FLOW_LOSS) * target.flow_confidence)[counted]
 
 
 def refine(loss: FrameLoss, steps: int, seed: int, resume: Path | None, save_every: int) -> FitRecord:

@@ -38,7 +38,7 @@ PRIOR_POINTS, POINT_SIGMA_M, DAMPING = 20, 0.03, 1e-6
 """Points that the prior of upright counts as, their noise (metres), and damping of a step."""
 PREDICTED_POINTS, LEAVING_COST_M = 40, 0.002
 """Points that a predicted pose counts as, and cost of leaving it by one standard deviation, metres."""
-LEAST_POINTS, LEAST_ERODED_PX, NEAREST_M = 25, 60, 0.1
+MIN_POINTS, MIN_ERODED_PX, NEAREST_M = 25, 60, 0.1
 """Depth points that an observation needs, pixels that the eroded mask keeps, least depth (metres)."""
 RADIUS, FULL_VIEW, DEPTH_SHARE = 0.75, 0.3, 0.1
 """In body lengths: radius around the median that points must lie in, silhouette area in full view (squared),
@@ -127,15 +127,15 @@ def observe(
         )
     eroded = cv2.erode(small, np.ones((3, 3), np.uint8))
     chosen = np.flatnonzero(
-        ((eroded if eroded.sum() > LEAST_ERODED_PX else small) > 0)
+        ((eroded if eroded.sum() > MIN_ERODED_PX else small) > 0)
         & (depth > NEAREST_M)
         & (clip.mapped | (clip.confidence(frame) >= 1))
     )
-    if len(chosen) < LEAST_POINTS:
+    if len(chosen) < MIN_POINTS:
         return None
     points = cameras.back_project(depth, clip.depth_intrinsics[frame]).reshape(-1, 3)[chosen]
     near = np.linalg.norm(points - np.median(points, axis=0), axis=1) < RADIUS * model.length_m
-    if near.sum() < LEAST_POINTS:
+    if near.sum() < MIN_POINTS:
         return None
     points = points[near][subsampling.evenly(near.sum(), POINTS)]
     pixel, z = cameras.project(points, clip.intrinsics[frame])

@@ -28,13 +28,13 @@ FINE_ROUNDS = 12
 """Gauss-Newton steps of the hypotheses that remain."""
 LOCALIZER_EVERY_FRAMES, LOCALIZER_WEIGHT = 2, 8.0
 """The agent's localizer is queried in one visible frame of so many; a certain pose is worth so many units."""
-MOST_LOCALIZED, LOCALIZER_SIGMA_RAD = 2, float(np.deg2rad(30.0))
+MAX_LOCALIZED, LOCALIZER_SIGMA_RAD = 2, float(np.deg2rad(30.0))
 """Poses of the localizer that become hypotheses, and spread of the bonus around their heading, radians."""
 SMOOTHING_PASSES, SMOOTHING_REACH = 2, 3
 """Passes of the smoothing, and its reach in time constants."""
 OUTLIER_SCALE = (0.35, 0.1)
 """Deviation (radians, metres) at which a neighbour's weight is halved."""
-LEAST_SHARE, COST_DECAY_M, SLOPE_RIDGE_S2 = 0.05, 0.02, 1e-4
+MIN_SHARE, COST_DECAY_M, SLOPE_RIDGE_S2 = 0.05, 0.02, 1e-4
 """Weight of hardly visible frames, cost where weights are 1/e (metres), ridge on the slope (s^2)."""
 
 
@@ -108,7 +108,7 @@ def _hypotheses(
         answers = localizer.localize(clip.color(frame), depth, *lenses, observation.mask)
     localized = [
         upright(observation.world_from_camera @ rigid.inverse(answer.map_from_camera))
-        for answer in answers[:MOST_LOCALIZED]
+        for answer in answers[:MAX_LOCALIZED]
     ]
     start = np.concatenate([start, localized]) if localized else start
     poses = agent_fit.fit_coarse(observation, model, start)
@@ -130,7 +130,7 @@ def _hypotheses(
         frame=observation.frame,
         world_from_agent=poses,
         cost=cost - LOCALIZER_WEIGHT * bonus,
-        least_misfit=float(cost.min()),
+        min_misfit=float(cost.min()),
         share=observation.share,
         middle_world=np.median(observation.points_world, axis=0),
         eye_world=observation.world_from_camera[:3, 3],
@@ -164,7 +164,7 @@ def smooth(
             outlier = np.linalg.norm(offset / np.repeat(OUTLIER_SCALE, 3), axis=1)
             weight = (
                 np.exp(-0.5 * (gap / smooth_s) ** 2)
-                * (LEAST_SHARE + share[index])
+                * (MIN_SHARE + share[index])
                 / (1 + outlier**2)
                 * np.exp(-(cost_m[index] - best) / COST_DECAY_M)
             )

@@ -17,7 +17,7 @@ from stages.register_videos.agent_fit import AgentModel, AgentObservation, PoseP
 SURE_SHARE, USUAL_QUANTILE, WORSE_M = 0.25, 0.3, 0.012
 """A frame stands by itself if it shows this share of the animal, or more of it than most frames do, and its
 cost exceeds the usual one, a quantile over the recording, by no more than this, metres."""
-LEAST_SHARE, LOST_M = 0.03, 0.036
+MIN_SHARE, LOST_M = 0.03, 0.036
 """A track ends where less of the animal is seen, or where the cost exceeds the usual one by more, metres."""
 LONGEST_S = 1.0
 """Gap between two frames across which nothing is predicted, seconds."""
@@ -97,7 +97,7 @@ class Tracker:
                 continue
             sigma = (NOISE[0] + speed[0] * elapsed, NOISE[1] + speed[1] * elapsed)
             fit = agent_fit.fit_near(observation, self.model, PosePrior(pose, sigma), rounds=ROUNDS)
-            if fit.cost_m > most or self.share[frame] < LEAST_SHARE:
+            if fit.cost_m > most or self.share[frame] < MIN_SHARE:
                 pose = None
                 continue
             pose = fit.world_from_agent

@@ -24,7 +24,7 @@ from stages.register_videos.flow_alignment import flow_correspondences
 from stages.register_videos.point_alignment import Walk, WalkTerm
 from stages.register_videos.votes import FrameVotes
 
-MOST_POINTS, LEAST_POINTS = 400_000, 40
+MAX_POINTS, MIN_POINTS = 400_000, 40
 """Depth points of a recording that take part, and as many correspondences of flow and of features, so that
 memory stays bounded; least number per frame."""
 DEPTH_INFLATION = 8.0
@@ -85,7 +85,7 @@ def align(
     and features.
     """
     surface, frames = depth_scans.SurfaceMap(caster.mesh), np.arange(len(clip))
-    most = max(MOST_POINTS // len(clip), LEAST_POINTS)
+    most = max(MAX_POINTS // len(clip), MIN_POINTS)
     scans = [
         _static_scan(clip, masks, int(frame), config.stride_px, most) for frame in track(frames, "depth")
     ]
@@ -172,7 +172,7 @@ def _median(values):
 
 def _ties(find, label, clip, masks, template, chosen, poses) -> list[Correspondences]:
     """Return the correspondences of the chosen frames that have any, so many that memory stays bounded."""
-    most = max(MOST_POINTS // len(chosen), LEAST_POINTS)
+    most = max(MAX_POINTS // len(chosen), MIN_POINTS)
     ties = (find(clip, masks, template, frame, poses[frame]) for frame in track(chosen.tolist(), label))
     return [tie.selected(subsampling.evenly(len(tie.first), most)) for tie in ties if tie is not None]
 

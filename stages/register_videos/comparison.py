@@ -12,16 +12,16 @@ from pipeline.geometry.meshes import RayCaster, render_view
 
 BLUR_PX = 9.0
 """Neighbourhood of the local contrast normalization, standard deviation in half-size pixels."""
-LEAST_VARIANCE = 9.0
+MIN_VARIANCE = 9.0
 """Variance of grey values below which a neighbourhood is noise."""
 GREY, CONTRAST = 128, 48
 """Grey value of the local mean, and grey values per standard deviation."""
 SHARE_FLOOR = 1e-3
 """Added to the share of known pixels in a neighbourhood."""
-FITS_M, LEAST_SHARE = 0.05, 0.1
+FITS_M, MIN_SHARE = 0.05, 0.1
 """Pixels are correlated where depth and rendering agree within the first, metres; frames with a smaller share
 of such pixels have no score."""
-SOFTNESS_PX, LEAST_NORM = 1.5, 1e-9
+SOFTNESS_PX, MIN_NORM = 1.5, 1e-9
 """Blur before the correlation, half-size pixels: the template's colours are that soft."""
 
 
@@ -60,7 +60,7 @@ def local_contrast_normalization(
     weight = known.astype(np.float32)
     share = _blur(weight) + SHARE_FLOOR
     mean = _blur(gray * weight) / share
-    deviation = np.sqrt(np.maximum(_blur((gray - mean) ** 2 * weight) / share, LEAST_VARIANCE))
+    deviation = np.sqrt(np.maximum(_blur((gray - mean) ** 2 * weight) / share, MIN_VARIANCE))
     return np.clip(GREY + CONTRAST * (gray - mean) / deviation * weight, 0, 255).astype(np.uint8)
 
 
@@ -76,7 +76,7 @@ def ncc(
     pair = compare(clip, masks, caster, frame, world_from_camera)
     depth = cv2.resize(clip.depth(frame), pair.depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
     same = pair.known & (np.abs(depth - pair.depth) < FITS_M)
-    if same.mean() < LEAST_SHARE:
+    if same.mean() < MIN_SHARE:
         return np.nan
     normalized = [
         local_contrast_normalization(picture, pair.known).astype(np.float64)
@@ -84,4 +84,4 @@ def ncc(
     ]
     first, second = (cv2.GaussianBlur(each, (0, 0), SOFTNESS_PX)[same] for each in normalized)
     first, second = first - first.mean(), second - second.mean()
-    return float(first @ second / max(np.linalg.norm(first) * np.linalg.norm(second), LEAST_NORM))
+    return float(first @ second / max(np.linalg.norm(first) * np.linalg.norm(second), MIN_NORM))

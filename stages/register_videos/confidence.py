@@ -28,7 +28,7 @@ AVERAGING_S = 1.0
 """Time constant over which scores are averaged, seconds: neighbouring poses err together."""
 UNANCHORED = 0.2
 """Factor on frames that neither a vote nor unbroken odometry from one holds."""
-LEAST_SCORED = 20
+MIN_SCORED = 20
 """Short recordings are compared in at least so many frames."""
 DRAWS = 400
 """Monte Carlo samples of a pose's covariance."""
@@ -55,7 +55,7 @@ def score_appearance(
     rng: np.random.Generator,
 ) -> NccScores:
     """Score frames against renderings from their poses and from poses that are wrong on purpose (decoys)."""
-    chosen = subsampling.evenly(len(clip), max(len(clip) // config.every_frames, LEAST_SCORED))
+    chosen = subsampling.evenly(len(clip), max(len(clip) // config.every_frames, MIN_SCORED))
     wrong = rng.integers(0, len(clip), config.decoys)
     decoys = world_from_camera[wrong] @ rigid.exp(_wrong_twists(config.decoys, rng))
 

@@ -10,13 +10,13 @@ class VoteConfig:
 
     every_frames: int = 5
     """One frame in so many is localized."""
-    least_probability: float = 0.2
+    min_probability: float = 0.2
     """Poses below this probability do not vote."""
     agree_deg: float = 8.0
     """Votes agree within this rotation, degrees ..."""
     agree_m: float = 0.3
     """... and this distance, metres; room for the odometry's drift."""
-    most_tilt_deg: float = 10.0
+    max_tilt_deg: float = 10.0
     """Poses that contradict gravity by more than this do not vote, degrees."""
 
 
@@ -39,11 +39,11 @@ class AlignmentConfig:
 class GateConfig:
     """When an aligned recording is accepted."""
 
-    least_fit: float = 0.35
+    min_fit: float = 0.35
     """Median share of a frame's static depth that must lie within 5 cm of the template."""
-    least_certainty: float = 0.5
+    min_certainty: float = 0.5
     """Probability of a vote that needs no confirmation by appearance."""
-    least_appearance: float = 0.3
+    min_appearance: float = 0.3
     """Share of the frames that must look more like their renderings than like renderings from wrong poses."""
 
 

@@ -24,13 +24,13 @@ SIGMA = 4.0
 the toy's two sessions positions gain 0.3 mm of 4.0 and 4.6 mm; at 1 one session turns by 0.07 degrees."""
 LONGEST_CELLS = 1.0
 """Longer steps leave the linear range of features, cells."""
-LEAST_EIGENVALUE = 0.005
+MIN_EIGENVALUE = 0.005
 """Squared change of features per cell below which an axis says nothing: plain walls."""
-LEAST_NORM = 0.5
+MIN_NORM = 0.5
 """Rendered features shorter than this mix vertices that no frame saw."""
 DEPTH_FITS_M = 0.12
 """Measured depth must agree with the template's, metres: moved things are left out."""
-LEAST_CELLS = 20
+MIN_CELLS = 20
 """Fewer cells align nothing."""
 
 
@@ -54,15 +54,15 @@ def feature_correspondences(
     depth, hits = render_view(scene.caster, world_from_camera, intrinsics, rows, columns)
     rendered = hits.interpolate(scene.caster.mesh, scene.vertex_features).reshape(rows, columns, channels)
     norm = np.linalg.norm(rendered, axis=-1, keepdims=True)
-    rendered = rendered / np.maximum(norm, LEAST_NORM)
+    rendered = rendered / np.maximum(norm, MIN_NORM)
     rays = cameras.ray_directions(intrinsics, rows, columns)
     measured = cameras.read_depth(clip.depth(frame), clip.depth_intrinsics[frame], rays)
     free = cv2.erode((masks[frame] == 0).astype(np.uint8), np.ones((2 * STRIDE_PX + 1,) * 2, np.uint8))
     corner = STRIDE_PX // 2
     free = free[corner::STRIDE_PX, corner::STRIDE_PX][:rows, :columns] > 0
-    good = free & (depth > 0) & (norm[..., 0] > LEAST_NORM) & (np.abs(measured - depth) < DEPTH_FITS_M)
+    good = free & (depth > 0) & (norm[..., 0] > MIN_NORM) & (np.abs(measured - depth) < DEPTH_FITS_M)
     good[[0, -1]] = good[:, [0, -1]] = False
-    if good.sum() < LEAST_CELLS:
+    if good.sum() < MIN_CELLS:
         return None
     gradient = np.stack([np.gradient(observed, axis=1), np.gradient(observed, axis=0)], axis=-1)[good]
     tensor = np.swapaxes(gradient, 1, 2) @ gradient
@@ -73,9 +73,9 @@ def feature_correspondences(
     points_map = rigid.apply(world_from_camera, ray * z[:, None])
     parts = []
     for index in range(2):
-        axis, precision = axes[..., index], np.maximum(eigenvalue[:, index], LEAST_EIGENVALUE)
+        axis, precision = axes[..., index], np.maximum(eigenvalue[:, index], MIN_EIGENVALUE)
         step = np.einsum("mk,mk->m", axis, slope) / precision
-        sound = (eigenvalue[:, index] > LEAST_EIGENVALUE) & (np.abs(step) < LONGEST_CELLS)
+        sound = (eigenvalue[:, index] > MIN_EIGENVALUE) & (np.abs(step) < LONGEST_CELLS)
         moved = cameras.unproject(centre + step[:, None] * axis, intrinsics) * z[:, None]
         # Gradient of the pixel with respect to the point, times depth over focal length: across the ray.
         across = np.column_stack([axis, -(axis * ray[:, :2]).sum(1)])

@@ -20,7 +20,7 @@ LONGEST_PX = 12
 """Longer flow is none, half-size pixels."""
 DEPTH_FITS_M = 0.12
 """Measured depth at the end of the flow must agree with the template's at its start, metres."""
-LEAST_KNOWN, LEAST_PAIRS = 0.1, 20
+MIN_KNOWN, MIN_PAIRS = 0.1, 20
 """Share of the picture that must show template, and pairs that must remain."""
 OUTSIDE_PX = 1e3
 """Flow of pixels outside the picture."""
@@ -32,7 +32,7 @@ def flow_correspondences(
     """Match one frame with the template rendered from its pose; None where too little can be matched."""
     pair = compare(clip, masks, caster, frame, world_from_camera)
     known, intrinsics = pair.known, pair.intrinsics
-    if known.mean() < LEAST_KNOWN:
+    if known.mean() < MIN_KNOWN:
         return None
     flow, return_px = _flow(
         local_contrast_normalization(pair.rendered, known), local_contrast_normalization(pair.recorded, known)
@@ -50,7 +50,7 @@ def flow_correspondences(
         & (np.abs(flow[rows, columns]).max(1) < LONGEST_PX)
         & (return_px[rows, columns] < RETURN_PX)
     )
-    if good.sum() < LEAST_PAIRS:
+    if good.sum() < MIN_PAIRS:
         return None
     points_map = rigid.apply(
         world_from_camera, cameras.unproject(start[good], intrinsics) * template_z[good, None]

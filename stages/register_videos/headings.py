@@ -16,7 +16,7 @@ from pipeline.geometry import rigid, viterbi
 
 HEADINGS = 36
 """Headings of the grid: steps of 10 degrees."""
-NOISE_DEG, MOST_COST = 20.0, 12.0
+NOISE_DEG, MAX_COST = 20.0, 12.0
 """A hypothesis turned by the first from a heading costs one unit more; one frame costs at most the second."""
 MOTION_WEIGHT, WALKING_M_S = 4.0, (0.25, 0.6)
 """Units for walking tail first, counting from the first speed, fully from the second, m/s: an animal that
@@ -43,7 +43,7 @@ class RootHypotheses:
     frame: int
     world_from_agent: Float[np.ndarray, "hypothesis 4 4"]
     cost: Float[np.ndarray, "hypothesis"]
-    least_misfit: float
+    min_misfit: float
     """Cost of the best placement, by shape and colour alone."""
     share: float
     """Visible area over the area in full view, 0..1."""
@@ -101,7 +101,7 @@ def path(
 def weights(candidates: list[RootHypotheses]) -> Float[np.ndarray, "observation"]:
     """Return the weight of each frame, 0..1: less where little is seen and where nothing fits."""
     misfit, share = (
-        np.array([getattr(each, name) for each in candidates]) for name in ("least_misfit", "share")
+        np.array([getattr(each, name) for each in candidates]) for name in ("min_misfit", "share")
     )
     worse = np.maximum(misfit - np.median(misfit), 0) / MISFIT
     return np.minimum(share / ENOUGH_SHARE, 1.0) / (1 + worse**2)
@@ -140,4 +140,4 @@ def _walking(moves: MotionCues) -> Float[np.ndarray, "observation"]:
 def _own_cost(candidates, grid, novelty):
     """Return one frame's cost of each heading of the grid, by looks alone."""
     seen = _turned_cost(candidates, grid[:, None]).min(1)
-    return novelty * np.minimum(seen - seen.min(), MOST_COST)
+    return novelty * np.minimum(seen - seen.min(), MAX_COST)

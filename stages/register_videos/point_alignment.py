@@ -19,13 +19,13 @@ from pipeline.mapping.bundle_adjustment import PointTerm, chained
 
 POINTS, PEAK_THRESHOLD = 1200, 0.02
 """Points of a picture at most, and SIFT's contrast threshold; plain walls need a low one."""
-MOST_POINTS, LEAST_POINTS = 2_400_000, 120
+MAX_POINTS, MIN_POINTS = 2_400_000, 120
 """Points of a recording at most, so that memory stays bounded, and least number per frame."""
 MASK_MARGIN_PX = 15
 """The agent's mask is widened by a square of this size, pixels: SIFT looks at neighbourhoods."""
 PICTURES = 80
 """Pictures of the walk-through that are described, at most."""
-MATCHED, LEAST_SHARED = 6, 0.15
+MATCHED, MIN_SHARED = 6, 0.15
 """Pictures that a frame is matched with, those that show most of its points, and the least share of them,
 times the cosine between both axes."""
 REACH_SHARE, REACH_M = 0.03, 0.15
@@ -54,7 +54,7 @@ class WalkTerm:
         poses = np.concatenate([world_from_camera, self._walked])
         pinholes = np.concatenate([clip.intrinsics, walk.clip.intrinsics[known]])
         walked = [_points(walk.clip, int(frame), POINTS) for frame in known]
-        most = min(POINTS, max(MOST_POINTS // len(clip), LEAST_POINTS))
+        most = min(POINTS, max(MAX_POINTS // len(clip), MIN_POINTS))
         pixels, depths, links = [], [], []
         for frame in track(range(len(clip)), "points"):
             points = _points(clip, frame, most, masks[frame] > 0)
@@ -65,7 +65,7 @@ class WalkTerm:
                 for pose, lens in zip(self._walked, pinholes[len(clip) :], strict=True)
             ]
             for key in np.argsort(-np.array(seen), kind="stable")[:MATCHED]:
-                if seen[key] > LEAST_SHARED:
+                if seen[key] > MIN_SHARED:
                     pairs = sift.matches(points.descriptors, walked[key].descriptors)
                     mine, theirs = pairs.T
                     frame_from_walked = rigid.inverse(poses[frame]) @ self._walked[key]

@@ -27,11 +27,11 @@ from stages.register_videos.confidence import (
 from stages.register_videos.config import Config
 from stages.register_videos.feature_alignment import FeatureMap
 from stages.register_videos.point_alignment import Walk
-from stages.register_videos.votes import LEAST_VOTES, FrameVotes
+from stages.register_videos.votes import MIN_VOTES, FrameVotes
 
-LEAST_MEASURED = 0.2
+MIN_MEASURED = 0.2
 """Share of the frames that must have static depth."""
-LEAST_RECOGNIZED = 0.2
+MIN_RECOGNIZED = 0.2
 """Without certain votes this share of the localized frames must agree: sessions of the room itself have 0.37
 and more, of a flat of the same shape with the same furniture elsewhere 0.1."""
 FLOOR_QUANTILE = 0.02
@@ -130,7 +130,7 @@ def register(
     scores = score_appearance(clip, masks, caster, aligned.world_from_camera, config.confidence, rng)
     appearance = appearance_probability(clip.timestamp_s, scores)
     if clip.mapped:
-        if appearance.mean() < config.gate.least_appearance:
+        if appearance.mean() < config.gate.min_appearance:
             share = f"only {appearance.mean():.0%} of the frames"
             return Rejected(f"{share} look more like the room than like wrong places in it", votes)
     elif config.initialization == "votes":
@@ -223,17 +223,17 @@ def rejection_reason(
 ) -> str | None:
     """Return why an aligned recording is not accepted, None when it is."""
     known = fit[np.isfinite(fit)]
-    if not len(known) or len(known) < LEAST_MEASURED * len(fit):
+    if not len(known) or len(known) < MIN_MEASURED * len(fit):
         count = f"only {len(known)} of {len(fit)} frames measured the room's depth"
         return f"{count}: it is too dark or too far away, or the animal fills the view"
-    if np.median(known) < config.gate.least_fit:
+    if np.median(known) < config.gate.min_fit:
         share = f"only {np.median(known):.0%} of the static depth lies within 5 cm of the room"
         return f"{share}: it has changed too much, or the place was mistaken"
-    if (votes.probability[supports] >= config.gate.least_certainty).sum() >= LEAST_VOTES:
+    if (votes.probability[supports] >= config.gate.min_certainty).sum() >= MIN_VOTES:
         return None
-    if supports.sum() < LEAST_RECOGNIZED * votes.asked:
+    if supports.sum() < MIN_RECOGNIZED * votes.asked:
         evidence = f"only {supports.sum()} of {votes.asked} frames were recognised and agree"
-    elif appearance < config.gate.least_appearance:
+    elif appearance < config.gate.min_appearance:
         evidence = f"only {appearance:.0%} of the frames look more like the room than like wrong places in it"
     else:
         return None

@@ -15,11 +15,11 @@ from pipeline.geometry import rigid, subsampling
 from pipeline.localization.localizer import Localizer, PoseHypothesis
 from stages.register_videos.config import VoteConfig
 
-LEAST_VOTES, LEAST_SHARE = 3, 0.25
+MIN_VOTES, MIN_SHARE = 3, 0.25
 """FrameVotes that must agree, and their share of all: two may agree by chance."""
-LEAST_LOCALIZED = 20
+MIN_LOCALIZED = 20
 """Short recordings are localized more often, so that so many frames may vote."""
-MOST_PROPOSALS = 400
+MAX_PROPOSALS = 400
 """At most so many votes, evenly spaced, propose a transform; all judge it."""
 REFIT_ROUNDS = 3
 """The best proposal is fitted to its supporters so often."""
@@ -65,7 +65,7 @@ def none_cast() -> FrameVotes:
 
 def collect(clip: Clip, masks: Masks, localizer: Localizer, config: VoteConfig) -> FrameVotes:
     """Localize one frame in so many, with the agent masked out."""
-    step = min(config.every_frames, max(len(clip) // LEAST_LOCALIZED, 1))
+    step = min(config.every_frames, max(len(clip) // MIN_LOCALIZED, 1))
     asked = np.arange(min(step // 2, len(clip) - 1), len(clip), step)
     frames, answers, nearest = [], [], None
     for frame in track(asked.tolist(), "localizing frames"):
@@ -73,7 +73,7 @@ def collect(clip: Clip, masks: Masks, localizer: Localizer, config: VoteConfig) 
         poses = localizer.localize(clip.color(frame), clip.depth(frame), *lenses, masks[frame] == 0)
         if poses and (nearest is None or poses[0].inlier_ratio > nearest.inlier_ratio):
             nearest = poses[0]
-        if poses and poses[0].probability >= config.least_probability:
+        if poses and poses[0].probability >= config.min_probability:
             frames.append(frame)
             answers.append(poses[0])
     return FrameVotes(np.array(frames, int), answers, len(asked), nearest)
@@ -93,9 +93,9 @@ def agree(
     weight = votes.probability.copy()
     if gravity_known:
         tilt = np.arccos(np.clip(proposals[:, 1, 1], -1, 1))
-        weight[tilt > np.deg2rad(config.most_tilt_deg)] = 0
+        weight[tilt > np.deg2rad(config.max_tilt_deg)] = 0
         proposals = keep_upright(proposals, odometry[:, :3, 3], voted[:, :3, 3])
-    tried = subsampling.evenly(len(proposals), MOST_PROPOSALS)
+    tried = subsampling.evenly(len(proposals), MAX_PROPOSALS)
     support = np.stack([close(proposals[one] @ odometry, voted, config) for one in tried]) & (weight > 0)
     best = (support * weight).sum(1).argmax()
     chosen, supports = proposals[tried[best]], support[best]
@@ -134,10 +134,10 @@ def close(
 
 def rejection_reason(votes: FrameVotes, supports: Bool[np.ndarray, "vote"] | None) -> str | None:
     """Return why the votes are not enough, None when they are."""
-    if len(votes.frame) < LEAST_VOTES:
+    if len(votes.frame) < MIN_VOTES:
         recognised = f"only {len(votes.frame)} of {votes.asked} frames were recognised"
         return f"{recognised}: the recording shows little of the walk-through's room"
     count = 0 if supports is None else int(supports.sum())
-    if count < LEAST_VOTES or count < LEAST_SHARE * len(votes.frame):
+    if count < MIN_VOTES or count < MIN_SHARE * len(votes.frame):
         return f"only {count} of {len(votes.frame)} recognised frames agree on where the recording lies"
     return None

@@ -8,6 +8,7 @@ from pathlib import Path
 from pipeline.core.videos import Video
 from pipeline.data import qa
 from pipeline.metrics import bars
+from pipeline.metrics.metrics import Metrics
 from stages.report import collect, crate, methods, pages
 from stages.report.chapters import CHAPTERS
 from stages.report.config import Config
@@ -48,11 +49,9 @@ class Inputs:
 
 def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] = ()) -> None:
     """Collect, judge, render."""
-    metrics, reasons = (
-        json.loads((inputs.evaluation / file).read_bytes()) for file in ("metrics.json", "reasons.json")
-    )
+    measured = Metrics.read(inputs.evaluation)
     folders = {chapter.artifact: inputs.folders(chapter.artifact) for chapter in CHAPTERS}
-    judged = bars.judge(metrics, reasons)
+    judged = bars.judge(measured.values, measured.reasons)
     labels = {video.id: collect.label(video, config.share_safe) for video in videos}
     read = [
         collect.read_chapter(chapter, folders[chapter.artifact], labels, config.share_safe)
@@ -63,15 +62,17 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
         name=config.name,
         chapters=chapters,
         judged=judged,
-        metrics=bars.grouped(metrics),
-        reasons=reasons,
+        metrics=bars.grouped(measured.values),
+        reasons=measured.reasons,
         methods=methods.paragraph(folders),
     )
     for file, text in texts.items():
         (out / file).write_text(text)
     (out / "methods.md").write_text(methods.document(folders))
     (out / "references.bib").write_text(methods.bibliography(folders))
-    found = crate.describe(config.name, folders, videos, metrics, safe=config.share_safe, times=config.times)
+    found = crate.describe(
+        config.name, folders, videos, measured.values, safe=config.share_safe, times=config.times
+    )
     (out / crate.FILE).write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
     largest_mb = max(len(text.encode()) for text in texts.values()) / 1e6
     size = qa.Check("largest page", largest_mb, "MB", warn=WARN_PAGE_MB)

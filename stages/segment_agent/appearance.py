@@ -41,7 +41,7 @@ MINED = 0.2
 """share of crops around what was taken for the animal by mistake, once a third of the steps is done"""
 SCALED, SCALES = 0.5, (0.5, 1.5)
 """share of crops that show the animal smaller or larger than it was seen, and how much"""
-LEAST_PX = 60
+MIN_PX = 60
 """animal pixels that an example needs"""
 CONTRAST, BRIGHTNESS = 0.2, 0.15
 """standard deviations of changed contrast (share) and exposure (of -1..1) of crops"""
@@ -110,7 +110,7 @@ def learn(
     rng: np.random.Generator,
     *,
     room: Sequence[Example] = (),
-    least_px: int = LEAST_PX,
+    min_px: int = MIN_PX,
     scaled: float = SCALED,
 ) -> Appearance | None:
     """Train a network on examples, and on others that show the ``room`` alone; None when none shows the
@@ -119,7 +119,7 @@ def learn(
     Stripes of a carpet may look like a tabby, so twice it looks at half of the examples and learns more from
     its mistakes.
     """
-    showing = [example for example in examples if (example.labels == 255).sum() >= least_px]
+    showing = [example for example in examples if (example.labels == 255).sum() >= min_px]
     if not showing:
         return None
     showing += room

@@ -42,7 +42,7 @@ UNKNOWN = 0.05
 """certainty where nothing is known: what is around it decides"""
 SURE_ROOM = 0.66
 """share of `ROOM` from which on a point is room beyond doubt"""
-LEAST_SETTLED_PX, LEAST_NOISE = 50, 3.0
+MIN_SETTLED_PX, MIN_NOISE = 50, 3.0
 """pixels without which colours are not compared, and their least noise, grey levels (JPEG)"""
 FEW = 5.0
 """references that must have seen a surface to make it half certain: one or two may have seen the animal"""
@@ -101,7 +101,7 @@ def recolored(
     A shadow or a changed exposure scales all channels alike, and a shadow only darkens. Any colour that the
     surface had within `ASKEW_PX` is no other one: the edges of a texture never lie quite where they were.
     """
-    if settled.sum() < LEAST_SETTLED_PX:
+    if settled.sum() < MIN_SETTLED_PX:
         return np.zeros(settled.shape)
     now = cv2.GaussianBlur(window.color, (5, 5), free_space.SOFTNESS_PX).astype(np.float32)
     before = votes.color * np.median((now[settled] + 4) / (votes.color[settled] + 4), axis=0)
@@ -111,5 +111,5 @@ def recolored(
     low = np.minimum(cv2.erode(np.where(known, then, np.float32(np.inf)), kernel), then)
     high = np.maximum(cv2.dilate(np.where(known, then, np.float32(-np.inf)), kernel), then)
     difference = np.linalg.norm(np.maximum(np.maximum(low - now, now - high), 0), axis=-1)
-    noise = max(float(np.median(difference[settled])), LEAST_NOISE)
+    noise = max(float(np.median(difference[settled])), MIN_NOISE)
     return np.where(settled, np.clip(difference / noise - 3, 0, 6), 0)

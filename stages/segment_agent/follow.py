@@ -22,7 +22,7 @@ ROUNDS, MODEL_NUMBERS = 8, 65
 """of GrabCut; its models are five Gaussians of a weight, a mean and a covariance each"""
 CLICK_REACH = 0.2
 """of the box around a click, as a share of the picture's height"""
-MOTION_GAPS, LEAST_MOVING = (4, 8), 0.15
+MOTION_GAPS, MIN_MOVING = (4, 8), 0.15
 """frames over which motion is measured in the hinted frame, and share of the box that must move for motion to
 separate the animal from the rest of the box"""
 
@@ -51,7 +51,7 @@ def cut_out(footage: Footage, hint: Prompt, rng: np.random.Generator) -> Float[n
     boxed = np.zeros((height, width), bool)
     boxed[low[1] : high[1], low[0] : high[0]] = True
     residual = footage.residual(hint.frame, *MOTION_GAPS)
-    still = (residual < STILL) & ((residual[boxed] > MOVING).mean() > LEAST_MOVING)
+    still = (residual < STILL) & ((residual[boxed] > MOVING).mean() > MIN_MOVING)
     marks = np.where(boxed, np.where(still, cv2.GC_PR_BGD, cv2.GC_PR_FGD), cv2.GC_BGD).astype(np.uint8)
     inside = grab(color, marks, rng)
     inside = inside if inside.any() else boxed

@@ -17,9 +17,9 @@ MOVING, STILL = 4.0, 2.5
 """typical residuals from which on a point moves against the background, and up to which it does not"""
 REACH_PX, OUTLINE_PX = 16, 3
 """how far from where it is presumed an animal is looked for, and flow blurs its outline; working pixels"""
-LEAST_MOVING = 0.3
+MIN_MOVING = 0.3
 """share of a region that must move for motion to separate the animal from the rest"""
-LEAST_TYPICAL_PX = 0.5
+MIN_TYPICAL_PX = 0.5
 """typical residual that counts as noise of the flow"""
 SHOWN_GAPS, SHOWN_LOG = (1, 4), 60.0
 """gaps over which a network is shown motion; 8-bit levels of log(1 + residual), for up to 70 residuals"""
@@ -75,7 +75,7 @@ class Footage:
             if matrix is not None:
                 expected = cv2.perspectiveTransform(pixel.reshape(1, -1, 2), matrix).reshape(pixel.shape)
                 error = np.linalg.norm(expected - pixel - moved, axis=-1)
-                parts.append(error / max(float(np.median(error)), LEAST_TYPICAL_PX))
+                parts.append(error / max(float(np.median(error)), MIN_TYPICAL_PX))
         return np.mean(parts, axis=0) if parts else np.zeros(self.size, np.float32)
 
     def moving(
@@ -90,10 +90,10 @@ class Footage:
         for gap in GAPS:
             residual = self._residual_over(frame, gap)
             moves = residual[inside & (residual > MOVING)]
-            if len(moves) > LEAST_MOVING * inside.sum():
+            if len(moves) > MIN_MOVING * inside.sum():
                 level = float(np.median(moves))
                 moving = ~grown(residual < max(MOVING, level / 2), OUTLINE_PX)
-                alone = moving[far].sum() < LEAST_MOVING / 2 * far.sum()
+                alone = moving[far].sum() < MIN_MOVING / 2 * far.sum()
                 return (moving.astype(np.float32) - (residual < max(STILL, level / 4))) * (alone & ~far)
         return np.zeros(self.size, np.float32)
 

@@ -30,7 +30,7 @@ NEAREST_M = 0.1
 """nothing is measured nearer to a depth camera"""
 NOISE_REACH_M = 0.15
 """largest difference that may be noise of a surface seen twice, and not another surface"""
-LEAST_PAIRS, MAD_TO_SIGMA, LEAST_NOISE_M = 200, 1.48, 0.002
+MIN_PAIRS, MAD_TO_SIGMA, MIN_NOISE_M = 200, 1.48, 0.002
 """differences that measure a range's noise, MAD to sigma, and the least deviation of any sensor"""
 SOFTNESS_PX = 1.2
 """deviation of the blur before colours are compared"""
@@ -166,13 +166,13 @@ def measure_noise(
         errors.append(np.abs(measured - z)[near])
     z, error = np.concatenate(ranges), np.concatenate(errors)
     bins = [(z >= low) & (z < low + 0.5) for low in np.arange(0.25, 6, 0.5)]
-    bins = [own for own in bins if own.sum() > LEAST_PAIRS]
+    bins = [own for own in bins if own.sum() > MIN_PAIRS]
     if len(bins) < 2:
         return DepthNoise()
     middle = np.array([float(np.median(z[own])) for own in bins])
     sigma = np.array([MAD_TO_SIGMA * float(np.median(error[own])) for own in bins])
     (constant, quadratic), _ = scipy.optimize.nnls(np.stack([np.ones_like(middle), middle**2], axis=1), sigma)
-    return DepthNoise(max(float(constant), LEAST_NOISE_M), float(quadratic))
+    return DepthNoise(max(float(constant), MIN_NOISE_M), float(quadratic))
 
 
 def _pairs(count: int) -> list[tuple[int, int]]:

@@ -15,7 +15,7 @@ from stages.segment_agent.windows import Sphere, supported_depth
 
 COARSE_PX, FINE_PX = 111, 222
 """side of the square that has as many pixels as candidates are made of: without and with known appearance"""
-REACH, LEAST_REACH_M = 1.8, 0.15
+REACH, MIN_REACH_M = 1.8, 0.15
 """radius of the ball in those of candidates, which show one side of the animal; no ball is smaller"""
 SOLID = np.ones((2, 2), np.uint8)
 """samples that an animal fills together; rims of furniture that poses misplace are thinner"""
@@ -57,9 +57,7 @@ def find_mover(
     if hint is None and not surely.any():
         surely = seen
     radii = [candidate.radius_m for candidate, sure in zip(chosen, surely, strict=True) if candidate and sure]
-    radius = (
-        float(np.clip(REACH * np.quantile(radii, 0.9), LEAST_REACH_M, animal.largest_m)) if radii else 0.0
-    )
+    radius = float(np.clip(REACH * np.quantile(radii, 0.9), MIN_REACH_M, animal.largest_m)) if radii else 0.0
     balls = [
         Sphere(candidate.centre_world, radius, presumed=not sure) if candidate else None
         for candidate, sure in zip(chosen, surely, strict=True)

@@ -27,9 +27,9 @@ FREE_M = 0.1
 """how far a candidate's centre may jump without motion: another part of the animal is seen"""
 EXCESS_M = 0.3
 """way beyond the fastest that costs as much as a convincing candidate is worth"""
-LEAST_VOTES, LEAST_SHARE = 2, 0.05
+MIN_VOTES, MIN_SHARE = 2, 0.05
 """references that must have seen through a point, and more as a share of those that saw a surface there"""
-LEAST_AREA_M2, LEAST_PIXELS = 0.003, 6
+MIN_AREA_M2, MIN_PIXELS = 0.003, 6
 """smallest visible area of a candidate, the head of a cat; samples that chance does not bring together"""
 LIKELY_AREA_M2 = 0.03
 """visible area from which on a candidate is fully convincing: a third of a cat from the side"""
@@ -74,17 +74,17 @@ class Hint:
 
 def moving(votes: Votes) -> Bool[np.ndarray, "*shape"]:
     """Return which points lie in space that is free at other times."""
-    return votes.free >= LEAST_VOTES + LEAST_SHARE * votes.occupied
+    return votes.free >= MIN_VOTES + MIN_SHARE * votes.occupied
 
 
 def surely_moving(votes: Votes, share: float) -> Bool[np.ndarray, "*shape"]:
     """Return which points lie in space that is free at a good share of other times: enough to learn from."""
-    return (votes.free > LEAST_VOTES) & (votes.free >= share * votes.occupied)
+    return (votes.free > MIN_VOTES) & (votes.free >= share * votes.occupied)
 
 
 def clearly_moving(votes: Votes) -> Bool[np.ndarray, "*shape"]:
     """Return which points clearly more references saw through than saw a surface there."""
-    return votes.free - votes.occupied > LEAST_VOTES
+    return votes.free - votes.occupied > MIN_VOTES
 
 
 def motion(votes: Votes) -> Float[np.ndarray, "*shape"]:
@@ -98,7 +98,7 @@ def groups(is_moving: Bool[np.ndarray, "height width"]) -> Iterator[Bool[np.ndar
     count, label = cv2.connectedComponents(closed, connectivity=8)
     for index in range(1, count):
         own = (label == index) & is_moving
-        if own.sum() >= LEAST_PIXELS:
+        if own.sum() >= MIN_PIXELS:
             yield own
 
 
@@ -113,7 +113,7 @@ def candidates(
     found = []
     for own in groups(is_moving):
         area = float(area_m2[own].sum())
-        if area < LEAST_AREA_M2:
+        if area < MIN_AREA_M2:
             continue
         points = points_world[own]
         centre = np.median(points, axis=0)

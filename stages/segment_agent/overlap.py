@@ -44,4 +44,4 @@ def estimate(
     chosen = [group[index] if index >= 0 else None for group, index in zip(lacking, choice, strict=True)]
     goes = movers.self_moving(chosen, clip.timestamp_s, animal)
     whole_m2 += [each.area_m2 if each and own else 0 for each, own in zip(chosen, goes, strict=True)]
-    return np.where(whole_m2 < movers.LEAST_AREA_M2, np.nan, right_m2 / np.maximum(whole_m2, 1e-9))
+    return np.where(whole_m2 < movers.MIN_AREA_M2, np.nan, right_m2 / np.maximum(whole_m2, 1e-9))

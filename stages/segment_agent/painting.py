@@ -27,7 +27,7 @@ SURE = 1.0
 """log-odds from which on a pixel is surely animal, beside the learned appearance"""
 SMALL_PX, BACKED = 250, 0.7
 """pixels below which chance makes masks; share of them that must look like the animal or move clearly"""
-LEAST_PRESUMED_PX = 25
+MIN_PRESUMED_PX = 25
 """sure pixels that a frame needs in which the track was lost"""
 PRESENCE_PRESUMED = -2.5
 PRESENCE_TRACKED = 2.0
@@ -106,7 +106,7 @@ class Painter:
                 like = network.log_odds_within(color, window.rows, window.columns)
                 labels, sure = self._by_appearance(window, evidence, like)
         inside = labels == 255
-        if sure[inside].sum() < (LEAST_PRESUMED_PX if ball.presumed else 1):
+        if sure[inside].sum() < (MIN_PRESUMED_PX if ball.presumed else 1):
             return Mask(empty, False, ABSENT_PRESUMED if ball.presumed else ABSENT_TRACKED)
         present = self._presence(evidence, like, inside, ball.presumed)
         if present < 0:  # unknown rather than animal

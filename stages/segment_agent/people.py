@@ -24,13 +24,13 @@ from stages.segment_agent.painting import Mask
 
 UPRIGHT_M = 0.9
 """vertical extent that no animal of a home has and that a person who is not cut off has"""
-LEAST_M = 0.4
+MIN_M = 0.4
 """vertical extent from which on a mover may be the legs of somebody who was seen whole before or after"""
 SLENDER = 1.2
 """how much higher than wide somebody upright is at least"""
-LEAST_UPRIGHT_FRAMES = 4
+MIN_UPRIGHT_FRAMES = 4
 """frames in which a track must be as high as a person"""
-MOST_PEOPLE = 3
+MAX_PEOPLE = 3
 BODY_RADIUS_M = 0.125
 """how far the body's axis lies behind what is seen of it: half the depth of a chest"""
 REACH_M = 0.45
@@ -81,7 +81,7 @@ def find_people(
     floor_m = float(np.median(lowest)) if len(lowest) else 0.0
     found = [list(group) for group, _ in scanned]
     axes, heights = [], []
-    for _ in range(MOST_PEOPLE):
+    for _ in range(MAX_PEOPLE):
         candidates = [[each.candidate for each in group] for group in found]
         chosen = movers.track(candidates, clip.timestamp_s, WALKER)
         picked = [group[index] if index >= 0 else None for group, index in zip(found, chosen, strict=True)]
@@ -96,9 +96,7 @@ def find_people(
             tops += [mover.top_m] if mover.whole else []
             found[frame].remove(mover)
         axes.append(_bridged(axis, clip.timestamp_s))
-        heights.append(
-            float(np.quantile(tops, 0.9)) - floor_m if len(tops) >= LEAST_UPRIGHT_FRAMES else np.nan
-        )
+        heights.append(float(np.quantile(tops, 0.9)) - floor_m if len(tops) >= MIN_UPRIGHT_FRAMES else np.nan)
     return People(np.array(axes).reshape(-1, len(clip), 2), np.array(heights, float), floor_m)
 
 
@@ -141,7 +139,7 @@ def _upright(
         group = points[own]
         bottom, top = np.quantile(group[:, 1], [0.02, 0.98])
         width = np.ptp(np.quantile(group[:, [0, 2]], [0.1, 0.9], axis=0), axis=0).max()
-        if top - bottom < max(LEAST_M, SLENDER * width):
+        if top - bottom < max(MIN_M, SLENDER * width):
             continue
         centre = np.median(group, axis=0)
         away = (centre - world_from_camera[:3, 3]) * [1, 0, 1]
@@ -165,7 +163,7 @@ def _persistent(
     piece = movers.pieces([mover and mover.candidate for mover in picked], seen, timestamp_s, WALKER)
     own = [seen[piece == number] for number in range(piece[-1] + 1)]
     tall = np.array([mover is not None and mover.extent_m > UPRIGHT_M for mover in picked])
-    is_person = [int(tall[frames].sum()) >= LEAST_UPRIGHT_FRAMES for frames in own]
+    is_person = [int(tall[frames].sum()) >= MIN_UPRIGHT_FRAMES for frames in own]
     place = np.array([[np.nan] * 3 if mover is None else mover.candidate.centre_world for mover in picked])
     for step in (1, -1):
         for number, following in pairwise(range(len(own))[::step]):

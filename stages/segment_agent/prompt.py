@@ -13,7 +13,7 @@ from pipeline.geometry import cameras, rigid
 from stages.segment_agent.free_space import steady_depth
 from stages.segment_agent.movers import Hint
 
-FORESHORTENED, LEAST_BOX_M = 1.5, 0.02
+FORESHORTENED, MIN_BOX_M = 1.5, 0.02
 """times half its box that an animal may reach: along the line of sight it may be longer; half of a box below
 the second is a click"""
 
@@ -62,7 +62,7 @@ def place(prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "fram
     distance = rigid.apply(rigid.inverse(world_from_camera[prompt.frame]), centre[None])[0, 2]
     half_m = max(x1 - x0, y1 - y0) / 2 * distance / clip.intrinsics[prompt.frame, 0, 0]
     hint = Hint(prompt.frame, centre)
-    return replace(hint, reach_m=FORESHORTENED * half_m) if half_m > LEAST_BOX_M else hint
+    return replace(hint, reach_m=FORESHORTENED * half_m) if half_m > MIN_BOX_M else hint
 
 
 def position(

@@ -21,7 +21,7 @@ from stages.segment_agent.appearance import Example, learn
 from stages.segment_agent.config import LearningConfig
 from stages.segment_agent.footage import REACH_PX, Footage, grown, pixels
 
-SURE, LEAST = 4.0, 0.5
+SURE, MIN = 4.0, 0.5
 """largest and smallest log-odds of a pixel; the largest of the network's judgement too"""
 MESSAGE, SMOOTHING = 0.6, 4.0
 """weights of messages in time (log-odds) and in the picture (-1..1)"""
@@ -48,14 +48,14 @@ def propagate(
     """Return log-odds of the animal in all frames from ``first`` in one, -`SURE` where it cannot be."""
     frames = range(len(footage.clip))
     found: Labels = [None for _ in frames]
-    found[hinted], possible = first, first > LEAST - SURE
+    found[hinted], possible = first, first > MIN - SURE
     forward = [*frames[hinted + 1 :], *frames[:hinted][::-1]]
     for turn, steps in enumerate(STEPS):
         options = replace(learning, steps=steps, crop_px=CROP_PX)
         judged = np.zeros((len(frames), *footage.size), np.float16)
         for picture in (footage.color, footage.with_motion):
             shown = examples(footage, found, hinted, learning.examples, picture)
-            network = learn(shown, options, rng, least_px=1, scaled=0.0)
+            network = learn(shown, options, rng, min_px=1, scaled=0.0)
             assert network is not None, "the hinted frame shows the animal"
             for frame in frames:
                 judged[frame] += network.log_odds(picture(frame)) / 2
@@ -92,7 +92,7 @@ def updated(footage: Footage, frame: int, judged: LogOdds, found: Labels) -> Log
     )
     log_odds = np.where(near, log_odds + SMOOTHING * around, -SURE)
     inside = connected(log_odds > 0, carried > 0 if seen else log_odds > 0)
-    low, high = np.where(inside, LEAST, -SURE), np.where(inside, SURE, -LEAST)
+    low, high = np.where(inside, MIN, -SURE), np.where(inside, SURE, -MIN)
     return np.clip(log_odds, low, high).astype(np.float16)
 
 

@@ -26,9 +26,9 @@ EDGE = 0.1
 """colour variance (0..1 squared) below which the filter smooths, as its root"""
 BINS, TONES = 12, 96
 """of a histogram along each axis of Lab, and the range of a and b that they divide"""
-LEAST_COLORS, PRIOR, PRIOR_BINS = 50, 0.02, 200
+MIN_COLORS, PRIOR, PRIOR_BINS = 50, 0.02, 200
 """pixels without which there is no palette, and the share of all that every so many unseen bins count as"""
-LEAST_CERTAINTY = 0.05
+MIN_CERTAINTY = 0.05
 """below, filtered evidence fades"""
 SURE_SHARE, HOLE_SHARE = 0.05, 0.05
 """share of a part that must be sure, and of the mask up to which a hole is closed"""
@@ -48,7 +48,7 @@ class Palette:
         self, color: UInt8[np.ndarray, "height width 3"], room: Bool[np.ndarray, "height width"]
     ) -> Float[np.ndarray, "height width"]:
         """Return log p(colour | animal) / p(colour | room), within +-2; ``room`` marks sure room."""
-        if min(self._counts.sum(), room.sum()) < LEAST_COLORS:
+        if min(self._counts.sum(), room.sum()) < MIN_COLORS:
             return np.zeros(color.shape[:2], np.float32)
         counts = np.zeros_like(self._counts)
         np.add.at(counts, _bin(color[room]), 1.0)
@@ -69,7 +69,7 @@ def sharpen(
     guide = cv2.GaussianBlur(color, (3, 3), 0).astype(np.float32) / 255
     both = np.dstack([evidence * certainty, certainty]).astype(np.float32)
     filtered = cv2.ximgproc.guidedFilter(guide, both, edges.radius_px, EDGE**2)
-    return filtered[..., 0] / np.maximum(filtered[..., 1], LEAST_CERTAINTY)
+    return filtered[..., 0] / np.maximum(filtered[..., 1], MIN_CERTAINTY)
 
 
 def label(

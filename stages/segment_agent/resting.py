@@ -26,7 +26,7 @@ POINTED_M, SURELY_M = 0.1, 0.05
 """around its place lies what a hint points at; nearer, and above the ground, it surely is the animal"""
 GRABBED_PX = 240
 """smallest side of a picture to cut out of: below, GrabCut's outline costs more than what it encloses"""
-LEAST_PX = 30
+MIN_PX = 30
 """pixels of the animal, and of what is not, without which it cannot be cut out"""
 
 
@@ -61,7 +61,7 @@ def find_resting(
         remedy = "point at the middle of the animal, or draw a box, in a frame that shows the ground too"
         what = "nothing stands out from level ground where the hint points"
         raise InputError("MSK-003", what, where, remedy)
-    cluster = find_cluster(shown, hint.centre_world, least_hits=1)
+    cluster = find_cluster(shown, hint.centre_world, min_hits=1)
     return [cluster.ball] * len(clip), judge_standing(cluster, ground, whole=False)
 
 
@@ -74,12 +74,12 @@ def _cut_out(clip, world_from_camera, hint, ground, height_px, rng):
     away_m = np.linalg.norm(window.points_world - hint.centre_world, axis=-1)
     raised = ground.above(window.points_world) > CLEARANCE_M
     possible, surely = raised & (away_m < hint.reach_m), raised & (away_m < SURELY_M)
-    if not surely.any() or min(possible.sum(), (~possible).sum()) < LEAST_PX:
+    if not surely.any() or min(possible.sum(), (~possible).sum()) < MIN_PX:
         return None
     marks = np.where(surely, cv2.GC_FGD, np.where(possible, cv2.GC_PR_FGD, cv2.GC_BGD)).astype(np.uint8)
     _, part = cv2.connectedComponents(_grab(window.color, marks, rng).astype(np.uint8))
     shown = (part > 0) & np.isin(part, part[surely]) & possible & window.trusted
-    return window.points_world[shown] if shown.sum() >= LEAST_PX else None
+    return window.points_world[shown] if shown.sum() >= MIN_PX else None
 
 
 def _grab(color, marks, rng):

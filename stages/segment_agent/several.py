@@ -32,7 +32,7 @@ from stages.segment_agent.windows import Sphere, Window, working_picture
 
 STEPS = 127 / LIMIT
 """kept log-odds are rounded to one part of so many"""
-LEAST_FRAMES, RECOGNIZED = 5, 0.75
+MIN_FRAMES, RECOGNIZED = 5, 0.75
 """frames in which an animal must be tracked to be in the recording, and the mean probability of its pixels"""
 ANOTHERS = -1.0
 """log-odds from which on a pixel that geometry knows nothing of is another animal's"""
@@ -95,7 +95,7 @@ def segment(
     known = [tracked(painter.balls) for painter in painters]
     for name, seen in zip(network.names, known, strict=True):
         log(f"{name}: tracked in {seen.sum()} of {len(clip)} frames" if seen.any() else f"{name} is not here")
-    _refuse_strangers(clip, strangers.sum() / max(np.any([strangers, *known], axis=0).sum(), LEAST_FRAMES))
+    _refuse_strangers(clip, strangers.sum() / max(np.any([strangers, *known], axis=0).sum(), MIN_FRAMES))
     own = network.names.index(followed)
     found = (joined(painters, margins, own, frame) for frame in range(len(clip)))
     found = people.hide(found, walkers, clip, poses)
@@ -187,7 +187,7 @@ def joined(painters: list[Painter], margins: Margins, own: int, frame: int) -> M
 def _is_here(painter: Painter, apart: AppearanceOf) -> bool:
     """Return whether what was tracked is this animal, by most of its pixels."""
     seen = np.flatnonzero(tracked(painter.balls)).tolist()
-    if len(seen) < LEAST_FRAMES:
+    if len(seen) < MIN_FRAMES:
         return False
     shares = []
     for frame in seen[:: max(1, len(seen) // masks.PROBES)]:

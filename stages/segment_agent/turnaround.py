@@ -21,7 +21,7 @@ from stages.segment_agent.evidence import UNKNOWN, Evidence, Judge
 from stages.segment_agent.refine import Edges
 from stages.segment_agent.windows import Sphere, Window
 
-LEAST_SPREAD = 1e-3
+MIN_SPREAD = 1e-3
 """mean squared sine of the angles between optical axes and their common line; below, they meet nowhere"""
 PICTURES = 40
 """frames that the cluster is made of"""
@@ -33,7 +33,7 @@ CLEARANCE_M = 0.03
 """height above the ground from which points surely do not belong to it"""
 FOOT_M, FOOT_SPREAD_M = 0.008, 0.004
 """height above the ground that makes a point under the body rather a paw, and what is worth one more"""
-LEAST_HITS = 3
+MIN_HITS = 3
 """pictures that must have seen a point in a cell"""
 EDGES = Edges(radius_px=2, unsure=0.4)
 """cells are coarser than evidence of motion"""
@@ -42,7 +42,7 @@ RIM_M, ASTRAY_M = 0.05, 0.15
 axis from the focus from which on it counts less than half"""
 LEVEL, SURE = 0.9, 3.0
 """least upward part of a level surface's normal; log-odds of what is beyond doubt"""
-LEAST_LEVEL = 200
+MIN_LEVEL = 200
 """points of level surface lower than the focus without which there is no ground"""
 NEAREST_M = 0.25
 """the optical axes meet at least so far before most cameras"""
@@ -99,7 +99,7 @@ def surroundings(
 ) -> tuple[Float[np.ndarray, "point 3"], GroundPlane | None]:
     """Return the points that frames see near a focus, and the ground beneath it, if one is seen."""
     points, level = _points_near(clip, world_from_camera, focus)
-    seen = (points[level, 1] < focus[1] + RIM_M).sum() >= LEAST_LEVEL
+    seen = (points[level, 1] < focus[1] + RIM_M).sum() >= MIN_LEVEL
     return points, fit_ground(points[level], focus) if seen else None
 
 
@@ -113,7 +113,7 @@ def meeting_point(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np
     weight = np.ones(len(centre))
     for _ in range(10):
         total = (weight[:, None, None] * across).sum(0)
-        if np.linalg.eigvalsh(total)[0] < LEAST_SPREAD * weight.sum():
+        if np.linalg.eigvalsh(total)[0] < MIN_SPREAD * weight.sum():
             return None
         point = np.linalg.solve(total, np.einsum("f,fij,fj->i", weight, across, centre))
         distance = np.linalg.norm(np.einsum("fij,fj->fi", across, point - centre), axis=1)
@@ -123,7 +123,7 @@ def meeting_point(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np
 
 
 def find_cluster(
-    points_world: Float[np.ndarray, "point 3"], focus: Float[np.ndarray, "3"], least_hits: int = LEAST_HITS
+    points_world: Float[np.ndarray, "point 3"], focus: Float[np.ndarray, "3"], min_hits: int = MIN_HITS
 ) -> Cluster:
     """Gather points into cells; take the connected group that is large and near the focus, grown by two."""
     reach = REACH_M + 2 * VOXEL_M
@@ -131,7 +131,7 @@ def find_cluster(
     at = np.floor((points_world - origin) / VOXEL_M).astype(int)
     at = at[((at >= 0) & (at < count)).all(1)]
     hits = np.bincount(np.ravel_multi_index(at.T, (count,) * 3), minlength=count**3).reshape((count,) * 3)
-    filled = hits >= least_hits
+    filled = hits >= min_hits
     around = np.ones((3, 3, 3), bool)
     closed = np.asarray(scipy.ndimage.binary_closing(filled, around), bool) | filled
     group, groups = cast("tuple[np.ndarray, int]", scipy.ndimage.label(closed, around))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.behavior.config import MOST_GUIDANCE
+from pipeline.behavior.config import MAX_GUIDANCE
 from pipeline.behavior.simulator import Simulator, SimulatorState
 from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.core import loopback
@@ -142,8 +142,8 @@ class LiveView:
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        scale = min(self.simulator.flock.sampling.guidance, MOST_GUIDANCE)
-        self.interactivity = gui.add_slider("interactivity", 0.0, MOST_GUIDANCE, SLIDER_STEP, scale)
+        scale = min(self.simulator.flock.sampling.guidance, MAX_GUIDANCE)
+        self.interactivity = gui.add_slider("interactivity", 0.0, MAX_GUIDANCE, SLIDER_STEP, scale)
         self.playing = gui.add_checkbox("time passes", True)
         self.again = Event()  # clicks come on another thread, perhaps in the middle of a step
         gui.add_button("start again, next seed").on_click(lambda _event: self.again.set())

@@ -19,7 +19,7 @@ CAPTIONS = {
     "histograms": "The animal's speed, distance to the observer, and how far it gets (training).",
     "windows": "Valid times of every recording, and how many windows start there.",
 }
-MOST_WINDOWS = 8192
+MAX_WINDOWS = 8192
 """Training windows that are gathered, evenly chosen: a day of a table holds 864 000, of 16 KB each."""
 
 
@@ -48,7 +48,7 @@ def checks(data: BehaviorData) -> list[Check]:
 
 def some(windows: Int[np.ndarray, "window"]) -> Int[np.ndarray, "chosen"]:
     """Return evenly chosen windows, all where they are few."""
-    return windows[subsampling.evenly(len(windows), MOST_WINDOWS)]
+    return windows[subsampling.evenly(len(windows), MAX_WINDOWS)]
 
 
 def visitation(

@@ -14,7 +14,7 @@ from stages.slice_behavior.config import Config
 from stages.slice_behavior.gridding import trajectory_from_motion
 from stages.slice_behavior.windows import slice_windows, write_volumes
 
-LEAST_PAST = 3
+MIN_PAST = 3
 """Frames that a posture and a velocity are taken from."""
 
 
@@ -52,7 +52,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
         raise InputError("ART-003", "no motion was given", "slice_behavior", "give --reconstruction")
     gaps = asdict(config)
     stride, past_s, _ = gaps.pop("stride"), gaps.pop("past_s"), gaps.pop("others")
-    past = max(round(past_s * config.rate_hz), LEAST_PAST)
+    past = max(round(past_s * config.rate_hz), MIN_PAST)
     trajectories = {id: trajectory_from_motion(motion, **gaps) for id, motion in source.motions.items()}
     test = frozenset(id for id in trajectories if sessions[id].split == "test")
     data = slice_windows(

@@ -21,7 +21,7 @@ from pipeline.longterm.short_motions import STEPS, BodyMotion, concatenate_motio
 METRICS = (
     "translation", "orientation", "pose", "mpjpe_mm", "mpvpe_mm",
     "end_v2v_share", "neighbour_v2v_mm", "neighbour_v2v_share", "seam_share", "seam_worst_mm",
-    "non_collision", "contact", "penetration_mm", "slide_m_s", "planted", "least_slide_m_s",
+    "non_collision", "contact", "penetration_mm", "slide_m_s", "planted", "min_slide_m_s",
 )  # fmt: skip
 """translation, orientation, pose: L1 x 100 of root position (m), of its rotation's first two columns, of the
 bones' channels (rad, m). MPJPE: origins of the bones. MPVPE: all vertices. Neighbour v2v, between one short
@@ -31,7 +31,7 @@ ends to the meshes one frame further in. Seam: how much further the vertices mov
 motions join than in the frames beside it, their mean and the worst of them. Share: of the body's length.
 Slide: median speed of standing feet in that clip; planted: share of frames in which any foot stands; least
 slide: speed of the foot that moves least."""
-MEDIANS = ("slide_m_s", "least_slide_m_s")
+MEDIANS = ("slide_m_s", "min_slide_m_s")
 """Metrics of which the tables give the median over clips, not the mean."""
 
 
@@ -85,7 +85,7 @@ def score(
             1000 * worth.penetration_m,
             worth.slide_m_s,
             stance.any(axis=1).mean(),
-            worth.least_slide_m_s,
+            worth.min_slide_m_s,
         ]
     )
 

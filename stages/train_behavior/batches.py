@@ -38,9 +38,9 @@ APPROACH_DISTANCE_M, APPROACH_SPEED_M_S = 2.4, 0.4
 BIN_M, MAX_REPEATS = 0.2, 8
 """bins of distance of approaches, and how often a window may count so that rare distances are
 asked as often"""
-LEAST_PATH_STD_M, LEAST_WAY_STD = 0.02, 0.05
+MIN_PATH_STD_M, MIN_WAY_STD = 0.02, 0.05
 """smallest scales of a path's frames (metres), and of goals (powered metres), strides (m/s) and positions"""
-LEAST_ROTATION_STD, LEAST_BONE_STD = 0.1, (0.05, 0.05, 0.05, 0.01, 0.01, 0.01)
+MIN_ROTATION_STD, MIN_BONE_STD = 0.1, (0.05, 0.05, 0.05, 0.01, 0.01, 0.01)
 """smallest scales of the root's rotation and of a bone's six numbers: an animal that only rests divides by
 nearly nothing otherwise"""
 MAX_STATISTICS_WINDOWS = 8192
@@ -196,8 +196,8 @@ def statistics_from_windows(windows: TrainingWindows, turn_rad: float) -> Window
     tracks, rows, known = windows.tracks(some), windows.frame[some], windows.bones_known[some]
     past, rate_hz = windows.past, windows.rate_hz
     future = tracks.root[:, past:].double().numpy()
-    level = np.sqrt((future[..., ::2] ** 2).mean((0, 2))).clip(LEAST_PATH_STD_M)
-    height = np.sqrt((future[..., 1] ** 2).mean(0)).clip(LEAST_PATH_STD_M)
+    level = np.sqrt((future[..., ::2] ** 2).mean((0, 2))).clip(MIN_PATH_STD_M)
+    height = np.sqrt((future[..., 1] ** 2).mean(0)).clip(MIN_PATH_STD_M)
     path_std = np.stack([level, height, level])
     whole = body_statistics(tracks.rotation[:, past:], windows.bones[rows[known, past:].unique()], turn_rad)
     strides = velocity_channels_from_path(tracks.root[:, past:], tracks.root[:, past - 1], rate_hz)
@@ -205,14 +205,14 @@ def statistics_from_windows(windows: TrainingWindows, turn_rad: float) -> Window
     goal_std = _spread(with_powered_length(future[:, -1], GOAL_LENGTH_POWER))
     scaling = Scaling(goal_std, velocity_std, path_std, *whole, rate_hz)
     mean, std = (torch.from_numpy(numbers).float() for numbers in whole)
-    position = tracks.root[:, :past].std().clip(LEAST_WAY_STD).expand(3)
+    position = tracks.root[:, :past].std().clip(MIN_WAY_STD).expand(3)
     return WindowStatistics(scaling, torch.cat([torch.zeros(3), mean]), torch.cat([position, std]))
 
 
 def _spread(way: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "3"]:
     """Return the root mean square of ways, both horizontal axes alike."""
     square = (way**2).mean(0)
-    return np.sqrt([square[::2].mean(), square[1], square[::2].mean()]).clip(LEAST_WAY_STD)
+    return np.sqrt([square[::2].mean(), square[1], square[::2].mean()]).clip(MIN_WAY_STD)
 
 
 def body_statistics(
@@ -222,7 +222,7 @@ def body_statistics(
     turns = rigid.rotation_from_vector(np.linspace(-1, 1, 9)[:, None] * [0, turn_rad, 0])
     root = rigid.rotation_to_6d(turns[:, None, None] @ rotation[::4, ::4].double().numpy()).reshape(-1, 6)
     posed = bones.double().numpy()
-    floor = np.concatenate([np.full(6, LEAST_ROTATION_STD), np.tile(LEAST_BONE_STD, posed.shape[-1] // 6)])
+    floor = np.concatenate([np.full(6, MIN_ROTATION_STD), np.tile(MIN_BONE_STD, posed.shape[-1] // 6)])
     std = np.concatenate([root.std(0), posed.std(0)])
     return np.concatenate([root.mean(0), posed.mean(0)]), np.maximum(std, floor)
 

@@ -106,12 +106,10 @@ def train(
     return TrainedBehavior(rounded(average.eval()), statistics.scaling, record)
 
 
-def _average(
-    average: BehaviorNets, nets: BehaviorNets, step: int, goal_steps: int, most_decay: float
-) -> None:
+def _average(average: BehaviorNets, nets: BehaviorNets, step: int, goal_steps: int, max_decay: float) -> None:
     """Move the average towards the weights; when the goals' phase ends, its nets take over the average."""
     begun = step - goal_steps if step >= goal_steps else step
-    decay = min(most_decay, (begun + 1) / (begun + AVERAGE_WARMUP_STEPS))
+    decay = min(max_decay, (begun + 1) / (begun + AVERAGE_WARMUP_STEPS))
     with torch.no_grad():
         for mean, parameter in zip(average.parameters(), nets.parameters(), strict=True):
             mean.lerp_(parameter, 1 - decay)

@@ -29,7 +29,7 @@ UNCERTAINTY_WEIGHT = 0.1
 """Weight of the likelihood of the predicted error against the error itself."""
 WEIGHT_DECAY, CLIP_NORM = 1e-4, 5.0
 """AdamW's decay and the largest norm of a gradient."""
-WARM_UP_SHARE, LEAST_RATE = 0.02, 0.01
+WARM_UP_SHARE, MIN_RATE = 0.02, 0.01
 """Share of the steps over which the learning rate rises, and what remains of it at the end."""
 
 DrawPatches = Callable[[np.random.Generator], tuple[Patches, np.ndarray]]
@@ -134,7 +134,7 @@ def _train(net, loss, config, seed):
 
     def schedule(done: float) -> float:
         warm_up = min(1.0, done / WARM_UP_SHARE + WARM_UP_SHARE)
-        return warm_up * (LEAST_RATE + (1 - LEAST_RATE) * (0.5 + 0.5 * np.cos(np.pi * done)))
+        return warm_up * (MIN_RATE + (1 - MIN_RATE) * (0.5 + 0.5 * np.cos(np.pi * done)))
 
     fit(
         modules={"net": net}, optimizer=optimizer, loss=loss, steps=config.steps, seed=seed,

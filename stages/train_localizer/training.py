@@ -22,7 +22,7 @@ from stages.train_localizer.views import RenderedView
 
 SEEDS = 2**31
 """Seeds are drawn below this."""
-MOST_DRAWS = 200
+MAX_DRAWS = 200
 """Random views of the scene of which one at least must be such as people take."""
 AXES = 64
 """Principal axes of the descriptors that are kept; more find no more on the built-in cat."""
@@ -31,8 +31,8 @@ SCENE_SAMPLING = PatchSampling("scene", 120.0, 0, 8, (6, 18))
 AGENT_SAMPLING = PatchSampling("agent", 110.0, 104, 4, (6, 14))
 """110 px per metre, crops of 0.95 m, a patch every 4 px (4 cm), radii of 6 and 14 px."""
 SOLVERS: dict[Target, localizers.RansacSolver] = {
-    "scene": localizers.RansacSolver(threshold_m=0.1, least_side_m=0.25, iterations=600, sectors=1),
-    "agent": localizers.RansacSolver(threshold_m=0.04, least_side_m=0.06, iterations=600, sectors=6),
+    "scene": localizers.RansacSolver(threshold_m=0.1, min_side_m=0.25, iterations=600, sectors=1),
+    "agent": localizers.RansacSolver(threshold_m=0.04, min_side_m=0.06, iterations=600, sectors=6),
 }
 """Inliers within a patch's size; triplets wider than a few patches."""
 RENDER_SCALE = 2
@@ -74,14 +74,14 @@ def scene_views(
     intrinsics = cameras.scale_intrinsics(np.median(clip.intrinsics, axis=0), clip.color_size, size)
 
     def draw(rng: np.random.Generator) -> RenderedView:
-        for _ in range(MOST_DRAWS):
+        for _ in range(MAX_DRAWS):
             camera = views.scene_camera(walk, floor_m, config.pitch_deg, rng)
             view = views.render(caster, camera, intrinsics, size, rng)
             if views.plausible(view, caster):
                 return view
         raise InputError(
             "MAP-006",
-            f"none of {MOST_DRAWS} views from within the map shows it in most of its pixels",
+            f"none of {MAX_DRAWS} views from within the map shows it in most of its pixels",
             str(clip.folder),
             "film the walk-through nearer to floor, walls and furniture, within 4 m",
         )
@@ -154,7 +154,7 @@ def _fresh_patches(shown, describe) -> networks.DrawPatches:
     """Return a function that renders and describes a fresh view that shows enough of the target."""
 
     def draw(rng: np.random.Generator) -> tuple[Patches, np.ndarray]:
-        for _ in range(MOST_DRAWS):
+        for _ in range(MAX_DRAWS):
             view = shown.draw(rng)
             patches = describing.patches_of(view, shown.sampling, describe)
             if patches is not None:

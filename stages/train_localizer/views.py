@@ -29,13 +29,13 @@ ELEVATION_DEG, AIM_M = (-10.0, 70.0), 0.03
 """Agent cameras: elevations (degrees), and standard deviation of the point they look at (metres)."""
 GAIN, WHITE_BALANCE, GAMMA = 0.3, 0.04, 0.25
 """Largest relative change of brightness, standard deviation of each channel's, and of gamma."""
-BLUR_PX, LEAST_BLUR_PX, PIXEL_NOISE = 1.0, 0.3, 0.015
+BLUR_PX, MIN_BLUR_PX, PIXEL_NOISE = 1.0, 0.3, 0.015
 """Largest and least Gaussian blur, pixels, and standard deviation of pixel noise, share of full scale."""
 OCCLUDED_SHARE, OCCLUDER_DEPTH = 0.4, 0.8
 """Share of scene queries with an occluder in front, and its depth over what it hides."""
 OCCLUDER_AXES, OCCLUDER_TURN_DEG = ((12, 4), (14, 7)), 30
 """Smallest and largest half axes of an occluder, as what the picture's width is divided by; largest turn."""
-LEAST_SEEN, NEAREST_M, NEAREST_QUANTILE, LEAST_FRONT = 0.6, 0.35, 0.05, 0.95
+MIN_SEEN, NEAREST_M, NEAREST_QUANTILE, MIN_FRONT = 0.6, 0.35, 0.05, 0.95
 """A plausible view: share of its pixels with surface, this quantile of its depth beyond this many metres, and
 share of surface seen from its front."""
 FRONT_RAYS = 16
@@ -110,7 +110,7 @@ def augment(
     color: Float[np.ndarray, "height width 3"], rng: np.random.Generator
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Change exposure, white balance and gamma, blur a little and add noise; colours 0..255."""
-    sigma = max(LEAST_BLUR_PX, rng.uniform(0, BLUR_PX))
+    sigma = max(MIN_BLUR_PX, rng.uniform(0, BLUR_PX))
     kernel = round(8 * sigma + 1) | 1  # four standard deviations on either side
     gain = 1 + rng.uniform(-GAIN, GAIN) + rng.normal(0, WHITE_BALANCE, 3)
     gamma = 1 + rng.uniform(-GAMMA, GAMMA)
@@ -122,7 +122,7 @@ def augment(
 
 def plausible(view: RenderedView, caster: RayCaster) -> bool:
     """Return whether a person could have taken it: mostly surface, from its front, nothing too near."""
-    if view.seen.mean() < LEAST_SEEN or np.quantile(view.depth[view.seen], NEAREST_QUANTILE) < NEAREST_M:
+    if view.seen.mean() < MIN_SEEN or np.quantile(view.depth[view.seen], NEAREST_QUANTILE) < NEAREST_M:
         return False
     grid = view.depth.shape[0] // FRONT_RAYS
     directions = (
@@ -132,7 +132,7 @@ def plausible(view: RenderedView, caster: RayCaster) -> bool:
     face = caster.cast(view.map_from_camera[:3, 3], directions).face
     corner = caster.mesh.vertices[caster.mesh.faces[face[face >= 0]]]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    return bool((np.einsum("ri,ri->r", normal, directions[face >= 0]) < 0).mean() > LEAST_FRONT)
+    return bool((np.einsum("ri,ri->r", normal, directions[face >= 0]) < 0).mean() > MIN_FRONT)
 
 
 def occlude(view: RenderedView, rng: np.random.Generator) -> RenderedView:

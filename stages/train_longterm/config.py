@@ -20,7 +20,7 @@ class Config:
     """Training of PoseNet, with RouteNet held."""
     clip_stride: int = 3
     """Frames (30 fps) between the starts of two-second training clips."""
-    most_bodies: int = 3000
+    max_bodies: int = 3000
     """Static bodies to learn from at most; beyond that they are subsampled evenly."""
     scene: bool = True
     """Whether RouteNet and PoseNet are conditioned on the scene."""

@@ -58,7 +58,7 @@ def train_networks(
     contacts = find_contact_vertices(dataset.body, list(dataset.stretches), dataset.distances)
     chosen = select_clips(dataset, rng, stride=config.clip_stride)
     clips = encode_selection(dataset, chosen, poses, sizes.points, rng)
-    stills = sample_static_bodies(dataset, poses, sizes.points, rng, most=config.most_bodies)
+    stills = sample_static_bodies(dataset, poses, sizes.points, rng, most=config.max_bodies)
     trainer = NetworkTrainer(poses, LongTermLossWeights(), config.seed, resume)
     static = initialized(lambda: StaticBody(sizes), config)
     route = initialized(lambda: RouteNet(sizes, with_scene=config.scene), config)

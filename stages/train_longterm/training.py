@@ -30,7 +30,7 @@ CHUNK = 256
 """Clips at a time where nothing is trained."""
 BODY_VERTICES = 150
 """Vertices of the surface that the CVAE's losses look at."""
-LEAST_RATE = 1e-3
+MIN_RATE = 1e-3
 """Share of the peak learning rate at both ends."""
 WARMUP = 0.03
 """Share of the training in which the learning rate rises."""
@@ -58,8 +58,8 @@ class LongTermLossWeights:
 
 def cosine(progress: float) -> float:
     """Return the factor on the learning rate: a linear warm-up, then a cosine; never quite 0."""
-    warm = min(1.0, (progress + LEAST_RATE) / WARMUP)
-    return warm * 0.5 * (1 + np.cos(np.pi * min(progress, 1.0))) + LEAST_RATE
+    warm = min(1.0, (progress + MIN_RATE) / WARMUP)
+    return warm * 0.5 * (1 + np.cos(np.pi * min(progress, 1.0))) + MIN_RATE
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ TITLE = (
 FOOTNOTE = "paper: on its own cat videos; '-': more than half (a twentieth) of the frames has no pose."
 EPISODE_S = 5.0
 """Intervals resample stretches of this length together: poses of neighbouring frames err alike."""
-MOST_DEG, MOST_M = 180.0, 10.0
+MAX_DEG, MAX_M = 180.0, 10.0
 """A frame without a pose counts as this wrong where errors are averaged"""
 UNITS = {"rotation_deg": "degrees", "translation_m": "meters"}
 
@@ -106,7 +106,7 @@ def _compare(
         start = np.concatenate([(sessions[index].timestamp_s / EPISODE_S).astype(int) for index in part])
         video = np.repeat(part, [len(sessions[index].timestamp_s) for index in part])
         both = [joined([errors[which][index] for index in part]) for which in (variant, "ours")]
-        for unit, most in (("rotation_deg", MOST_DEG), ("translation_m", MOST_M)):
+        for unit, most in (("rotation_deg", MAX_DEG), ("translation_m", MAX_M)):
             theirs, ours = (np.minimum(getattr(each, UNITS[unit]), most) for each in both)
             interval = bootstrapped(theirs - ours, episodes(start, video, 1), rng)
             found.put_mean(f"{name}/{unit}_more_than_ours", interval)
@@ -165,7 +165,7 @@ def checks(values: Mapping[str, float | None], variants: Sequence[str]) -> list[
     """Judge whether what the ablations leave out matters."""
     ours = values.get("ours/rotation_deg_median")
     without = values.get("no_localizer/rotation_deg_median")
-    ratio = None if ours is None else (without if without is not None else MOST_DEG) / max(ours, 1e-6)
+    ratio = None if ours is None else (without if without is not None else MAX_DEG) / max(ours, 1e-6)
     found = [Check("rotation, ours", ours, "deg, median", 0.5, 2.0)]
     if "no_localizer" in variants:
         found.append(Check("rotation without localizer over ours", ratio, "", 3.0, None, "higher"))

@@ -13,7 +13,7 @@ from pipeline.behavior.model import BehaviorNets
 from pipeline.behavior.planning import Sampler, TorchNetworks, observe
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import AnimalBatch, as_companions
-from pipeline.behavior.trajectories import ABSENT_M, KINDS, MOST_COMPANIONS, PAST, BehaviorData, nearest
+from pipeline.behavior.trajectories import ABSENT_M, KINDS, MAX_COMPANIONS, PAST, BehaviorData, nearest
 from stages.train_behavior.objective import with_some_absent
 from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
 from tests.stages.simulate.test_simulator import scaling
@@ -73,14 +73,14 @@ def test_an_animal_is_not_a_person(encoder):
 
 def test_the_nearest_are_perceived():
     rng = np.random.default_rng(0)
-    others = rng.uniform(-5, 5, (3, MOST_COMPANIONS + 5, PAST, 4))
+    others = rng.uniform(-5, 5, (3, MAX_COMPANIONS + 5, PAST, 4))
     others[0] = np.nan
     others[1, 3, -1] = np.nan  # has gone
     others[2, 4, :-1] = np.nan  # has just come
     others[2, 4, -1, :3] = 0.1
     agent = np.zeros((3, 3))
     some = nearest(others, agent)
-    assert some.shape[1] == MOST_COMPANIONS and np.isfinite(some).all()
+    assert some.shape[1] == MAX_COMPANIONS and np.isfinite(some).all()
     assert (some[0, :, :, 0] == ABSENT_M).all()
     assert not (some[1] == others[1, 3, 0]).all(-1).any()
     np.testing.assert_array_equal(some[2, 0], np.repeat(others[2, 4, -1:], PAST, 0))

@@ -117,7 +117,7 @@ def test_a_gliding_motion_gets_feet_that_stand(dataset, contact_body):
     scene = dataset.scenes[0].distance
     judge = PlausibilityMeter(dataset.body, contact_body.contacts, scene)
     done = optimize_motion(gliding, contact_body, scene, SETTINGS)
-    before, after = (judge.plausibility(each, judge.stance(each)).least_slide_m_s for each in (gliding, done))
+    before, after = (judge.plausibility(each, judge.stance(each)).min_slide_m_s for each in (gliding, done))
     assert before > 0.1 and after < 0.3 * before
     assert not judge.stance(gliding).any() and judge.stance(done).any(axis=1).mean() > 0.5
 

@@ -18,7 +18,7 @@ from stages.build_scene_template.config import Config, FusionConfig, RefinementC
 from tests.stages.textured_room import MemoryClip, aligned_errors, drifting, textured_room, walk
 
 NO_POINTS = TrackedPoints(*np.zeros((2, 0), int), *np.zeros((3, 0, 2)), *np.zeros((2, 0)), np.zeros(0, int))
-SFM = SfmConfig(most_keyframes=16, features=600, overlap=4, loops_per_keyframe=1)
+SFM = SfmConfig(max_keyframes=16, features=600, overlap=4, loops_per_keyframe=1)
 
 
 @pytest.fixture(scope="module")
@@ -233,6 +233,6 @@ def test_false_matches_are_dropped_by_depth(clip, tmp_path):
 
 
 def test_more_than_a_home_is_refused(clip, monkeypatch):
-    monkeypatch.setattr(fuse, "MOST_VOXELS", 1000)
+    monkeypatch.setattr(fuse, "MAX_VOXELS", 1000)
     with pytest.raises(InputError, match="MAP-005.*the walk-through spans"):
         fuse.fuse(clip, np.arange(0, 48, 4), clip.truth, FusionConfig(voxel_m=0.05))

@@ -169,7 +169,7 @@ def test_the_same_room_is_found_and_another_is_not():
         overlap.describe(shots) for shots in (_shots(0, 24), _shots(0, 9, offset), _shots(5, 9, offset))
     )
     assert overlap.placed_share(room, again, rng) > 0.5
-    assert overlap.placed_share(room, other, rng) < problems.LEAST_PLACED
+    assert overlap.placed_share(room, other, rng) < problems.MIN_PLACED
     for share, describe_capture in ((0.01, {"CAP-053"}), (0.6, set())):
         sample = sampling.RecordingSample(*[None] * 2, [], 0.0)
         seen = problems.CaptureMeasurements(sample, placed=share)
@@ -194,7 +194,7 @@ def test_movers_are_counted():
     assert still.seen == 0
     assert lone.seen > 0.6
     assert lone.several < 0.2
-    assert pair.several > problems.MOST_SEVERAL
+    assert pair.several > problems.MAX_SEVERAL
     sample = sampling.RecordingSample(*[None] * 2, [], 0.0)
     codes = [
         problems._of_content(problems.CaptureMeasurements(sample, moving=seen), "session").keys()

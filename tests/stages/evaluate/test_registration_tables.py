@@ -72,7 +72,7 @@ def test_ablations_are_compared_frame_by_frame(capture):
     assert values["worse/videos_registered"] == 1
     assert values["worse/rotation_deg_p95"] is None, "half of the frames have no pose"
     assert values["worse/rotation_deg_more_than_ours"] == pytest.approx(
-        (2.0 + table.MOST_DEG - 1.0) / 2, abs=1e-3
+        (2.0 + table.MAX_DEG - 1.0) / 2, abs=1e-3
     )
     low, high = (values[f"worse/rotation_deg_more_than_ours_ci95_{end}"] for end in ("low", "high"))
     assert low < values["worse/rotation_deg_more_than_ours"] < high

@@ -115,8 +115,8 @@ def test_the_animal_walks_around_a_person_in_its_way(simulator: Path, chromium: 
                 state = page.evaluate("ats.state()")
                 gaps.append(np.hypot(state["animal"][0] - person[0], state["animal"][2] - person[1]))
             assert state["aim"] is None, f"half a minute, and it stands at {state['animal'][:3]}"
-        least_m = clearance_of(small_world.rest()) - 0.04
-        assert min(gaps[4:]) > least_m, "metres: two plans that fade into each other cut corners"
+        min_m = clearance_of(small_world.rest()) - 0.04
+        assert min(gaps[4:]) > min_m, "metres: two plans that fade into each other cut corners"
         assert wrong == []
 
 

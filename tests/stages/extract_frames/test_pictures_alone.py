@@ -117,7 +117,7 @@ def test_depth_of_known_cameras_is_right_where_others_agree(room):
 
 
 def test_keyframes_follow_motion_and_not_time():
-    config = PhotogrammetryConfig(keyframe_share=0.1, most_keyframes=20)
+    config = PhotogrammetryConfig(keyframe_share=0.1, max_keyframes=20)
     travelled = np.concatenate([np.zeros(50), np.linspace(0, 1, 50)])
     sharpness = np.ones(100)
     sharpness[::7] = 2.0

@@ -75,4 +75,4 @@ def test_the_stage_copies_poses_and_stops_where_too_few_fit(tmp_path):
     assert (RegisteredPoses.open(out / "v002").world_from_camera == eye).all()
     assert not (out / "v003").exists()
     with pytest.raises(InputError, match="REG-001.*no overlap"):
-        stage.run(stage.Inputs(folders), Config(least_registered=2), out)
+        stage.run(stage.Inputs(folders), Config(min_registered=2), out)

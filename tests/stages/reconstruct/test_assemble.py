@@ -8,7 +8,7 @@ import torch
 from pipeline.data.motion import MotionTable
 from pipeline.geometry import rigid
 from stages.reconstruct import assemble, rays
-from stages.reconstruct.problem import MOST_PRECISE, prior_precision
+from stages.reconstruct.problem import MAX_PRECISE, prior_precision
 from tests.stages.reconstruct.test_optimise import WIDE, film, problem
 
 
@@ -91,7 +91,7 @@ def test_masks_count_by_how_much_of_the_animal_they_show(monkeypatch):
         assemble.mask_weights(views),
         assemble.mask_weights(dataclasses.replace(views, outside_px=hidden)),
     )
-    assert 0.15 < after[2] / before[2] < 0.35 and after[3] == assemble.LEAST_MASK_WEIGHT
+    assert 0.15 < after[2] / before[2] < 0.35 and after[3] == assemble.MIN_MASK_WEIGHT
     rest = torch.arange(len(before)) > 3
     torch.testing.assert_close(after[rest], before[rest])
 
@@ -101,5 +101,5 @@ def test_cameras_are_held_as_firmly_as_registration_is_sure():
     table = MotionTable(pose, pose, torch.eye(4)[None], [40], [True], knot_frames=10)
     confidence = np.repeat([0.3, 1.0], 20)
     camera_precision = prior_precision(table, confidence)
-    assert camera_precision[0] == camera_precision[1] == 1 and camera_precision[4] == MOST_PRECISE
-    assert 1 < camera_precision[2] < MOST_PRECISE, "between doubtful and certain frames"
+    assert camera_precision[0] == camera_precision[1] == 1 and camera_precision[4] == MAX_PRECISE
+    assert 1 < camera_precision[2] < MAX_PRECISE, "between doubtful and certain frames"

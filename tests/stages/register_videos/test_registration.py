@@ -141,8 +141,8 @@ def test_a_repainted_room_of_the_same_shape_is_refused(maps):
         clip = MemoryClip(RayCaster(Mesh(maps.scene.vertices, maps.scene.faces, color)), truth, truth)
         scores = score_appearance(clip, NoAgent(40), caster, truth, config.confidence, rng)
         right[name] = appearance_probability(clip.timestamp_s, scores).mean()
-    assert right["other"] < 0.5 * config.gate.least_appearance
-    assert right["dim"] > 2 * config.gate.least_appearance
+    assert right["other"] < 0.5 * config.gate.min_appearance
+    assert right["dim"] > 2 * config.gate.min_appearance
     votes = voting.collect(clip, NoAgent(40), maps.scene_localizer, VoteConfig(every_frames=8))
     doubtful, sure = (
         replace(votes, answers=[replace(answer, probability=p) for answer in votes.answers])

@@ -34,7 +34,7 @@ def test_agent_is_found_from_all_around():
 
 
 def test_a_map_that_fills_no_view_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "MOST_DRAWS", 5)
+    monkeypatch.setattr(training, "MAX_DRAWS", 5)
     truth = walk(4)
     clip = MemoryClip(RayCaster(textured_room(edge_m=0.5)), truth, truth, folder=tmp_path)
     crumb = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), np.full((3, 3), 9, np.uint8))

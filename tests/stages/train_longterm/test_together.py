@@ -20,7 +20,7 @@ NETWORKS = ("static", "route", "pose")
 
 def trained(batch: int) -> learning.TrainedLongTerm:
     short = LongTermOptimizerConfig(steps=4, batch=batch)
-    config = Config(body=short, route=short, pose=short, clip_stride=40, most_bodies=60)
+    config = Config(body=short, route=short, pose=short, clip_stride=40, max_bodies=60)
     return learning.train_networks(strider.dataset(count=2, seconds=4.0), config, sizes=SIZES)
 
 

@@ -19,7 +19,7 @@ SIZES = LongTermSizes(pose=12, latent=4, scene=16, hidden=12, width=24, points=3
 SHORT = LongTermOptimizerConfig(steps=80, batch=16, rate=1e-2)
 
 
-SETTINGS = Config(body=SHORT, route=SHORT, pose=SHORT, clip_stride=10, most_bodies=120)
+SETTINGS = Config(body=SHORT, route=SHORT, pose=SHORT, clip_stride=10, max_bodies=120)
 
 
 @pytest.fixture(scope="module")
