@@ -1,9 +1,9 @@
-"""Localizers: one picture with depth -> where the camera is, relative to a map (the scene, or the agent).
+"""Localizers: estimate the camera pose of one RGB-D picture relative to a map (the scene or the agent).
 
-Three kinds: a bank of patches of rendered views, a scene-coordinate network (both solved by RANSAC over
-closed forms, since depth is known), and the paper's pose regressor. Patches are described by DAISY or by the
-network that the features were fitted with. The inlier ratio is calibrated to a probability. `load` opens a
-trained localizer, `Localizer.localize` queries it.
+Three kinds: nearest neighbours in a bank of rendered patches and scene-coordinate regression, both followed
+by RANSAC over rigid alignments (depth is known), and the paper's absolute pose regression. Descriptors are
+DAISY or those of the network that the features were fitted with. The inlier ratio is calibrated to a
+probability. `load` opens a trained localizer, `Localizer.localize` queries it.
 """
 
 import json
@@ -32,11 +32,11 @@ from pipeline.localization.patches import (
 Net = TypeVar("Net", bound=nn.Module)
 Kind = Literal["bank", "coordinates", "regression"]
 MIN_INLIERS = 4
-"""Fewer agreeing patches give no pose: three fit any."""
-MIN_SECTOR = 6
-"""Patches without which an azimuth sector is not queried."""
-REGRESSED_POINTS = 60
-"""Patches that a regressed pose keeps as points."""
+"""Least number of inliers of a pose: three points always fit."""
+MIN_SECTOR_PATCHES = 6
+"""Azimuth sectors with fewer patches are not queried."""
+MAX_REGRESSED_POINTS = 60
+"""Points that a regressed pose keeps, at most."""
 LOGIT_LIMIT = 30.0
 """Logits are clipped to this, so that the exponential stays finite."""
 NEWTON_STEPS, RIDGE = 50, (1e-3, 5e-3)
@@ -63,7 +63,7 @@ class PoseHypothesis:
 
     map_from_camera: Float[np.ndarray, "4 4"]
     inlier_ratio: float
-    """Share of the patches that agree; of a regressed pose its own certainty, 0..1."""
+    """Share of the patches that are inliers; for a regressed pose its predicted certainty, 0..1."""
     probability: float
     points_map: Float[np.ndarray, "inlier 3"]
     points_camera: Float[np.ndarray, "inlier 3"]
@@ -71,21 +71,21 @@ class PoseHypothesis:
 
 @dataclass(frozen=True)
 class RansacSolver:
-    """How matches of patches become one pose."""
+    """RANSAC parameters that turn matched patches into one pose."""
 
     threshold_m: float
-    """Patches within this of their match agree, metres."""
+    """Inlier threshold: distance between a patch and its match, metres."""
     min_side_m: float
-    """Least side of a RANSAC triplet, metres."""
+    """Least side of a RANSAC sample's triangle, metres."""
     iterations: int
-    """RANSAC triplets."""
+    """Number of RANSAC samples of three matches."""
     sectors: int
-    """Agent: a bank is queried once per azimuth sector, so that front and back both answer."""
+    """Agent: the bank is queried once per azimuth sector, so that front and back both give a hypothesis."""
 
 
 @dataclass(frozen=True)
 class Localizer:
-    """What was learned of a map, and how to query it."""
+    """A trained localizer: descriptors, model, solver and calibration."""
 
     sampling: PatchSampling
     basis: PcaBasis
@@ -93,9 +93,9 @@ class Localizer:
     calibration: Calibration
     solver: RansacSolver
     describer: Describer = Describer()
-    """What describes patches: DAISY at the sampling's radii, or a network with its weights."""
+    """Patch descriptor: DAISY at the sampling's radii, or a network with its weights."""
     describe: Describe | None = None
-    """The opened network; None: DAISY."""
+    """The loaded network; None: DAISY."""
 
     def localize(
         self,
@@ -105,31 +105,34 @@ class Localizer:
         intrinsics: Float[np.ndarray, "3 3"],
         mask: Bool[np.ndarray, "height width"] | None = None,
     ) -> list[PoseHypothesis]:
-        """Return poses, best first; the scene's localizer gives at most one. Depth in metres; mask: where the
-        target may be."""
-        lenses = depth_intrinsics, intrinsics
-        patches = extract_patches(color, depth, *lenses, mask, self.sampling, self.describe)
+        """Return pose hypotheses, best first; at most one for a scene.
+
+        Depth in metres, intrinsics in pixels; ``mask`` limits the picture to where the target may be.
+        """
+        patches = extract_patches(
+            color, depth, depth_intrinsics, intrinsics, mask, self.sampling, self.describe
+        )
         return [] if patches is None else self.localize_patches(patches)
 
     def localize_patches(self, patches: Patches) -> list[PoseHypothesis]:
-        """Return poses for patches that are described already."""
+        """Return pose hypotheses for described patches, best first."""
         query = self.basis.project(patches.descriptors)
         match self.model:
             case PatchBank() as bank:
-                parts = [None] if self.sampling.target == "scene" else bank.sectors(self.solver.sectors)
-                answers = [
-                    self._solve(patches, *bank.match(query, part))
-                    for part in parts
-                    if part is None or len(part) >= MIN_SECTOR
+                sectors = [None] if self.sampling.target == "scene" else bank.sectors(self.solver.sectors)
+                poses = [
+                    self._solve(patches, *bank.match(query, sector))
+                    for sector in sectors
+                    if sector is None or len(sector) >= MIN_SECTOR_PATCHES
                 ]
             case SceneCoordinateNet() as net:
-                answers = [self._solve(patches, *net.match(query))]
+                poses = [self._solve(patches, *net.match(query))]
             case PoseRegressor() as net:
-                answers = [self._regressed(patches, *net.regress(query, patches.cell, self._anchor(patches)))]
+                poses = [self._regress(patches, *net.regress(query, patches.cell, self._anchor(patches)))]
             case _:
                 assert_never(self.model)
-        found = [answer for answer in answers if answer is not None]
-        return sorted(found, key=lambda answer: -answer.inlier_ratio)
+        found = [pose for pose in poses if pose is not None]
+        return sorted(found, key=lambda pose: -pose.inlier_ratio)
 
     def _solve(self, patches, matched, weight) -> PoseHypothesis | None:
         solver = self.solver
@@ -148,12 +151,12 @@ class Localizer:
         return self._hypothesis(map_from_camera, ratio, matched[inlier], points_camera)
 
     def _anchor(self, patches) -> Float[np.ndarray, "3"]:
-        """Return the point whose position a regressor predicts: the camera's or the animal's middle."""
+        """Return the point whose map position is regressed, camera frame: camera centre or animal centre."""
         return np.zeros(3) if self.sampling.target == "scene" else np.median(patches.points_camera, axis=0)
 
-    def _regressed(self, patches, map_from_camera, certainty) -> PoseHypothesis:
-        some = patches.points_camera[:: max(1, len(patches.points_camera) // REGRESSED_POINTS)]
-        return self._hypothesis(map_from_camera, certainty, rigid.apply(map_from_camera, some), some)
+    def _regress(self, patches, map_from_camera, certainty) -> PoseHypothesis:
+        subset = patches.points_camera[:: max(1, len(patches.points_camera) // MAX_REGRESSED_POINTS)]
+        return self._hypothesis(map_from_camera, certainty, rigid.apply(map_from_camera, subset), subset)
 
     def _hypothesis(self, map_from_camera, ratio, points_map, points_camera) -> PoseHypothesis:
         probability = float(self.calibration.probability(ratio))
@@ -161,8 +164,10 @@ class Localizer:
 
 
 def calibrate(score: Float[np.ndarray, "sample"], good: Bool[np.ndarray, "sample"]) -> Calibration:
-    """Fit P(good) as a logistic curve of a score in 0..1 by Newton steps; one pseudo-observation at each end
-    and a ridge keep separable data finite."""
+    """Fit P(good) by logistic regression on a score in 0..1 (Newton's method).
+
+    One pseudo-observation at each end and a ridge keep the fit to separable data finite.
+    """
     x = np.concatenate([score, [0.0, 1.0]])
     y = np.concatenate([good.astype(float), [0.0, 1.0]])
     design = np.stack([np.ones_like(x), x], axis=1)
@@ -170,70 +175,70 @@ def calibrate(score: Float[np.ndarray, "sample"], good: Bool[np.ndarray, "sample
     penalty = np.diag(RIDGE)
     for _ in range(NEWTON_STEPS):
         p = 1 / (1 + np.exp(-np.clip(design @ weights, -LOGIT_LIMIT, LOGIT_LIMIT)))
-        curvature = design.T @ (design * (p * (1 - p))[:, None]) + penalty
-        weights = weights + np.linalg.solve(curvature, design.T @ (y - p) - penalty @ weights)
+        hessian = design.T @ (design * (p * (1 - p))[:, None]) + penalty
+        weights = weights + np.linalg.solve(hessian, design.T @ (y - p) - penalty @ weights)
     return Calibration(float(weights[0]), float(weights[1]))
 
 
 def errors(
     map_from_camera: Float[np.ndarray, "*batch 4 4"], truth: Float[np.ndarray, "*batch 4 4"]
 ) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
-    """Return rotation error (degrees) and the distance of the camera centres (metres)."""
+    """Return rotation errors (degrees) and translation errors (metres)."""
     rotation = np.rad2deg(rigid.rotation_angle(map_from_camera[..., :3, :3], truth[..., :3, :3]))
     return rotation, np.linalg.norm(map_from_camera[..., :3, 3] - truth[..., :3, 3], axis=-1)
 
 
 def save(folder: Path, localizer: Localizer, report: dict) -> None:
-    """Write ``localizer.safetensors`` and ``localizer.json``; the report holds the held-out figures."""
+    """Write ``localizer.safetensors`` and ``localizer.json``; the report holds the held-out errors."""
     match localizer.model:
         case PatchBank() as bank:
             kind, arguments, arrays = "bank", {}, bank.arrays()
         case SceneCoordinateNet() as net:
-            kind, arguments, arrays = "coordinates", net.arguments, _weights(net)
+            kind, arguments, arrays = "coordinates", net.arguments, _state_arrays(net)
         case PoseRegressor() as net:
-            kind, arguments, arrays = "regression", net.arguments, _weights(net)
+            kind, arguments, arrays = "regression", net.arguments, _state_arrays(net)
         case _:
             assert_never(localizer.model)
     basis = {f"basis.{name}": value for name, value in vars(localizer.basis).items()}
     contiguous = {name: np.ascontiguousarray(value) for name, value in (arrays | basis).items()}
     save_file(contiguous, folder / "localizer.safetensors")
-    table = {"kind": kind, "arguments": arguments, "held_out": report}
+    metadata = {"kind": kind, "arguments": arguments, "held_out": report}
     parts = ("sampling", "solver", "calibration", "describer")
-    table |= {name: asdict(getattr(localizer, name)) for name in parts}
-    (folder / "localizer.json").write_text(json.dumps(table, indent=1) + "\n")
+    metadata |= {name: asdict(getattr(localizer, name)) for name in parts}
+    (folder / "localizer.json").write_text(json.dumps(metadata, indent=1) + "\n")
 
 
 def load(folder: Path, device: str = "cpu") -> Localizer:
-    """Open a trained localizer, a descriptor network on ``device``. Raises InputError MOD-001 to MOD-003."""
-    table = json.loads((folder / "localizer.json").read_text())
+    """Load a localizer, its descriptor network on ``device``. Raises InputError MOD-001 to MOD-003."""
+    metadata = json.loads((folder / "localizer.json").read_text())
     arrays = load_file(folder / "localizer.safetensors")
     basis = PcaBasis(arrays.pop("basis.mean"), arrays.pop("basis.components"))
-    kind: Kind = table["kind"]
+    kind: Kind = metadata["kind"]
     match kind:
         case "bank":
             model = PatchBank.from_arrays(arrays)
         case "coordinates":
-            model = _with_weights(SceneCoordinateNet(**table["arguments"]), arrays)
+            model = _load_weights(SceneCoordinateNet(**metadata["arguments"]), arrays)
         case "regression":
-            model = _with_weights(PoseRegressor(**table["arguments"]), arrays)
+            model = _load_weights(PoseRegressor(**metadata["arguments"]), arrays)
         case _:
             assert_never(kind)
-    sampling = PatchSampling(**{**table["sampling"], "radii_px": tuple(table["sampling"]["radii_px"])})
-    calibration, solver = Calibration(**table["calibration"]), RansacSolver(**table["solver"])
-    describer = Describer(**table["describer"])
+    sampling = PatchSampling(**{**metadata["sampling"], "radii_px": tuple(metadata["sampling"]["radii_px"])})
+    calibration, solver = Calibration(**metadata["calibration"]), RansacSolver(**metadata["solver"])
+    describer = Describer(**metadata["describer"])
     describe = open_describer(describer, device)
     return Localizer(sampling, basis, model, calibration, solver, describer, describe)
 
 
 def open_describer(describer: Describer, device: str) -> Describe | None:
-    """Open a descriptor network; None for DAISY, which patches describe at their own radii."""
+    """Load a descriptor network; None for DAISY, which `extract_patches` computes itself."""
     return None if describer.backend == "daisy" else describer.open(device)
 
 
-def _weights(net: nn.Module) -> dict[str, np.ndarray]:
+def _state_arrays(net: nn.Module) -> dict[str, np.ndarray]:
     return {name: value.cpu().numpy() for name, value in net.state_dict().items()}
 
 
-def _with_weights(net: Net, arrays: dict[str, np.ndarray]) -> Net:
+def _load_weights(net: Net, arrays: dict[str, np.ndarray]) -> Net:
     net.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
     return net.eval()

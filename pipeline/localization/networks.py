@@ -1,9 +1,8 @@
-"""The localizers that are networks: scene-coordinate regression and the paper's pose regressor.
+"""Neural localizers: scene-coordinate regression and the paper's absolute pose regression.
 
-`SceneCoordinateNet` maps each patch by itself, so that its neighbours cannot spoil it, to the point of the
-map under it (ACE, Brachmann et al. 2023). `PoseRegressor`, a ResNet-18 over dense descriptors with group
-normalisation, regresses the camera's rotation (a unit quaternion) and position (Eq. 5). Both predict their
-expected error, learned from the errors themselves.
+`SceneCoordinateNet` maps each patch independently of its neighbours to its point of the map (ACE, Brachmann
+et al. 2023). `PoseRegressor`, a ResNet-18 with group normalisation over dense descriptors, regresses the
+camera's rotation (a unit quaternion) and position (Eq. 5). Both also predict their expected error.
 """
 
 import itertools
@@ -18,9 +17,9 @@ from pipeline.geometry import rigid, rigid_torch
 MIN_LOG_M, MAX_LOG_M = -4.0, 3.0
 """Bounds of the predicted log distance (2 cm to 20 m)."""
 GRID = 16
-"""The descriptors are laid on a square grid of so many cells."""
+"""Cells along each side of the regressor's descriptor grid."""
 GROUPS, HIDDEN = 8, 256
-"""Groups of the normalisation, and units of the hidden layer of the head."""
+"""Groups of the group normalisation, and hidden units of the head."""
 MIN_LOG, MAX_LOG = -6.0, 3.0
 """Bounds of the predicted log error (radians + metres)."""
 IDENTITY_BIAS = 1e-3
@@ -28,7 +27,7 @@ IDENTITY_BIAS = 1e-3
 
 
 class SceneCoordinateNet(nn.Module):
-    """Patch descriptor -> point of the map in metres and the logarithm of the expected distance from it."""
+    """Patch descriptor -> map point (metres) and log of its expected error."""
 
     middle: Tensor
     extent: Tensor
@@ -45,7 +44,7 @@ class SceneCoordinateNet(nn.Module):
     def forward(
         self, descriptors: Float[Tensor, "patch axis"]
     ) -> tuple[Float[Tensor, "patch 3"], Float[Tensor, "patch"]]:
-        """Return points (metres) and log distances."""
+        """Return map points (metres) and log expected errors."""
         out = self.net(descriptors * descriptors.shape[-1] ** 0.5)
         return self.middle + self.extent * out[:, :3], out[:, 3].clamp(MIN_LOG_M, MAX_LOG_M)
 
@@ -53,7 +52,7 @@ class SceneCoordinateNet(nn.Module):
     def match(
         self, query: Float[np.ndarray, "query axis"]
     ) -> tuple[Float[np.ndarray, "query 3"], Float[np.ndarray, "query"]]:
-        """Return the map's point under each patch (metres) and its precision as weight."""
+        """Return each patch's map point (metres), weighted by its precision."""
         points, log_m = self(torch.from_numpy(np.ascontiguousarray(query, np.float32)))
         return points.double().numpy(), torch.exp(-2 * log_m).double().numpy()
 
@@ -61,29 +60,27 @@ class SceneCoordinateNet(nn.Module):
 def coordinate_loss(
     points: Float[Tensor, "patch 3"], log_m: Float[Tensor, "patch"], truth: Float[Tensor, "patch 3"]
 ) -> Float[Tensor, "patch"]:
-    """Return |x - y| / b + log b, the negative log likelihood of a Laplace law of width b (metres)."""
+    """Return |x - y| / b + log b, the Laplace negative log likelihood with scale b (metres)."""
     return (points - truth).norm(dim=-1) * torch.exp(-log_m) + log_m
 
 
-class _Block(nn.Module):
-    """Two 3x3 convolutions beside a shortcut (He et al. 2016), with normalisation by groups."""
+class _ResidualBlock(nn.Module):
+    """Residual block of two 3x3 convolutions (He et al. 2016) with group normalisation."""
 
-    def __init__(self, before: int, after: int, stride: int):
+    def __init__(self, c_in: int, c_out: int, stride: int):
         super().__init__()
-        self.first, self.second = nn.Conv2d(before, after, 3, stride, 1), nn.Conv2d(after, after, 3, 1, 1)
-        self.norms = nn.ModuleList([nn.GroupNorm(GROUPS, after), nn.GroupNorm(GROUPS, after)])
-        self.shortcut = (
-            nn.Identity() if before == after and stride == 1 else nn.Conv2d(before, after, 1, stride)
-        )
+        self.first, self.second = nn.Conv2d(c_in, c_out, 3, stride, 1), nn.Conv2d(c_out, c_out, 3, 1, 1)
+        self.norms = nn.ModuleList([nn.GroupNorm(GROUPS, c_out), nn.GroupNorm(GROUPS, c_out)])
+        self.shortcut = nn.Identity() if c_in == c_out and stride == 1 else nn.Conv2d(c_in, c_out, 1, stride)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the block's features."""
-        inner = torch.relu(self.norms[0](self.first(x)))
-        return torch.relu(self.norms[1](self.second(inner)) + self.shortcut(x))
+        hidden = torch.relu(self.norms[0](self.first(x)))
+        return torch.relu(self.norms[1](self.second(hidden)) + self.shortcut(x))
 
 
 class PoseRegressor(nn.Module):
-    """Grid of descriptors -> quaternion, the anchor's position in the map (metres), log of expected error."""
+    """Descriptor grid -> rotation, anchor position in the map (metres), log of the expected error."""
 
     middle: Tensor
     extent: Tensor
@@ -95,8 +92,8 @@ class PoseRegressor(nn.Module):
         blocks = []
         for index in range(4):
             blocks += [
-                _Block(widths[index], widths[index + 1], 1 if index == 0 else 2),
-                _Block(widths[index + 1], widths[index + 1], 1),
+                _ResidualBlock(widths[index], widths[index + 1], 1 if index == 0 else 2),
+                _ResidualBlock(widths[index + 1], widths[index + 1], 1),
             ]
         self.trunk = nn.Sequential(nn.Conv2d(axes, width, 3, 1, 1), nn.ReLU(), *blocks)
         self.head = nn.Sequential(
@@ -124,8 +121,10 @@ class PoseRegressor(nn.Module):
         cell: Int[np.ndarray, "patch 2"],
         anchor_camera: Float[np.ndarray, "3"],
     ) -> tuple[Float[np.ndarray, "4 4"], float]:
-        """Return ``map_from_camera`` of one picture and a certainty in 0..1; the anchor is a point in camera
-        axes, metres."""
+        """Return ``map_from_camera`` of one picture and a certainty in 0..1.
+
+        ``anchor_camera`` is the point whose map position is regressed, camera frame, metres.
+        """
         rotation, position, log_error = self(torch.from_numpy(on_grid(query, cell))[None])
         matrix = rotation[0].double().numpy()
         return rigid.make(matrix, position[0].double().numpy() - matrix @ anchor_camera), float(
@@ -136,14 +135,14 @@ class PoseRegressor(nn.Module):
 def on_grid(
     query: Float[np.ndarray, "patch axis"], cell: Int[np.ndarray, "patch 2"]
 ) -> Float[np.ndarray, "axis row column"]:
-    """Arrange patches on the network's grid, centred, zero where there is none, subsampled to fit."""
+    """Scatter patches onto the regressor's grid: centred, subsampled to fit, zero where empty."""
     extent = cell.max(0) + 1
-    place = (
+    target = (
         cell * GRID // max(int(extent.max()), GRID)
         + (GRID - np.minimum(extent * GRID // max(int(extent.max()), GRID), GRID)) // 2
     )
     grid = np.zeros((query.shape[1], GRID, GRID), np.float32)
-    grid[:, place[:, 0], place[:, 1]] = query.T
+    grid[:, target[:, 0], target[:, 1]] = query.T
     return grid
 
 
@@ -152,7 +151,7 @@ def pose_loss(
     log_error: Float[Tensor, "batch"],
     true_rotation: Float[Tensor, "batch 3 3"], true_position: Float[Tensor, "batch 3"],
 ) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch"]]:  # fmt: skip
-    """Return angle + distance (radians + metres; Eq. 5), and the negative log likelihood of that error."""
+    """Return rotation plus translation error (radians + metres, Eq. 5) and its negative log likelihood."""
     chord = (rotation - true_rotation).flatten(1).norm(dim=1) / 8**0.5
     error = 2 * torch.asin(chord.clamp(max=1 - 1e-6)) + (position - true_position).norm(dim=-1)
     return error, error.detach() * torch.exp(-log_error) + log_error

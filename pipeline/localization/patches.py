@@ -1,6 +1,6 @@
-"""From a picture with depth to patches: resized to one scale, described by DAISY or DINOv2, lifted by depth.
+"""Patches of an RGB-D picture: resized to one scale, described by DAISY or DINOv2, back-projected by depth.
 
-`extract_patches` treats one picture, `PcaBasis` reduces its descriptors, `PatchBank` finds the nearest
+`extract_patches` describes one picture, `PcaBasis` reduces its descriptors, `PatchBank` finds nearest
 neighbours among patches of rendered views. Views of the agent are scaled by their depth.
 """
 
@@ -16,35 +16,34 @@ from pipeline.geometry import cameras
 
 Target = Literal["scene", "agent"]
 Describe = Callable[[np.ndarray, int], np.ndarray]
-"""``describe(color, stride_px) -> [rows columns channel]`` at cell centres, as
-`pipeline.backends.descriptors` opens it."""
+"""``describe(color, stride_px) -> [rows columns channel]``, see `pipeline.backends.descriptors`."""
 
 MIN_PATCHES = 6
-"""A picture with fewer patches gives no answer."""
+"""A picture with fewer patches is not localized."""
 MIN_MASK_PX, MIN_DEPTH_PX, DEPTH_SAMPLES = 30, 10, 400
-"""Agent: least pixels of the mask, least of them with depth, and mask pixels that measure its depth."""
-NEAREST_M = 0.1
-"""Depth below this is none, metres."""
+"""Agent: least mask pixels, least of them with depth, and mask pixels sampled for the median depth."""
+MIN_DEPTH_M = 0.1
+"""Smaller depth counts as missing, metres."""
 GREY = 128
 """Grey value outside the mask."""
 KEYPOINT_PX = 8.0
-"""Size of DAISY's key points, pixels; without effect on unrotated descriptors."""
-BASIS_SAMPLES = 20_000
-"""Descriptors that fit the principal axes."""
+"""Size of DAISY's keypoints, pixels; no effect on unrotated descriptors."""
+PCA_SAMPLES = 20_000
+"""Descriptors sampled for the PCA."""
 MIN_NORM = 1e-6
-BLOCK = 4096
-"""Patches of the bank compared at once: their similarities stay in the processor's cache."""
+BANK_BLOCK = 4096
+"""Bank patches per matrix product, so that the similarities fit the processor's cache."""
 MIN_SIMILARITY = 0.05
-"""Cosine similarities below count as this, so that every match keeps some weight."""
+"""Floor of the cosine similarity, so that every match keeps some weight."""
 
 
 @dataclass(frozen=True)
 class PatchSampling:
-    """How pictures are scaled and where patches lie."""
+    """Scale of the pictures and grid of the patches."""
 
     target: Target
     focal_px: float
-    """Scene: pictures get this focal length, pixels. Agent: crops get so many pixels per metre."""
+    """Scene: focal length that pictures are resized to, pixels. Agent: pixels per metre of the crops."""
     window_px: int
     """Agent: edge of the square crop, pixels; scene: unused."""
     stride_px: int
@@ -55,7 +54,7 @@ class PatchSampling:
 
 @dataclass(frozen=True)
 class Patches:
-    """Patches of one picture: descriptors and the points under them."""
+    """Patches of one picture: descriptors and 3D points."""
 
     descriptors: Float[np.ndarray, "patch channel"]
     points_camera: Float[np.ndarray, "patch 3"]
@@ -66,23 +65,23 @@ class Patches:
 
 @dataclass(frozen=True)
 class PcaBasis:
-    """The principal axes that descriptors are reduced to."""
+    """Principal components of descriptors."""
 
     mean: Float[np.ndarray, "channel"]
     components: Float[np.ndarray, "axis channel"]
 
     def project(self, descriptors: Float[np.ndarray, "patch channel"]) -> Float[np.ndarray, "patch axis"]:
-        """Project descriptors onto the axes and normalise them to unit length."""
-        low = (descriptors.astype(np.float32) - self.mean) @ self.components.T
-        return low / np.maximum(np.linalg.norm(low, axis=1, keepdims=True), MIN_NORM)
+        """Project descriptors onto the components and normalise to unit length."""
+        reduced = (descriptors.astype(np.float32) - self.mean) @ self.components.T
+        return reduced / np.maximum(np.linalg.norm(reduced, axis=1, keepdims=True), MIN_NORM)
 
 
 def fit_pca(descriptors: Float[np.ndarray, "patch channel"], axes: int, rng: np.random.Generator) -> PcaBasis:
-    """Fit the principal axes on a sample of descriptors."""
-    chosen = rng.choice(len(descriptors), min(len(descriptors), BASIS_SAMPLES), replace=False)
-    known = descriptors[chosen].astype(np.float64)
-    mean = known.mean(0)
-    _, vectors = np.linalg.eigh((known - mean).T @ (known - mean))
+    """Fit the principal components to a sample of descriptors."""
+    chosen = rng.choice(len(descriptors), min(len(descriptors), PCA_SAMPLES), replace=False)
+    valid = descriptors[chosen].astype(np.float64)
+    mean = valid.mean(0)
+    _, vectors = np.linalg.eigh((valid - mean).T @ (valid - mean))
     components = np.ascontiguousarray(vectors[:, ::-1][:, :axes].T).astype(np.float32)
     return PcaBasis(mean.astype(np.float32), components)
 
@@ -99,23 +98,23 @@ class PatchBank:
     map_from_camera: Float[np.ndarray, "view 4 4"]
 
     def match(
-        self, query: Float[np.ndarray, "query axis"], part: Int[np.ndarray, "part"] | None = None
+        self, query: Float[np.ndarray, "query axis"], subset: Int[np.ndarray, "subset"] | None = None
     ) -> tuple[Float[np.ndarray, "query 3"], Float[np.ndarray, "query"]]:
-        """Return the map's point of each query's nearest neighbour, among all or some, and its weight."""
+        """Return the map point of each query's nearest neighbour (optionally in a subset), and its weight."""
         descriptors, points = self.descriptors, self.points_map
-        if part is not None:
-            descriptors, points = descriptors[part], points[part]
+        if subset is not None:
+            descriptors, points = descriptors[subset], points[subset]
         nearest, similarity = np.zeros(len(query), int), np.full(len(query), -np.inf, np.float32)
-        for first in range(0, len(descriptors), BLOCK):
-            table = query @ descriptors[first : first + BLOCK].T
-            best = table.argmax(1)
-            score = table[np.arange(len(query)), best]
+        for first in range(0, len(descriptors), BANK_BLOCK):
+            similarities = query @ descriptors[first : first + BANK_BLOCK].T
+            best = similarities.argmax(1)
+            score = similarities[np.arange(len(query)), best]
             nearest = np.where(score > similarity, best + first, nearest)
             similarity = np.maximum(similarity, score)
         return points[nearest].astype(float), np.clip(similarity, MIN_SIMILARITY, 1).astype(float) ** 2
 
     def sectors(self, count: int) -> list[Int[np.ndarray, "part"]]:
-        """Split the patches by the azimuth their view was taken from."""
+        """Group patch indices by the azimuth of their view's camera."""
         eye = self.map_from_camera[:, :3, 3]
         sector = np.floor((np.arctan2(eye[:, 0], eye[:, 2]) / (2 * np.pi) + 0.5) * count).astype(int) % count
         return [np.flatnonzero(sector[self.view] == index) for index in range(count)]
@@ -133,7 +132,7 @@ class PatchBank:
 def describe_daisy(
     picture: UInt8[np.ndarray, "height width 3"], sampling: PatchSampling
 ) -> tuple[Float[np.ndarray, "patch channel"], Float[np.ndarray, "patch 2"]]:
-    """Return DAISY descriptors on a resized picture's grid and their centres, pixels (Tola et al. 2010)."""
+    """Return dense DAISY descriptors (Tola et al. 2010) of a resized picture and their centres, pixels."""
     gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     offset = sampling.stride_px // 2
     y, x = np.mgrid[offset : gray.shape[0] : sampling.stride_px, offset : gray.shape[1] : sampling.stride_px]
@@ -162,11 +161,11 @@ def extract_patches(
     sampling: PatchSampling,
     describe: Describe | None = None,
 ) -> Patches | None:
-    """Describe one picture at the localizer's scale; None where too little of the target is seen.
+    """Describe one picture at the localizer's scale; None if too little of the target is visible.
 
     Args:
         color, depth, depth_intrinsics, intrinsics: RGB, metres (0 = unknown), pixels; one camera centre.
-        mask: where the target is; None: everywhere.
+        mask: pixels of the target; None: all.
         sampling: scale and grid.
         describe: a network; None: DAISY at the sampling's radii.
     """
@@ -191,25 +190,25 @@ def extract_patches(
     cell = (pixel[:, ::-1] / sampling.stride_px).astype(int)
     pixel = pixel / scale + origin
     points = _lift(pixel, depth, depth_intrinsics, intrinsics)
-    known = points[:, 2] > NEAREST_M
+    valid = points[:, 2] > MIN_DEPTH_M
     if mask is not None:
         column, row = np.clip(pixel.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
-        known &= mask[row, column] & (pixel >= 0).all(1) & (pixel < mask.shape[::-1]).all(1)
-    enough = known.sum() >= MIN_PATCHES
-    return Patches(descriptors[known], points[known], cell[known]) if enough else None
+        valid &= mask[row, column] & (pixel >= 0).all(1) & (pixel < mask.shape[::-1]).all(1)
+    enough = valid.sum() >= MIN_PATCHES
+    return Patches(descriptors[valid], points[valid], cell[valid]) if enough else None
 
 
 def _crop(color, depth, depth_intrinsics, intrinsics, mask, sampling):
-    """Cut a square of fixed size in metres around the mask, grey outside it; None without depth in it."""
+    """Crop a square of fixed metric size around the mask, grey outside the mask; None without depth."""
     row, column = np.nonzero(mask)
     if len(row) < MIN_MASK_PX:
         return None
     sample = np.stack([column, row], 1)[:: max(1, len(row) // DEPTH_SAMPLES)] + 0.5
     points = _lift(sample, depth, depth_intrinsics, intrinsics)
-    known = points[:, 2] > NEAREST_M
-    if known.sum() < MIN_DEPTH_PX:
+    valid = points[:, 2] > MIN_DEPTH_M
+    if valid.sum() < MIN_DEPTH_PX:
         return None
-    scale = sampling.focal_px * float(np.median(points[known, 2])) / intrinsics[0, 0]
+    scale = sampling.focal_px * float(np.median(points[valid, 2])) / intrinsics[0, 0]
     half = sampling.window_px / 2 / scale
     origin = np.array([(column.min() + column.max() + 1) / 2, (row.min() + row.max() + 1) / 2]) - half
     warp = np.array([[scale, 0, -origin[0] * scale], [0, scale, -origin[1] * scale]])
@@ -220,6 +219,6 @@ def _crop(color, depth, depth_intrinsics, intrinsics, mask, sampling):
 
 
 def _lift(pixel, depth, depth_intrinsics, intrinsics):
-    """Lift colour pixels to camera axes by depth of the same camera centre; z = 0 where it is unknown."""
+    """Back-project colour pixels to the camera frame by depth; z = 0 where unknown."""
     ray = cameras.unproject(pixel, intrinsics)
     return ray * cameras.read_depth(depth, depth_intrinsics, ray)[:, None]
