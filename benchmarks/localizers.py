@@ -27,7 +27,7 @@ from pipeline.data import npz, ply
 from pipeline.data.clips import Clip, Masks
 from pipeline.data.templates import SceneCameras
 from pipeline.localization import localizer as model
-from stages.train_localizer import describing, training
+from stages.train_localizer import described_views, training
 from stages.train_localizer.config import Config, NetworkConfig, SceneConfig
 from stages.train_localizer.views import RenderedView
 
@@ -76,7 +76,7 @@ def errors_of_renders(
     counts as wrong.
     """
     spoilt_queries = iter([replace(query, color=spoilt(query.color, how)) for query in queries])
-    held = describing.hold_out(localizer, lambda: next(spoilt_queries), len(queries))
+    held = described_views.evaluate(localizer, lambda: next(spoilt_queries), len(queries))
     return _summary(held.rotation_deg, held.translation_m)
 
 

@@ -1,8 +1,8 @@
 """Train a localizer from rendered random views of a template.
 
 target = "scene": the room's template and frames of the walk-through; target = "agent": the canonical animal
-from all around. Views are augmented with changing light, blur, noise and occluders; held-out views measure
-the error and calibrate the uncertainty. Patches are described as all features are. Writes
+from all sides. Views are augmented with changing light, blur, noise and occluders; held-out views measure the
+error and calibrate the uncertainty. Patches use the same descriptor as all features. Writes
 localizer.safetensors and localizer.json.
 """
 

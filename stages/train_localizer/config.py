@@ -9,15 +9,15 @@ class SceneConfig:
     """Views of the room."""
 
     views: int = 500
-    """Rendered views that are learned."""
+    """Rendered training views."""
     held_out: int = 80
     """Further views that measure the error and calibrate the uncertainty."""
     frames: int = 60
-    """Frames of the walk-through that join them."""
+    """Frames of the walk-through added to the training views."""
     focal_px: float = 120.0
     """Focal length that pictures are resized to, pixels."""
     pitch_deg: tuple[float, float] = (-55.0, 15.0)
-    """Rendered cameras look between these angles, degrees above the horizon."""
+    """Pitch range of rendered cameras, degrees above the horizon."""
 
 
 @dataclass(frozen=True)
@@ -25,21 +25,21 @@ class AgentConfig:
     """Views of the animal."""
 
     views: int = 250
-    """Rendered views that are learned."""
+    """Rendered training views."""
     held_out: int = 60
     """Further views that measure the error and calibrate the uncertainty."""
     distance_m: tuple[float, float] = (0.7, 3.5)
-    """Distances of rendered cameras, metres."""
+    """Distance range of rendered cameras, metres."""
 
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Size and training of the kinds that are networks."""
+    """Size and training of the networks."""
 
     steps: int = 2500
     """Steps of AdamW."""
     rate: float = 2e-3
-    """Learning rate at the start; it falls to a hundredth along a cosine."""
+    """Initial learning rate; cosine decay to a hundredth."""
     coordinate_width: int = 384
     """Coordinates: hidden units ..."""
     coordinate_layers: int = 4
@@ -51,7 +51,7 @@ class NetworkConfig:
     batch_views: int = 64
     """Regression: views per step."""
     fresh_views: int = 0
-    """Regression: views rendered anew in every step, each in place of the oldest; 0: a fixed set."""
+    """Regression: new views rendered per step, each replacing the oldest; 0: a fixed set."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Config:
     """Which localizer is trained, and how."""
 
     target: Literal["scene", "agent"] = "scene"
-    """What is localized against: the room or the animal."""
+    """Target of localization: the room or the animal."""
     kind: Literal["bank", "coordinates", "regression"] = "bank"
     """bank: nearest neighbours among patches of rendered views; coordinates: a network regresses each patch's
     point of the map; regression: a network regresses the pose, as in the paper."""
@@ -68,6 +68,6 @@ class Config:
     agent: AgentConfig = field(default_factory=AgentConfig)
     """Views of the animal."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
-    """The kinds that are networks."""
+    """Network localizers."""
     seed: int = 0
     """Seed of views, noise and RANSAC."""

@@ -1,4 +1,4 @@
-"""What all kinds of localizers learn from: rendered views as patches; and how the trained one is measured."""
+"""Training data of all kinds of localizers (rendered views as patches), and evaluation on held-out views."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,31 +21,31 @@ from pipeline.localization.patches import (
 )
 from stages.train_localizer.views import RenderedView
 
-GOOD: dict[Target, tuple[float, float]] = {"scene": (2.0, 0.05), "agent": (15.0, 0.08)}
-"""Rotation (degrees) and translation (metres) within which a pose counts as right."""
+POSE_TOLERANCE: dict[Target, tuple[float, float]] = {"scene": (2.0, 0.05), "agent": (15.0, 0.08)}
+"""Largest rotation error (degrees) and translation error (metres) of a correct pose."""
 
 
 @dataclass(frozen=True)
-class HeldOut:
-    """Errors on rendered views that were not learned."""
+class HeldOutErrors:
+    """Errors on held-out rendered views."""
 
     rotation_deg: Float[np.ndarray, "view"]
     translation_m: Float[np.ndarray, "view"]
-    """NaN in both where there is no pose."""
+    """Both NaN where no pose was found."""
     inlier_ratio: Float[np.ndarray, "view"]
     good: Bool[np.ndarray, "view"]
     views: list[RenderedView]
 
 
-def patches_of(view: RenderedView, sampling: PatchSampling, describe: Describe | None) -> Patches | None:
-    """Describe a view as a query would be."""
+def describe_view(view: RenderedView, sampling: PatchSampling, describe: Describe | None) -> Patches | None:
+    """Describe a view in the same way as a query."""
     mask = None if sampling.target == "scene" else view.seen
     return extract_patches(view.color, view.depth, view.intrinsics, view.intrinsics, mask, sampling, describe)
 
 
 @dataclass(frozen=True)
 class DescribedViews:
-    """All views as reduced patches, one after the other."""
+    """Patches of all views, concatenated, with descriptors in PCA space."""
 
     basis: PcaBasis
     descriptors: Float[np.ndarray, "patch axis"]
@@ -56,7 +56,7 @@ class DescribedViews:
 
     @property
     def points_map(self) -> Float[np.ndarray, "patch 3"]:
-        """The true point of the map under each patch, metres."""
+        """The true map point of each patch, metres."""
         posed = zip(self.map_from_camera[self.view], self.patches, strict=True)
         return np.concatenate([rigid.apply(pose, patches.points_camera) for pose, patches in posed]).astype(
             np.float32
@@ -68,7 +68,7 @@ class DescribedViews:
         return [len(patches.points_camera) for patches in self.patches]
 
     def bank(self) -> PatchBank:
-        """Keep everything; descriptors as they are stored (half precision)."""
+        """Return a bank of all patches, with descriptors rounded to half precision as when stored."""
         stored = self.descriptors.astype(np.float16).astype(np.float32)
         view = np.repeat(self.view, self.counts).astype(np.int32)
         return PatchBank(stored, self.points_map, view, self.map_from_camera)
@@ -81,11 +81,11 @@ def describe_views(
     describe: Describe | None,
     rng: np.random.Generator,
 ) -> DescribedViews:
-    """Describe all views and reduce their descriptors to principal axes."""
+    """Describe all views and project their descriptors to principal components."""
     described = [
         (index, patches)
         for index, view in enumerate(track(views, "describing views"))
-        if (patches := patches_of(view, sampling, describe)) is not None
+        if (patches := describe_view(view, sampling, describe)) is not None
     ]
     descriptors = np.concatenate([patches.descriptors for _, patches in described])
     basis = fit_pca(descriptors, min(axes, descriptors.shape[1]), rng)
@@ -98,17 +98,18 @@ def describe_views(
     )
 
 
-def hold_out(localizer: localizers.Localizer, draw: Callable[[], RenderedView], count: int) -> HeldOut:
-    """Localize fresh views; the agent's error is that of the agent in the camera's frame."""
+def evaluate(localizer: localizers.Localizer, draw: Callable[[], RenderedView], count: int) -> HeldOutErrors:
+    """Localize new views; for the agent, errors are those of the agent's pose in the camera frame."""
     views = [draw() for _ in range(count)]
     rotation, translation, ratio = np.full(count, np.nan), np.full(count, np.nan), np.zeros(count)
     for index, view in enumerate(track(views, "held-out views")):
-        patches = patches_of(view, localizer.sampling, localizer.describe)
-        answers = localizer.localize_patches(patches) if patches is not None else []
-        if answers:
-            poses = np.stack([answers[0].map_from_camera, view.map_from_camera])
+        patches = describe_view(view, localizer.sampling, localizer.describe)
+        hypotheses = localizer.localize_patches(patches) if patches is not None else []
+        if hypotheses:
+            poses = np.stack([hypotheses[0].map_from_camera, view.map_from_camera])
             estimate, truth = rigid.inverse(poses) if localizer.sampling.target == "agent" else poses
             rotation[index], translation[index] = localizers.errors(estimate, truth)
-            ratio[index] = answers[0].inlier_ratio
-    limits = GOOD[localizer.sampling.target]
-    return HeldOut(rotation, translation, ratio, (rotation <= limits[0]) & (translation <= limits[1]), views)
+            ratio[index] = hypotheses[0].inlier_ratio
+    tolerance = POSE_TOLERANCE[localizer.sampling.target]
+    good = (rotation <= tolerance[0]) & (translation <= tolerance[1])
+    return HeldOutErrors(rotation, translation, ratio, good, views)

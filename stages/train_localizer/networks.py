@@ -1,4 +1,4 @@
-"""Train the kinds of localizers that are networks, on the views that the bank would hold or on fresh ones.
+"""Train the neural localizers, on a fixed set of views or on newly rendered ones.
 
 Several processes (`pipeline.core.distributed`) share each batch."""
 
@@ -21,19 +21,19 @@ from pipeline.localization.networks import (
 )
 from pipeline.localization.patches import Patches, PcaBasis, Target
 from stages.train_localizer.config import NetworkConfig
-from stages.train_localizer.describing import DescribedViews
+from stages.train_localizer.described_views import DescribedViews
 
 PATCH_DROPOUT = 0.15
-"""Share of a view's patches that are hidden in each step, as occluders do."""
+"""Share of a view's patches dropped in each step, which simulates occluders."""
 UNCERTAINTY_WEIGHT = 0.1
-"""Weight of the likelihood of the predicted error against the error itself."""
+"""Weight of the negative log likelihood of the predicted error, relative to the error itself."""
 WEIGHT_DECAY, CLIP_NORM = 1e-4, 5.0
-"""AdamW's decay and the largest norm of a gradient."""
+"""AdamW's weight decay and the gradient clipping norm."""
 WARM_UP_SHARE, MIN_RATE = 0.02, 0.01
-"""Share of the steps over which the learning rate rises, and what remains of it at the end."""
+"""Share of the steps for learning rate warm-up, and the final learning rate relative to the initial one."""
 
 DrawPatches = Callable[[np.random.Generator], tuple[Patches, np.ndarray]]
-"""Draws a fresh view: its patches and ``map_from_camera``."""
+"""Draws a new view: its patches and ``map_from_camera``."""
 
 
 def train_coordinates(described: DescribedViews, config: NetworkConfig, seed: int) -> SceneCoordinateNet:
@@ -43,7 +43,7 @@ def train_coordinates(described: DescribedViews, config: NetworkConfig, seed: in
         described.descriptors.shape[1], config.coordinate_width, config.coordinate_layers
     )
     descriptors, points = torch.from_numpy(described.descriptors), torch.from_numpy(described.points_map)
-    _set_extent(net, points)
+    _set_map_extent(net, points)
 
     def loss(_: int, generator: torch.Generator):
         chosen = torch.randint(
@@ -57,7 +57,7 @@ def train_coordinates(described: DescribedViews, config: NetworkConfig, seed: in
 
 @dataclass
 class PoseSamples:
-    """A ring of views for the regressor; with fresh views each step replaces the oldest ones."""
+    """Ring buffer of the regressor's views; with fresh views each step replaces the oldest ones."""
 
     grids: Float[Tensor, "view axis row column"]
     rotation: Float[Tensor, "view 3 3"]
@@ -65,7 +65,7 @@ class PoseSamples:
     oldest: int = 0
 
     def replace(self, basis: PcaBasis, draw: DrawPatches, target: Target, rng: np.random.Generator) -> None:
-        """Draw a view and put it in place of the oldest."""
+        """Replace the oldest view by a new one."""
         patches, map_from_camera = draw(rng)
         drawn = _sample(basis.project(patches.descriptors), patches, map_from_camera, target)
         for ring, value in zip((self.grids, self.rotation, self.position), drawn, strict=True):
@@ -74,8 +74,7 @@ class PoseSamples:
 
 
 def _sample(descriptors, patches, map_from_camera, target) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a view's grid, its rotation, and the position in the map that a regressor predicts: that of the
-    camera, or of the middle of what an agent view shows."""
+    """Return a view's grid, rotation and regressed map position: camera centre or agent centre."""
     rotation, position = map_from_camera[:3, :3], map_from_camera[:3, 3]
     if target == "agent":
         position = rotation @ np.median(patches.points_camera, axis=0) + position
@@ -89,11 +88,11 @@ def train_regressor(
     seed: int,
     draw: DrawPatches | None = None,
 ) -> PoseRegressor:
-    """Train the paper's regressor (Eq. 5) on the described views, or on views that ``draw`` renders."""
+    """Train the paper's regressor (Eq. 5) on the described views, or on new ones from ``draw``."""
     torch.manual_seed(seed)
     net = PoseRegressor(described.descriptors.shape[1], config.pose_width)
     samples = _samples(described, target)
-    _set_extent(net, samples.position)
+    _set_map_extent(net, samples.position)
 
     def loss(step: int, generator: torch.Generator):
         if draw is not None:
@@ -123,8 +122,8 @@ def _samples(described: DescribedViews, target: Target) -> PoseSamples:
     return PoseSamples(grids, rotation, position)
 
 
-def _set_extent(net, points):
-    """Give a network the middle and size of the map, so that its outputs are of order one."""
+def _set_map_extent(net, points):
+    """Set a network's map centre and scale, so that its raw outputs are of order one."""
     net.middle.copy_(points.mean(0))
     net.extent.copy_(points.std(0).norm())
 

@@ -1,4 +1,4 @@
-"""From a template to its localizer's files."""
+"""Train a template's localizer and write its files."""
 
 import json
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ from pipeline.localization import localizer as localizers
 from stages.train_localizer import pictures, training
 from stages.train_localizer.config import Config
 
-Given = TypeVar("Given")
+InputT = TypeVar("InputT")
 
 
 @dataclass(frozen=True)
@@ -27,20 +27,20 @@ class Inputs:
     """Folders of finished artifacts; which template is needed depends on the target."""
 
     feature_basis: Path | None = None
-    """Names the descriptor of all features; without it patches are described by DAISY."""
+    """Names the descriptor of all features; None: DAISY."""
     scene_template: Path | None = None
     """Target scene."""
     frames: Mapping[str, Path] | None = None
-    """Target scene: the walk-through that its template was built from, by recording."""
+    """Target scene: the walk-through of its template, by recording."""
     agent_template: Path | None = None
     """Target agent."""
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") -> localizers.Localizer | None:
-    """Train, measure and write the localizer; of several processes the first does, None for the others.
+    """Train, evaluate and write the localizer; None in all processes but the first.
 
-    A bank is not trained: the first makes it alone. Raises InputError MAP-006 where the map fills hardly any
-    view.
+    A bank is not trained: the first process builds it alone. Raises InputError MAP-006 where the map
+    fills hardly any view.
     """
     distributed.join(device)
     if config.kind == "bank" and not distributed.leave():
@@ -51,7 +51,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") ->
         case "scene":
             views = _scene_views(inputs, config, rng)
         case "agent":
-            mesh = ply.read_ply(_needed(inputs.agent_template, "agent_template") / "agent.ply")
+            mesh = ply.read_ply(_required(inputs.agent_template, "agent_template") / "agent.ply")
             views = training.agent_views(mesh, config.agent, rng)
     localizer, held = training.train(views, config, describer, device, rng)
     if not distributed.leave():
@@ -68,17 +68,17 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") ->
 
 
 def _scene_views(inputs: Inputs, config: Config, rng: np.random.Generator) -> training.TrainingViews:
-    template = _needed(inputs.scene_template, "scene_template")
-    clip = Clip.open(next(iter(_needed(inputs.frames, "frames").values())))
+    template = _required(inputs.scene_template, "scene_template")
+    clip = Clip.open(next(iter(_required(inputs.frames, "frames").values())))
     walk = SceneCameras.open(template).world_from_camera
     floor_m = json.loads((template / "world.json").read_text())["floor"]
     return training.scene_views(ply.read_ply(template / "mesh.ply"), walk, floor_m, clip, config.scene, rng)
 
 
-def _needed(value: Given | None, name: str) -> Given:
-    """Return an input that the target needs. Raises InputError ART-001."""
+def _required(value: InputT | None, name: str) -> InputT:
+    """Return a required input. Raises InputError ART-001 if it is None."""
     if value is None:
         raise InputError(
-            "ART-001", "is not given, but the target needs it", name, f"pass --{name.replace('_', '-')}"
+            "ART-001", "is missing, but the target requires it", name, f"pass --{name.replace('_', '-')}"
         )
     return value

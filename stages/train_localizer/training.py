@@ -1,4 +1,4 @@
-"""From a template to a trained localizer: views, descriptors, the chosen kind, its calibration."""
+"""Train a localizer from a template: views, descriptors, model, calibration."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,16 +16,16 @@ from pipeline.geometry import cameras, subsampling
 from pipeline.geometry.meshes import Mesh, RayCaster
 from pipeline.localization import localizer as localizers
 from pipeline.localization.patches import Patches, PatchSampling, Target
-from stages.train_localizer import describing, networks, views
+from stages.train_localizer import described_views, networks, views
 from stages.train_localizer.config import AgentConfig, Config, SceneConfig
 from stages.train_localizer.views import RenderedView
 
-SEEDS = 2**31
-"""Seeds are drawn below this."""
+MAX_SEED = 2**31
+"""Exclusive upper bound of random seeds."""
 MAX_DRAWS = 200
-"""Random views of the scene of which one at least must be such as people take."""
-AXES = 64
-"""Principal axes of the descriptors that are kept; more find no more on the built-in cat."""
+"""Attempts at drawing a plausible random view."""
+PCA_AXES = 64
+"""Principal components of the descriptors; more do not help on the built-in cat."""
 SCENE_SAMPLING = PatchSampling("scene", 120.0, 0, 8, (6, 18))
 """Resized to a focal length of 120 px, a patch every 8 px (4 degrees), radii of 6 and 18 px."""
 AGENT_SAMPLING = PatchSampling("agent", 110.0, 104, 4, (6, 14))
@@ -34,26 +34,26 @@ SOLVERS: dict[Target, localizers.RansacSolver] = {
     "scene": localizers.RansacSolver(threshold_m=0.1, min_side_m=0.25, iterations=600, sectors=1),
     "agent": localizers.RansacSolver(threshold_m=0.04, min_side_m=0.06, iterations=600, sectors=6),
 }
-"""Inliers within a patch's size; triplets wider than a few patches."""
+"""Inlier thresholds of a patch's size; RANSAC samples wider than a few patches."""
 RENDER_SCALE = 2
-"""Agent views are rendered at so many times the resolution of the crop."""
-VIEW_MARGIN, NEAREST_M, VIEW_PX = 2.4, 0.3, (64, 240)
-"""Agent views: edge over the animal's radius, least distance to its surface (metres), bounds of the edge."""
+"""Resolution of rendered agent views relative to that of the crop."""
+VIEW_MARGIN, MIN_DISTANCE_M, VIEW_PX = 2.4, 0.3, (64, 240)
+"""Agent views: side over the animal's radius, least distance to its surface (metres), bounds of the side."""
 
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """What a localizer learns from, and where fresh views and queries come from."""
+    """Training views of a localizer, and generators of further views and queries."""
 
     target: Target
     sampling: PatchSampling
     pictures: list[RenderedView]
     draw: Callable[[np.random.Generator], RenderedView]
-    """Render a random view as those that are learned."""
+    """Render a random training view."""
     draw_query: Callable[[np.random.Generator], RenderedView]
-    """Render one with depth noise and occluders, as a phone would see it."""
+    """Render a query with depth noise and occluders, as from a phone."""
     held_out: int
-    """Queries that measure the error."""
+    """Number of held-out queries."""
 
 
 def scene_views(
@@ -64,9 +64,9 @@ def scene_views(
     config: SceneConfig,
     rng: np.random.Generator,
 ) -> TrainingViews:
-    """Render random views of the scene and add frames of the walk-through with their template cameras.
+    """Render random views of the scene and add frames of the walk-through.
 
-    Raises InputError MAP-006 where the map fills hardly any view.
+    Raises InputError MAP-006 if hardly any view is filled by the map.
     """
     caster = RayCaster(mesh)
     scale = config.focal_px / float(np.median(clip.intrinsics[:, 0, 0]))
@@ -81,7 +81,7 @@ def scene_views(
                 return view
         raise InputError(
             "MAP-006",
-            f"none of {MAX_DRAWS} views from within the map shows it in most of its pixels",
+            f"none of {MAX_DRAWS} random views inside the map shows it in most of its pixels",
             str(clip.folder),
             "film the walk-through nearer to floor, walls and furniture, within 4 m",
         )
@@ -100,7 +100,7 @@ def scene_views(
 
 
 def agent_views(mesh: Mesh, config: AgentConfig, rng: np.random.Generator) -> TrainingViews:
-    """Render random views of the canonical agent, from all around."""
+    """Render random views of the canonical agent from all sides."""
     caster = RayCaster(mesh)
     centre = (mesh.vertices.min(0) + mesh.vertices.max(0)).astype(float) / 2
     radius = float(np.linalg.norm(mesh.vertices - centre, axis=1).max())
@@ -109,7 +109,7 @@ def agent_views(mesh: Mesh, config: AgentConfig, rng: np.random.Generator) -> Tr
     def draw(rng: np.random.Generator) -> RenderedView:
         camera = views.agent_camera(centre, config.distance_m, rng)
         distance = float(np.linalg.norm(camera[:3, 3] - centre))
-        size = int(np.clip(VIEW_MARGIN * radius / max(distance - radius, NEAREST_M) * focal, *VIEW_PX))
+        size = int(np.clip(VIEW_MARGIN * radius / max(distance - radius, MIN_DISTANCE_M) * focal, *VIEW_PX))
         intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
         return views.render(caster, camera, intrinsics, (size, size), rng)
 
@@ -121,42 +121,42 @@ def agent_views(mesh: Mesh, config: AgentConfig, rng: np.random.Generator) -> Tr
 
 
 def train(
-    shown: TrainingViews, config: Config, describer: Describer, device: str, rng: np.random.Generator
-) -> tuple[localizers.Localizer, describing.HeldOut]:
-    """Train on the views, measure the error on fresh queries and calibrate the uncertainty with it."""
+    data: TrainingViews, config: Config, describer: Describer, device: str, rng: np.random.Generator
+) -> tuple[localizers.Localizer, described_views.HeldOutErrors]:
+    """Train on the views, then measure the error and calibrate the probability on held-out queries."""
     describe = localizers.open_describer(describer, device)
-    described = describing.describe_views(shown.pictures, shown.sampling, AXES, describe, rng)
+    described = described_views.describe_views(data.pictures, data.sampling, PCA_AXES, describe, rng)
     match config.kind:
         case "bank":
             model = described.bank()
         case "coordinates":
-            model = networks.train_coordinates(described, config.network, int(rng.integers(SEEDS)))
+            model = networks.train_coordinates(described, config.network, int(rng.integers(MAX_SEED)))
         case "regression":
-            draw = _fresh_patches(shown, describe) if config.network.fresh_views else None
-            seed = int(rng.integers(SEEDS))
-            model = networks.train_regressor(described, shown.target, config.network, seed, draw)
+            draw = _fresh_patches(data, describe) if config.network.fresh_views else None
+            seed = int(rng.integers(MAX_SEED))
+            model = networks.train_regressor(described, data.target, config.network, seed, draw)
         case _:
             assert_never(config.kind)
     uncalibrated = localizers.Localizer(
-        shown.sampling,
+        data.sampling,
         described.basis,
         model,
         localizers.Calibration(0.0, 0.0),
-        SOLVERS[shown.target],
+        SOLVERS[data.target],
         describer,
         describe,
     )
-    held = describing.hold_out(uncalibrated, lambda: shown.draw_query(rng), shown.held_out)
+    held = described_views.evaluate(uncalibrated, lambda: data.draw_query(rng), data.held_out)
     return replace(uncalibrated, calibration=localizers.calibrate(held.inlier_ratio, held.good)), held
 
 
-def _fresh_patches(shown, describe) -> networks.DrawPatches:
-    """Return a function that renders and describes a fresh view that shows enough of the target."""
+def _fresh_patches(data, describe) -> networks.DrawPatches:
+    """Return a function that renders and describes a new view with enough patches."""
 
     def draw(rng: np.random.Generator) -> tuple[Patches, np.ndarray]:
         for _ in range(MAX_DRAWS):
-            view = shown.draw(rng)
-            patches = describing.patches_of(view, shown.sampling, describe)
+            view = data.draw(rng)
+            patches = described_views.describe_view(view, data.sampling, describe)
             if patches is not None:
                 return patches, view.map_from_camera
         raise AssertionError("no view shows the target")
@@ -165,7 +165,7 @@ def _fresh_patches(shown, describe) -> networks.DrawPatches:
 
 
 def _resized_frame(clip, frame, world_from_camera, intrinsics, size):
-    """Resize one real frame, as if it had been rendered."""
+    """Return one recorded frame, resized, as a view."""
     color = cv2.resize(clip.color(frame), size[::-1], interpolation=cv2.INTER_AREA)
     depth = cv2.resize(clip.depth(frame), size[::-1], interpolation=cv2.INTER_NEAREST)
     return RenderedView(world_from_camera, intrinsics, color, depth, depth > 0)

@@ -1,6 +1,6 @@
-"""Random views of a template: camera poses, renderings, and their augmentation by light, blur and noise.
+"""Random views of a template: camera poses, rendering, and augmentation by light, blur and noise.
 
-`scene_camera` and `agent_camera` draw poses, `render` draws an augmented view; all draw from one generator.
+`scene_camera` and `agent_camera` sample poses, `render` renders an augmented view; all use one generator.
 """
 
 from dataclasses import dataclass, replace
@@ -17,34 +17,32 @@ from pipeline.geometry.meshes import RayCaster, render_view
 from pipeline.mapping.depth_scans import depth_noise
 
 UP = np.array([0.0, 1.0, 0.0])
-
-
 NEAR_SHARE, NEAR_M, NEAR_YAW_RAD, NEAR_PITCH_RAD = 0.5, 0.35, 0.6, 0.2
 """Share of scene cameras near the walk-through's, standard deviations of their offset, metres and radians."""
 ROOM_MARGIN_M, HEIGHT_M = 0.8, (0.5, 1.9)
 """The other cameras: margin around the walk-through's path, and heights above the floor, metres."""
 ROLL_DEG = 12.0
 """Standard deviation of roll, degrees."""
-ELEVATION_DEG, AIM_M = (-10.0, 70.0), 0.03
-"""Agent cameras: elevations (degrees), and standard deviation of the point they look at (metres)."""
+ELEVATION_DEG, TARGET_SIGMA_M = (-10.0, 70.0), 0.03
+"""Agent cameras: elevation range (degrees), and standard deviation of the look-at point (metres)."""
 GAIN, WHITE_BALANCE, GAMMA = 0.3, 0.04, 0.25
-"""Largest relative change of brightness, standard deviation of each channel's, and of gamma."""
+"""Largest change of exposure, standard deviation of white balance, largest change of gamma."""
 BLUR_PX, MIN_BLUR_PX, PIXEL_NOISE = 1.0, 0.3, 0.015
 """Largest and least Gaussian blur, pixels, and standard deviation of pixel noise, share of full scale."""
 OCCLUDED_SHARE, OCCLUDER_DEPTH = 0.4, 0.8
-"""Share of scene queries with an occluder in front, and its depth over what it hides."""
+"""Share of scene queries with an occluder, and its depth relative to what it hides."""
 OCCLUDER_AXES, OCCLUDER_TURN_DEG = ((12, 4), (14, 7)), 30
-"""Smallest and largest half axes of an occluder, as what the picture's width is divided by; largest turn."""
-MIN_SEEN, NEAREST_M, NEAREST_QUANTILE, MIN_FRONT = 0.6, 0.35, 0.05, 0.95
-"""A plausible view: share of its pixels with surface, this quantile of its depth beyond this many metres, and
-share of surface seen from its front."""
+"""Range of an occluder's semi-axes, as divisors of the picture's width, and largest rotation."""
+MIN_SEEN_SHARE, MIN_DEPTH_M, DEPTH_QUANTILE, MIN_FRONT_SHARE = 0.6, 0.35, 0.05, 0.95
+"""A plausible view: least share of pixels with surface, least depth (metres) at a quantile, and least share
+of front-facing surface."""
 FRONT_RAYS = 16
-"""Rays along the picture's height that test the last."""
+"""Rays along the picture's height that test for front faces."""
 
 
 @dataclass(frozen=True)
 class RenderedView:
-    """One rendered view, augmented; depth in metres, 0 = nothing; intrinsics in pixels."""
+    """One augmented rendered view; depth in metres, 0 = no surface; intrinsics in pixels."""
 
     map_from_camera: Float[np.ndarray, "4 4"]
     intrinsics: Float[np.ndarray, "3 3"]
@@ -59,7 +57,7 @@ def scene_camera(
     pitch_deg: tuple[float, float],
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "4 4"]:
-    """Draw a camera: near one of the walk-through's, or anywhere within reach of where it went."""
+    """Sample a camera near one of the walk-through's, or anywhere around its path."""
     roll = np.deg2rad(rng.normal(0, ROLL_DEG))
     near = walk[rng.integers(len(walk))]
     if rng.random() < NEAR_SHARE:
@@ -77,7 +75,7 @@ def scene_camera(
 def agent_camera(
     centre: Float[np.ndarray, "3"], distance_m: tuple[float, float], rng: np.random.Generator
 ) -> Float[np.ndarray, "4 4"]:
-    """Draw a camera that looks at the agent from any azimuth."""
+    """Sample a camera that looks at the agent from any azimuth."""
     azimuth = rng.uniform(-np.pi, np.pi)
     elevation = np.arcsin(rng.uniform(*np.sin(np.deg2rad(ELEVATION_DEG))))
     direction = np.array(
@@ -85,7 +83,7 @@ def agent_camera(
     )
     eye = centre + direction * rng.uniform(*distance_m)
     roll = np.deg2rad(rng.normal(0, ROLL_DEG))
-    return rigid.look_at(eye, centre + rng.normal(0, AIM_M, 3), UP) @ rigid.exp(
+    return rigid.look_at(eye, centre + rng.normal(0, TARGET_SIGMA_M, 3), UP) @ rigid.exp(
         np.array([0, 0, roll, 0, 0, 0])
     )
 
@@ -97,7 +95,7 @@ def render(
     size: tuple[int, int],
     rng: np.random.Generator,
 ) -> RenderedView:
-    """Render a view (pixels, size = height, width) and augment its colour; depth stays exact."""
+    """Render a view (size = height, width in pixels) with augmented colour and exact depth."""
     depth, hits = render_view(caster, map_from_camera, intrinsics, *size)
     seen = depth > 0
     assert caster.mesh.color is not None, "templates have colours"
@@ -121,8 +119,8 @@ def augment(
 
 
 def plausible(view: RenderedView, caster: RayCaster) -> bool:
-    """Return whether a person could have taken it: mostly surface, from its front, nothing too near."""
-    if view.seen.mean() < MIN_SEEN or np.quantile(view.depth[view.seen], NEAREST_QUANTILE) < NEAREST_M:
+    """Return whether a person could have taken the view: mostly front-facing surface, not too near."""
+    if view.seen.mean() < MIN_SEEN_SHARE or np.quantile(view.depth[view.seen], DEPTH_QUANTILE) < MIN_DEPTH_M:
         return False
     grid = view.depth.shape[0] // FRONT_RAYS
     directions = (
@@ -132,11 +130,11 @@ def plausible(view: RenderedView, caster: RayCaster) -> bool:
     face = caster.cast(view.map_from_camera[:3, 3], directions).face
     corner = caster.mesh.vertices[caster.mesh.faces[face[face >= 0]]]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    return bool((np.einsum("ri,ri->r", normal, directions[face >= 0]) < 0).mean() > MIN_FRONT)
+    return bool((np.einsum("ri,ri->r", normal, directions[face >= 0]) < 0).mean() > MIN_FRONT_SHARE)
 
 
 def occlude(view: RenderedView, rng: np.random.Generator) -> RenderedView:
-    """Put an ellipse of one colour in front, nearer than what it hides."""
+    """Add a uniform elliptic occluder, nearer than what it hides."""
     height, width = view.depth.shape
     centre = (int(rng.integers(width // 5, width * 4 // 5)), int(rng.integers(height // 3, height)))
     axes = tuple(int(rng.integers(width // small, width // large)) for small, large in OCCLUDER_AXES)
@@ -147,6 +145,6 @@ def occlude(view: RenderedView, rng: np.random.Generator) -> RenderedView:
 
 
 def with_depth_noise(view: RenderedView, rng: np.random.Generator) -> RenderedView:
-    """Add the noise of phone depth."""
+    """Add phone depth noise."""
     noisy = np.where(view.seen, view.depth + rng.normal(0, 1, view.depth.shape) * depth_noise(view.depth), 0)
     return replace(view, depth=noisy.astype(np.float32))

@@ -9,7 +9,7 @@ from pipeline.localization import localizer as model
 from pipeline.localization.networks import GRID, on_grid, pose_loss
 from pipeline.localization.patches import Patches, PatchSampling, PcaBasis
 from stages.train_localizer.config import NetworkConfig
-from stages.train_localizer.describing import DescribedViews
+from stages.train_localizer.described_views import DescribedViews
 from stages.train_localizer.networks import train_coordinates, train_regressor
 
 AXES = 16
