@@ -1,5 +1,4 @@
-"""Gather the registrations of all sessions: their poses, and a summary of what was registered, rejected, and
-why."""
+"""Gather the poses of all sessions, and summarise which were registered or rejected, and why."""
 
 from pipeline.workflow import cli
 from stages.gather_registration import stage

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Config:
-    """What the rest of the flow needs."""
+    """Requirements of the following stages."""
 
     min_registered: int = 1
-    """Sessions that must be registered for the flow to go on."""
+    """Least number of registered sessions."""

@@ -1,4 +1,4 @@
-"""Summarise what was registered and what was rejected, and draw all paths into one picture."""
+"""Summarise registered and rejected recordings, and draw all paths in one picture."""
 
 from dataclasses import dataclass
 
@@ -11,14 +11,14 @@ from pipeline.data.qa import Check
 from pipeline.geometry import views
 
 EDGE_PX, MARGIN_PX = 560, 20
-"""Size of the picture of all paths, and what is left free around them."""
+"""Size and margin of the picture of all paths."""
 FONT_SCALE = 0.45
 COLORS = ((220, 60, 50), (50, 110, 210), (60, 160, 80), (200, 140, 30), (140, 80, 180), (40, 160, 170))
 
 
 @dataclass(frozen=True)
 class SessionOutcome:
-    """One recording's status, and its poses where it was registered."""
+    """One recording's status, and its poses if it was registered."""
 
     video: str
     status: dict
@@ -28,7 +28,7 @@ class SessionOutcome:
 
     @property
     def description(self) -> str:
-        """Return why a recording was rejected, and what it resembles most."""
+        """Return why a recording was rejected, and its nearest view."""
         nearest = self.status.get("nearest_view")
         view = (
             f"; its nearest view is the walk-through at {nearest['walkthrough_s']:.1f} s" if nearest else ""
@@ -46,7 +46,7 @@ def summarise(outcomes: list[SessionOutcome]) -> dict:
 
 
 def checks(outcomes: list[SessionOutcome]) -> list[Check]:
-    """Judge the whole."""
+    """Return the quality checks."""
     share = sum(outcome.poses is not None for outcome in outcomes) / max(len(outcomes), 1)
     figures = [outcome.status["figures"] for outcome in outcomes if outcome.poses is not None]
     gaps = [figure["depth_gap_m"] for figure in figures if figure["depth_gap_m"] is not None]
@@ -62,17 +62,17 @@ def checks(outcomes: list[SessionOutcome]) -> list[Check]:
 def paths(outcomes: list[SessionOutcome]) -> UInt8[np.ndarray, "height width 3"]:
     """Draw all registered paths from above: phones thin, animals thick, one colour a recording."""
     image = np.full((EDGE_PX, EDGE_PX, 3), views.BACKGROUND, np.uint8)
-    known = {each.video: each.poses for each in outcomes if each.poses is not None}
-    if not known:
+    registered = {each.video: each.poses for each in outcomes if each.poses is not None}
+    if not registered:
         return image
-    pairs = {video: (poses.world_from_camera, poses.world_from_agent) for video, poses in known.items()}
+    pairs = {video: (poses.world_from_camera, poses.world_from_agent) for video, poses in registered.items()}
     ground = np.concatenate([each[:, [0, 2], 3] for pair in pairs.values() for each in pair])
     low, high = np.nanmin(ground, axis=0), np.nanmax(ground, axis=0)
     meter_px = (EDGE_PX - 2 * MARGIN_PX) / max(float((high - low).max()), 0.1)
     overview = views.Overview(image, low - MARGIN_PX / meter_px, meter_px)
     for index, (video, (cameras, agents)) in enumerate(pairs.items()):
-        color, place = COLORS[index % len(COLORS)], (10, 16 * (index + 1))
+        color, corner = COLORS[index % len(COLORS)], (10, 16 * (index + 1))
         overview.draw(cameras[:, :3, 3], color, 1)
         overview.draw(agents[:, :3, 3], color, 3)
-        cv2.putText(image, video, place, cv2.FONT_HERSHEY_SIMPLEX, FONT_SCALE, color, 1, cv2.LINE_AA)
+        cv2.putText(image, video, corner, cv2.FONT_HERSHEY_SIMPLEX, FONT_SCALE, color, 1, cv2.LINE_AA)
     return image

@@ -1,4 +1,4 @@
-"""From every session's poses and status to one registration."""
+"""Collect every session's poses and status into one registration."""
 
 import json
 from collections.abc import Mapping
@@ -50,7 +50,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
     (out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
     qa.write(
         out, good="all recordings are registered and their paths share one room",
-        bad="recordings are rejected, or a path lies apart from the others",
+        bad="recordings are rejected, or a path is displaced from the others",
         checks=gather.checks(outcomes),
         pictures=[qa.Picture("paths", gather.paths(outcomes), "From above: phones thin, animals thick.")],
     )  # fmt: skip
