@@ -33,7 +33,7 @@ from stages.extract_frames.config import Config as FramesConfig
 from stages.register_videos import registration
 from stages.register_videos.config import AlignmentConfig, ConfidenceConfig, VoteConfig
 from stages.register_videos.config import Config as RegistrationConfig
-from stages.register_videos.point_alignment import Walk
+from stages.register_videos.point_alignment import Walkthrough
 from stages.train_localizer import training
 from stages.train_localizer.config import Config as LocalizerConfig
 
@@ -104,7 +104,7 @@ def registered(
     """Register the second half; NaN where it is rejected."""
     found = made.world_from_camera, walk.intrinsics, made.registered, made.keyframe
     cameras = SceneCameras(walk.timestamp_s, *found).world_from_keyframe
-    maps = registration.Maps(made.mesh, made.mesh, localizer, localizer, walk=Walk(walk, cameras))
+    maps = registration.Maps(made.mesh, made.mesh, localizer, localizer, walk=Walkthrough(walk, cameras))
     rng = np.random.default_rng(EVERY_FRAME.seed)
     result = registration.register(session, masks, maps, EVERY_FRAME, rng)
     if isinstance(result, registration.Rejected):

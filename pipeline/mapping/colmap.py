@@ -1,4 +1,4 @@
-"""COLMAP on one CPU thread and with fixed seeds, so that the same pictures give the same model.
+"""Deterministic COLMAP: one CPU thread and fixed seeds.
 
 `extract`, `match` and `mapping_options` make a model; `read_sparse_model` reads it.
 """
@@ -14,15 +14,15 @@ from jaxtyping import Float, Int
 from pipeline.geometry import rigid
 
 GLOBAL_ADJUSTMENT_GROWTH = 1.3
-"""Global bundle adjustment after the model grew by this factor; COLMAP's 1.1 takes twice as long."""
+"""Growth of the model that triggers global bundle adjustment; COLMAP's 1.1 takes twice as long."""
 FIRST_PAIR_DEG = 6.0
-"""Least triangulation angle of the first pair, degrees: walks through a room have small baselines."""
+"""Least triangulation angle of the initial pair, degrees: walk-throughs have small baselines."""
 MIN_POSE_INLIERS = 20
-"""Points a picture must share with the model to be registered; plain walls have few."""
+"""Least PnP inliers of a registered picture; plain walls have few points."""
 
 
 def seed_everything(seed: int) -> None:
-    """Fix COLMAP's own random numbers and keep all but its errors quiet."""
+    """Seed COLMAP's random numbers and log only its errors."""
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     pycolmap.set_random_seed(seed)
 
@@ -42,7 +42,7 @@ def extract(
     reader: pycolmap.ImageReaderOptions,
     sift: dict[str, int | float],
 ) -> None:
-    """Extract SIFT features in pictures of one camera; ``sift`` sets COLMAP's options by name."""
+    """Extract SIFT features in pictures of one camera; ``sift`` overrides COLMAP's options by name."""
     extraction = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
     for option, value in sift.items():
         setattr(extraction.sift, option, value)
@@ -52,7 +52,7 @@ def extract(
 
 
 def match(database: Path, pairs: Iterable[tuple[str, str]], seed: int) -> None:
-    """Match and verify pairs of picture names; the list is left beside the database as pairs.txt."""
+    """Match and geometrically verify pairs of picture names; writes pairs.txt beside the database."""
     listing = database.parent / "pairs.txt"
     listing.write_text("".join(f"{first} {second}\n" for first, second in pairs))
     matching = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
@@ -91,11 +91,11 @@ class SparseModel:
     observed_pixel: Float[np.ndarray, "observation 2"]
     reprojection_px: float
     reconstruction: pycolmap.Reconstruction
-    """COLMAP's own model, for its text files."""
+    """The COLMAP model itself, for export."""
 
 
 def read_sparse_model(model: pycolmap.Reconstruction) -> SparseModel:
-    """Read a model whose pictures are named by six digits, the frame."""
+    """Read a model whose picture names start with the six-digit frame number."""
     images = sorted(
         (image for image in model.images.values() if image.has_pose), key=lambda image: image.name
     )

@@ -1,6 +1,6 @@
-"""Depth scans against a surface: point-to-plane correspondences for `pipeline.mapping.pose_optimization`.
+"""Point-to-plane correspondences between depth scans and a surface, for `pipeline.mapping.pose_optimization`.
 
-`scan` subsamples a depth image to points with their noise; `SurfaceMap` pairs them with the nearest surface.
+`scan` subsamples a depth image to points with their noise; `SurfaceMap` finds their nearest vertices.
 """
 
 from dataclasses import dataclass
@@ -15,42 +15,42 @@ from pipeline.mapping.pose_optimization import MAP, Correspondences
 
 NOISE_M, NOISE_SHARE = 0.008, 0.004
 """Noise of phone LiDAR: 8 mm and 0.4 % of the depth, metres."""
-FURTHEST_M = 4.5
-"""LiDAR of phones is not metric beyond, metres."""
-NEAREST_M = 0.1
-"""Depth below this is none, metres."""
-STEP_M, STEP_SHARE = 0.05, 0.05
-"""A pixel whose neighbour differs by more than this (metres and share of the depth) is not used."""
-NORMAL_JUMP_M, NORMAL_JUMP_SHARE = 0.05, 0.06
+MAX_DEPTH_M = 4.5
+"""Phone LiDAR is unreliable beyond this, metres."""
+MIN_DEPTH_M = 0.1
+"""Smaller depth counts as missing, metres."""
+MAX_STEP_M, MAX_STEP_SHARE = 0.05, 0.05
+"""Pixels whose neighbour differs by more (metres plus share of the depth) are depth edges and not used."""
+MAX_NORMAL_STEP_M, MAX_NORMAL_STEP_SHARE = 0.05, 0.06
 """The same over the span of `image_normals`."""
-QUERY_REACH = 1.5
-"""The nearest vertex may be farther than the plane through it: search radius over reach."""
+QUERY_RADIUS_RATIO = 1.5
+"""Search radius over reach: the nearest vertex may be farther than the plane through it."""
 
 
 @dataclass(frozen=True)
 class Scan:
-    """Points that one frame measured, in camera axes, and their standard deviation."""
+    """Depth points of one frame in its camera frame, with standard deviations."""
 
     points_camera: Float[np.ndarray, "point 3"]
     sigma_m: Float[np.ndarray, "point"]
     pixel_index: Int[np.ndarray, "point"]
     """Row-major index into the depth image."""
 
-    def subsampled(self, most: int) -> "Scan":
-        """Keep at most so many points, evenly over the picture."""
-        chosen = subsampling.evenly(len(self.sigma_m), most)
+    def subsampled(self, max_points: int) -> "Scan":
+        """Keep at most ``max_points``, evenly spaced."""
+        chosen = subsampling.evenly(len(self.sigma_m), max_points)
         return Scan(self.points_camera[chosen], self.sigma_m[chosen], self.pixel_index[chosen])
 
 
 def depth_noise(depth_m: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
-    """Return the standard deviation of phone LiDAR at a depth, metres."""
+    """Return the standard deviation of phone LiDAR depth, metres."""
     return NOISE_M + NOISE_SHARE * depth_m
 
 
 def image_normals(
     depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"], span_px: int = 4
 ) -> Float[np.ndarray, "height width 3"]:
-    """Return unit normals towards the camera by central differences; zero at edges and unknown depth."""
+    """Return camera-facing unit normals by central differences; zero at depth edges and unknown depth."""
     points = cameras.back_project(depth, intrinsics)
     normals = np.zeros_like(points)
     inner = slice(span_px, -span_px)
@@ -59,7 +59,7 @@ def image_normals(
     cross = np.cross(down, right)
     length = np.linalg.norm(cross, axis=-1)
     centre = depth[inner, inner]
-    limit = NORMAL_JUMP_M + NORMAL_JUMP_SHARE * centre
+    limit = MAX_NORMAL_STEP_M + MAX_NORMAL_STEP_SHARE * centre
     known = (centre > 0) & (length > 1e-9) & (np.abs(right[..., 2]) < limit) & (np.abs(down[..., 2]) < limit)
     for end in (slice(2 * span_px, None), slice(None, -2 * span_px)):
         known &= (depth[inner, end] > 0) & (depth[end, inner] > 0)
@@ -74,10 +74,10 @@ def scan(
     stride: int,
     confidence: UInt8[np.ndarray, "height width"] | None = None,
     ignore: Bool[np.ndarray, "height width"] | None = None,
-    furthest_m: float = FURTHEST_M,
+    max_depth_m: float = MAX_DEPTH_M,
 ) -> Scan:
-    """Keep one pixel in ``stride`` each way of known depth (metres), of confidence >= 1, away from edges."""
-    usable = (depth > NEAREST_M) & (depth < furthest_m)
+    """Keep every ``stride``-th pixel with known depth (metres) and confidence >= 1, away from depth edges."""
+    usable = (depth > MIN_DEPTH_M) & (depth < max_depth_m)
     if confidence is not None:
         usable &= confidence >= 1
     if ignore is not None:
@@ -86,7 +86,7 @@ def scan(
         np.abs(np.diff(depth, axis=0, append=depth[-1:])),
         np.abs(np.diff(depth, axis=1, append=depth[:, -1:])),
     )
-    usable &= step < STEP_M + STEP_SHARE * depth
+    usable &= step < MAX_STEP_M + MAX_STEP_SHARE * depth
     offset = stride // 2
     grid = np.zeros_like(usable)
     grid[offset::stride, offset::stride] = True
@@ -112,10 +112,9 @@ class SurfaceMap:
         reach_m: float,
         inflation: float = 1.0,
     ) -> Correspondences:
-        """Pair every scanned point with the nearest vertex within reach (metres) whose normal faces the
-        camera, point to plane.
+        """Pair scan points with the tangent plane of the nearest camera-facing vertex within reach (metres).
 
-        ``inflation`` multiplies the depth noise, since neighbouring pixels err together.
+        ``inflation`` multiplies the depth noise, since errors of neighbouring pixels are correlated.
         """
         first = np.repeat(frames, [len(scan.points_camera) for scan in scans])
         points = np.concatenate([scan.points_camera for scan in scans])
@@ -123,16 +122,16 @@ class SurfaceMap:
         poses = world_from_camera[frames]
         world = [rigid.apply(pose, scan.points_camera) for pose, scan in zip(poses, scans, strict=True)]
         world = np.concatenate(world)
-        distance, nearest = self._tree.query(world, distance_upper_bound=QUERY_REACH * reach_m)
+        distance, nearest = self._tree.query(world, distance_upper_bound=QUERY_RADIUS_RATIO * reach_m)
         matched = np.flatnonzero(np.isfinite(distance))
         nearest, first, world = np.asarray(nearest)[matched], first[matched], world[matched]
         normal = self.normals_world[nearest]
         facing = np.einsum("ci,ci->c", normal, world_from_camera[first, :3, 3] - world) > 0
-        matched, met = matched[facing], self.points_world[nearest[facing]]
+        matched, points_second = matched[facing], self.points_world[nearest[facing]]
         second, sigma = np.full(len(matched), MAP), inflation * sigma[matched]
-        return Correspondences(first[facing], second, points[matched], met, normal[facing], sigma)
+        return Correspondences(first[facing], second, points[matched], points_second, normal[facing], sigma)
 
     def distance(self, points_world: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point"]:
-        """Return the distance along the nearest normal, negative behind the surface, metres."""
+        """Return signed point-to-plane distances to the nearest vertex, metres; negative behind it."""
         _, nearest = self._tree.query(points_world)
         return np.einsum("pi,pi->p", points_world - self.points_world[nearest], self.normals_world[nearest])

@@ -1,7 +1,7 @@
-"""Align depth pictures to one another: projective point-to-plane ICP with robust weights.
+"""Projective point-to-plane ICP between depth images with robust weights.
 
 `depth_image` prepares points and normals, `align_views` refines the motion between two depth images and
-returns its information matrix. Moving things are outliers that the robust weights leave out.
+returns its information matrix. The robust weights reject moving objects as outliers.
 """
 
 from dataclasses import dataclass
@@ -12,29 +12,29 @@ from jaxtyping import Bool, Float
 
 from pipeline.geometry import cameras, rigid
 
-NEAREST_M = 0.05
-"""Points nearer to the target camera than this are not projected, metres."""
+MIN_DEPTH_M = 0.05
+"""Points nearer to the target camera are not projected, metres."""
 MIN_COSINE = 0.7
-"""Normals of a pair must agree within 45 degrees."""
+"""Least cosine between the normals of a correspondence (45 degrees)."""
 POINTS_PER_MEASUREMENT = 20
-"""Neighbouring depth pixels err together: so many count as one independent measurement."""
+"""Errors of neighbouring pixels are correlated: so many points count as one independent measurement."""
 NOISE_FLOOR_M = 0.005
-"""The information assumes at least this noise, metres: phone depth is not better."""
+"""Least noise assumed in the information matrix, metres: phone depth is no better."""
 DAMPING = 1e-3
 """Levenberg-Marquardt damping per unit of weight; keeps flat walls solvable."""
 CONVERGED = 1e-5
 """Steps below this (radians, metres) end the iteration."""
 NORMAL_JUMP, NORMAL_JUMP_DEPTH_M = 0.06, 0.5
-"""Neighbours whose depth differs by more than this share of it (at least so many metres) bound a surface."""
+"""Depth edge: neighbours differ by more than this share of the depth, taken as at least so many metres."""
 
 
 @dataclass(frozen=True)
 class DepthImage:
-    """A depth picture as points and unit normals in its camera's axes, metres."""
+    """Points (metres) and unit normals of a depth image in its camera frame."""
 
     points: Float[np.ndarray, "height width 3"]
     normals: Float[np.ndarray, "height width 3"]
-    """Zero where there is no depth or the surface breaks off."""
+    """Zero at unknown depth and depth edges."""
     intrinsics: Float[np.ndarray, "3 3"]
 
 
@@ -45,9 +45,9 @@ class IcpResult:
     target_from_source: Float[np.ndarray, "4 4"]
     information: Float[np.ndarray, "6 6"]
     overlap: float
-    """Share of the source's points that met the target's surface."""
+    """Share of the projected source points that have a correspondence."""
     residual_m: float
-    """Root mean square distance to the planes of those, metres."""
+    """Weighted RMS point-to-plane distance, metres."""
 
 
 def depth_image(
@@ -56,10 +56,10 @@ def depth_image(
     usable: Bool[np.ndarray, "height width"],
     stride: int,
 ) -> DepthImage:
-    """Prepare a depth picture (metres, 0 = unknown) at every ``stride``-th pixel."""
-    every = np.s_[stride // 2 :: stride, stride // 2 :: stride]
-    points = cameras.back_project(depth, intrinsics)[every].astype(np.float32)
-    points[~(usable & (depth > 0))[every]] = 0
+    """Compute points and normals of a depth image (metres, 0 = unknown) at every ``stride``-th pixel."""
+    grid = np.s_[stride // 2 :: stride, stride // 2 :: stride]
+    points = cameras.back_project(depth, intrinsics)[grid].astype(np.float32)
+    points[~(usable & (depth > 0))[grid]] = 0
     scaled = intrinsics.copy()
     scaled[:2, 2] = (intrinsics[:2, 2] - stride // 2 - 0.5) / stride + 0.5
     scaled[:2, :2] /= stride
@@ -76,8 +76,8 @@ def align_views(
 ) -> IcpResult:
     """Refine ``target_from_source`` by projective point-to-plane ICP (Chen and Medioni 1992).
 
-    Points farther than ``reach_m`` from the surface they project to are left out (Tukey's weights); the reach
-    halves half-way. The information counts `POINTS_PER_MEASUREMENT` points as one measurement.
+    Tukey's weights reject points farther than ``reach_m`` from the surface they project to; the reach halves
+    half-way. The information counts `POINTS_PER_MEASUREMENT` points as one measurement.
     """
     target_from_source = np.array(target_from_source, float)
     focal = target.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float32)
@@ -86,8 +86,8 @@ def align_views(
         reach = reach_m * (0.5 if iteration >= iterations // 2 else 1.0)
         rotation = np.ascontiguousarray(target_from_source[:3, :3], np.float32)
         motion = rotation, target_from_source[:3, 3].astype(np.float32)
-        surfaces = target.points, target.normals, source.points, source.normals
-        sums = _accumulate(*surfaces, *motion, focal, np.float32(reach))
+        images = target.points, target.normals, source.points, source.normals
+        sums = _accumulate(*images, *motion, focal, np.float32(reach))
         hessian, gradient, squares, weight, overlap = sums
         step = -np.linalg.solve(hessian + np.eye(6) * (DAMPING * max(weight, 1.0)), gradient)
         target_from_source = rigid.exp(step) @ target_from_source
@@ -99,7 +99,7 @@ def align_views(
 
 
 def _normals(points: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width 3"]:
-    """Return unit normals towards the camera by central differences; zero at depth steps and the rim."""
+    """Return camera-facing unit normals by central differences; zero at depth edges and the image border."""
     normals = np.zeros_like(points)
     across = points[1:-1, 2:] - points[1:-1, :-2]
     down = points[2:, 1:-1] - points[:-2, 1:-1]
@@ -119,9 +119,9 @@ def _normals(points: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "
 def _accumulate(
     target_points, target_normals, source_points, source_normals, rotation, translation, focal, reach
 ):
-    """Sum the normal equations of one Gauss-Newton step; twist acts on the target's side."""
+    """Accumulate the normal equations of one Gauss-Newton step for a left-hand twist (target frame)."""
     hessian, gradient = np.zeros((6, 6)), np.zeros(6)
-    squares, total, met, seen = 0.0, 0.0, 0.0, 0.0
+    squares, total_weight, matched, projected = 0.0, 0.0, 0.0, 0.0
     height, width = target_points.shape[:2]
     row = np.zeros(6)
     for i in range(source_points.shape[0]):
@@ -130,7 +130,7 @@ def _accumulate(
             if normal_source[0] == 0 and normal_source[1] == 0 and normal_source[2] == 0:
                 continue
             p = rotation @ source_points[i, j] + translation
-            if p[2] < NEAREST_M:
+            if p[2] < MIN_DEPTH_M:
                 continue
             x = int(np.floor(p[0] / p[2] * focal[0] + focal[2]))
             y = int(np.floor(p[1] / p[2] * focal[1] + focal[3]))
@@ -139,10 +139,10 @@ def _accumulate(
             n, q = target_normals[y, x], target_points[y, x]
             if n[0] == 0 and n[1] == 0 and n[2] == 0:
                 continue
-            seen += 1.0
+            projected += 1.0
             d = p - q
-            turned = rotation @ normal_source
-            cosine = turned[0] * n[0] + turned[1] * n[1] + turned[2] * n[2]
+            rotated_normal = rotation @ normal_source
+            cosine = rotated_normal[0] * n[0] + rotated_normal[1] * n[1] + rotated_normal[2] * n[2]
             if d[0] * d[0] + d[1] * d[1] + d[2] * d[2] > 4 * reach * reach or cosine < MIN_COSINE:
                 continue
             error = d[0] * n[0] + d[1] * n[1] + d[2] * n[2]
@@ -158,6 +158,6 @@ def _accumulate(
                 for b in range(6):
                     hessian[a, b] += weight * row[a] * row[b]
             squares += weight * error * error
-            total += weight
-            met += 1.0
-    return hessian, gradient, squares, total, met / max(seen, 1.0)
+            total_weight += weight
+            matched += 1.0
+    return hessian, gradient, squares, total_weight, matched / max(projected, 1.0)

@@ -1,9 +1,8 @@
-"""Correct the drift of a depth recording's odometry, or make odometry where there is none.
+"""Correct the drift of a depth recording's odometry, or estimate odometry by ICP.
 
-`find_jumps` detects where tracking was lost and resumed elsewhere, and `repair` chains the odometry without
-that. `correct_drift` aligns depth images of frames that see the same place (`icp`) and solves a pose graph of
-them with the device's odometry; `chain_alignments` makes a first odometry from frame to frame;
-`align_gravity` turns +y up.
+`find_jumps` detects tracking jumps and `repair` removes them. `correct_drift` aligns overlapping depth images
+(`icp`) and solves a pose graph of them with the device's odometry; `chain_alignments` estimates odometry from
+frame to frame; `align_gravity` turns +y up.
 """
 
 import functools
@@ -21,35 +20,35 @@ from pipeline.geometry.align import rotation_between
 from pipeline.mapping.icp import DepthImage, IcpResult, align_views
 
 JUMP_M_S = 4.0
-"""A step faster than its neighbours by more than this, m/s, is a jump: hands reach about 2 m/s."""
-WINDOW_STEPS = 5
-"""Steps whose median is the usual speed."""
-SHORTEST_S = 0.05
-"""Least time between frames, seconds: noise over less is no speed."""
+"""A step is a jump if faster than its neighbours by more than this, m/s: hands reach about 2 m/s."""
+MEDIAN_WINDOW = 5
+"""Window of the median filter of speeds, steps."""
+MIN_STEP_S = 0.05
+"""Lower bound of the time step when computing speeds, seconds."""
 CAUCHY_SCALE = 3.0
 """Mahalanobis distance at which the weight of an edge of the pose graph is halved."""
 FIXED_PRECISION, FREE_PRECISION = 1e12, 1e-6
-"""Prior precision of the graph's first pose, which stays, and of the others, to keep all solvable."""
+"""Prior precision of the graph's first pose, which stays fixed, and of the others, for a regular Hessian."""
 CONVERGED = 1e-6
 """Steps of the graph below this (radians, metres) end the iteration."""
 KEYFRAME_STEP = 5
 """Frames between keyframes: half a second at 10 Hz, within which views overlap."""
 LOOP_RADIUS_M, LOOP_RADIUS_RAD, LOOP_DISTANCE = 1.0, 0.8, 1.2
-"""Keyframes see the same place when distance / metres + angle / radians of these is below the last."""
+"""Loop candidates: distance / LOOP_RADIUS_M + angle / LOOP_RADIUS_RAD is at most LOOP_DISTANCE."""
 LOOP_SPACING = 2
-"""Keyframes on either side of a chosen loop partner that are not chosen too: they would repeat it."""
+"""Non-maximum suppression: keyframes on either side of a loop partner that are skipped as redundant."""
 REACH_M = 0.15
-"""Largest distance of a surface from its counterpart, metres: several times the drift between partners."""
+"""Correspondence distance of ICP, metres: several times the drift between loop partners."""
 SIGMA_RAD, SIGMA_M = 0.002, 0.004
 """Odometry's standard deviation from one frame to the next, radians and metres (ARKit at 10 Hz)."""
 JUMP_INFLATION = 60.0
-"""A step over a tracking jump may err by so many times the usual deviation."""
+"""Factor on the standard deviation of a step across a tracking jump."""
 MIN_OVERLAP = 0.4
-"""Share of the points that must meet for an alignment to count."""
-LARGEST_RESIDUAL = 0.3
-"""Residual beyond which an alignment does not count, share of `REACH_M`."""
+"""Least overlap of an accepted alignment."""
+MAX_RESIDUAL = 0.3
+"""Largest residual of an accepted alignment, share of `REACH_M`."""
 ICP_ITERATIONS, GRAPH_ITERATIONS = 8, 8
-"""Gauss-Newton steps; both have converged by then."""
+"""Gauss-Newton steps, enough for convergence."""
 CACHED_VIEWS = 256
 """Depth images kept in memory at once."""
 UP_CONES = (0.75, 0.9, 0.97, 0.985, 0.985)
@@ -57,18 +56,18 @@ UP_CONES = (0.75, 0.9, 0.97, 0.985, 0.985)
 MIN_NORMALS = 100
 """Fewer normals in a cone end the search for up."""
 GRAVITY_VIEWS = 20
-"""Depth images that vote on up."""
+"""Depth images whose normals estimate the up direction."""
 
 
 @dataclass(frozen=True)
 class CorrectedOdometry:
-    """Poses without drift, and how well the depth images agree."""
+    """Drift-corrected poses, and how well the depth images agree."""
 
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     edges: int
-    """Alignments that were accepted."""
+    """Number of accepted alignments."""
     residual_m: float
-    """Median distance between aligned surfaces, metres; NaN without alignments."""
+    """Median ICP residual, metres; NaN without alignments."""
 
 
 def correct_drift(
@@ -78,9 +77,9 @@ def correct_drift(
     *,
     loops: int = 3,
 ) -> CorrectedOdometry:
-    """Refine odometry, repaired at tracking jumps, in its own frame; the first camera keeps its pose.
+    """Refine odometry in its own frame after repairing tracking jumps; the first camera stays fixed.
 
-    Each keyframe is aligned to its predecessor and to ``loops`` earlier ones that see the same place.
+    Each keyframe is aligned to its predecessor and to at most ``loops`` earlier loop candidates.
     """
     view = functools.lru_cache(maxsize=CACHED_VIEWS)(view)
     jumps = find_jumps(timestamp_s, odometry_from_camera)
@@ -96,7 +95,7 @@ def correct_drift(
     for first, second in _keyframe_pairs(odometry_from_camera, loops):
         guess = rigid.inverse(odometry_from_camera[first]) @ odometry_from_camera[second]
         result = align_views(view(first), view(second), guess, reach_m=REACH_M, iterations=ICP_ITERATIONS)
-        if _credible(result):
+        if _is_reliable(result):
             edges.append(RelativePose(first, second, result.target_from_source, result.information))
             residuals.append(result.residual_m)
     poses = optimize_pose_graph(odometry_from_camera, edges, iterations=GRAPH_ITERATIONS)
@@ -109,45 +108,45 @@ def chain_alignments(
     guess: Callable[[int, Float[np.ndarray, "4 4"]], Float[np.ndarray, "4 4"]],
     count: int,
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Make odometry of ``count`` frames by aligning each depth image to the one before.
+    """Estimate odometry of ``count`` frames by aligning each depth image to its predecessor.
 
-    ``guess(i, last)`` starts the alignment of frame i+1 in frame i's axes; ``last`` is the motion before it.
+    ``guess(i, last)`` is the initial pose of frame i+1 in frame i; ``last`` is the previous motion.
     """
     steps, last = [], np.eye(4)
     for index in range(count - 1):
         start = guess(index, last)
         result = align_views(view(index), view(index + 1), start, reach_m=REACH_M, iterations=ICP_ITERATIONS)
-        last = result.target_from_source if _credible(result) else start
+        last = result.target_from_source if _is_reliable(result) else start
         steps.append(last)
     return rigid.accumulate(np.array(steps).reshape(-1, 4, 4))
 
 
-def _credible(result: IcpResult) -> bool:
-    return result.overlap > MIN_OVERLAP and result.residual_m < LARGEST_RESIDUAL * REACH_M
+def _is_reliable(result: IcpResult) -> bool:
+    return result.overlap > MIN_OVERLAP and result.residual_m < MAX_RESIDUAL * REACH_M
 
 
 def _keyframe_pairs(poses: Float[np.ndarray, "frame 4 4"], loops: int) -> list[tuple[int, int]]:
-    """Pair each keyframe with its predecessor and with earlier ones that see the same place from near by."""
+    """Pair each keyframe with its predecessor and its nearest loop candidates."""
     keys = np.arange(0, len(poses), KEYFRAME_STEP)
     centre, forward = poses[keys, :3, 3], poses[keys, :3, 2]
     pairs = []
     for key in range(1, len(keys)):
         pairs.append((int(keys[key - 1]), int(keys[key])))
-        apart = np.linalg.norm(centre[: key - 1] - centre[key], axis=1) / LOOP_RADIUS_M
-        apart += np.arccos(np.clip(forward[: key - 1] @ forward[key], -1, 1)) / LOOP_RADIUS_RAD
+        separation = np.linalg.norm(centre[: key - 1] - centre[key], axis=1) / LOOP_RADIUS_M
+        separation += np.arccos(np.clip(forward[: key - 1] @ forward[key], -1, 1)) / LOOP_RADIUS_RAD
         for _ in range(loops):
-            if not len(apart) or apart.min() > LOOP_DISTANCE:
+            if not len(separation) or separation.min() > LOOP_DISTANCE:
                 break
-            best = int(apart.argmin())
+            best = int(separation.argmin())
             pairs.append((int(keys[best]), int(keys[key])))
-            apart[max(best - LOOP_SPACING, 0) : best + LOOP_SPACING + 1] = np.inf
+            separation[max(best - LOOP_SPACING, 0) : best + LOOP_SPACING + 1] = np.inf
     return pairs
 
 
 def align_gravity(
     view: Callable[[int], DepthImage], world_from_camera: Float[np.ndarray, "frame 4 4"]
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Turn a world of unknown gravity so that +y is up: where most normals near the cameras' own up point."""
+    """Rotate the world so that +y is up, the dominant surface normal near the cameras' mean up direction."""
     up = -world_from_camera[:, :3, 1].mean(0)
     up /= np.linalg.norm(up)
     normals = []
@@ -165,7 +164,7 @@ def align_gravity(
 
 @dataclass(frozen=True)
 class RelativePose:
-    """A measured motion between two frames; the information weighs its twist in the first camera's frame."""
+    """A measured motion between two frames, with the information matrix of its twist in the first frame."""
 
     first: int
     second: int
@@ -178,10 +177,10 @@ class RelativePose:
 def optimize_pose_graph(
     world_from_camera: Float[np.ndarray, "frame 4 4"], edges: Sequence[RelativePose], *, iterations: int
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Minimise the edges' squared Mahalanobis errors by Gauss-Newton, the first frame held.
+    """Minimise the edges' squared Mahalanobis errors by Gauss-Newton; the first pose is fixed.
 
-    An edge's residual is log(current first_from_second @ measured second_from_first), its robust weight
-    Cauchy's. Jacobians take the relative error as small, which odometry grants.
+    An edge's residual is log(current first_from_second @ measured second_from_first), its robust kernel
+    Cauchy's. Jacobians assume small residuals, which holds for odometry.
     """
     poses = np.array(world_from_camera, float)
     first = np.array([edge.first for edge in edges])
@@ -202,10 +201,10 @@ def optimize_pose_graph(
 
 
 def _solve(count, first, second, relative, residual, information) -> Float[np.ndarray, "frame 6"]:
-    """Solve one Gauss-Newton step for the poses' twists, each on its camera's side."""
+    """Solve one Gauss-Newton step for the poses' right-hand twists."""
     rotation, translation = relative[:, :3, :3], relative[:, :3, 3]
     j_first = -np.broadcast_to(np.eye(6), information.shape)
-    # The adjoint carries the second camera's twist to the first camera's frame.
+    # The adjoint maps the second camera's twist to the first camera's frame.
     j_second = np.zeros_like(information)
     j_second[:, :3, :3] = j_second[:, 3:, 3:] = rotation
     j_second[:, 3:, :3] = np.cross(translation[:, None, :], rotation.transpose(0, 2, 1)).transpose(0, 2, 1)
@@ -218,23 +217,23 @@ def _solve(count, first, second, relative, residual, information) -> Float[np.nd
             entries.append(np.broadcast_arrays(weighted @ j_b, rows, columns))
     blocks, rows, columns = (np.concatenate(part).ravel() for part in zip(*entries, strict=True))
     hessian = scipy.sparse.coo_matrix((blocks, (rows, columns)), shape=(6 * count, 6 * count))
-    held = scipy.sparse.diags(np.r_[np.full(6, FIXED_PRECISION), np.full(6 * (count - 1), FREE_PRECISION)])
-    return -scipy.sparse.linalg.spsolve((hessian + held).tocsc(), gradient.reshape(-1)).reshape(count, 6)
+    prior = scipy.sparse.diags(np.r_[np.full(6, FIXED_PRECISION), np.full(6 * (count - 1), FREE_PRECISION)])
+    return -scipy.sparse.linalg.spsolve((hessian + prior).tocsc(), gradient.reshape(-1)).reshape(count, 6)
 
 
 def find_jumps(
     timestamp_s: Float[np.ndarray, "frame"], odometry_from_camera: Float[np.ndarray, "frame 4 4"]
 ) -> Bool[np.ndarray, "frame"]:
-    """Return which frames cannot be where odometry places them after the frame before; False for the first.
+    """Return which frames follow a tracking jump; False for the first.
 
-    Only translation counts: a phone that is tipped over turns as fast as one whose tracking jumps.
+    Only translation is tested: a phone can really turn as fast as a jump does.
     """
     if len(timestamp_s) < 2:
         return np.zeros(len(timestamp_s), bool)
     step_m = np.linalg.norm(np.diff(odometry_from_camera[:, :3, 3], axis=0), axis=1)
-    speed = step_m / np.maximum(np.diff(timestamp_s), SHORTEST_S)
-    usual = scipy.ndimage.median_filter(speed, WINDOW_STEPS, mode="mirror")
-    return np.concatenate([[False], speed - usual > JUMP_M_S])
+    speed = step_m / np.maximum(np.diff(timestamp_s), MIN_STEP_S)
+    typical = scipy.ndimage.median_filter(speed, MEDIAN_WINDOW, mode="mirror")
+    return np.concatenate([[False], speed - typical > JUMP_M_S])
 
 
 def repair(
@@ -242,13 +241,13 @@ def repair(
     odometry_from_camera: Float[np.ndarray, "frame 4 4"],
     jumps: Bool[np.ndarray, "frame"],
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Chain odometry anew, each jump replaced by the velocity around it; without jumps return it as it is."""
+    """Replace each jump by the interpolated velocity around it; without jumps return the input."""
     if not jumps.any():
         return odometry_from_camera
     step = rigid.inverse(odometry_from_camera[:-1]) @ odometry_from_camera[1:]
     gap_s = np.diff(timestamp_s)[:, None]
     broken, intact = np.flatnonzero(jumps[1:]), np.flatnonzero(~jumps[1:])
-    rate = rigid.log(step[intact]) / np.maximum(gap_s[intact], SHORTEST_S)
+    rate = rigid.log(step[intact]) / np.maximum(gap_s[intact], MIN_STEP_S)
     step[broken] = rigid.exp(
         gap_s[broken] * np.stack([np.interp(broken, intact, axis) for axis in rate.T], axis=1)
     )

@@ -1,9 +1,8 @@
-"""Optimize camera poses by correspondences and relative poses: one sparse, robust Gauss-Newton for maps and
-sessions.
+"""Sparse, robust Gauss-Newton over camera poses, with correspondences and relative pose factors.
 
-A correspondence pairs a point seen by one camera with a point seen by another, or with one of the fixed map;
-its residual is their distance along one direction, so point-to-plane, point-to-line and point-to-point terms
-share one form. A relative pose factor is what odometry measured between two frames. Cost is linear in frames.
+A correspondence pairs a point seen by one camera with a point of another camera or of the fixed map. Its
+residual is their distance along one direction, so point-to-plane, point-to-line and point-to-point terms
+share one form. A relative pose factor is the odometry between two frames. Run time is linear in frames.
 """
 
 from collections.abc import Callable
@@ -18,26 +17,26 @@ from scipy.sparse.linalg import spsolve
 from pipeline.geometry import rigid
 
 MAP = -1
-"""Stands for the fixed map in ``Correspondences.second``; its points are in world axes."""
+"""Index of the fixed map in ``Correspondences.second``; its points are in the world frame."""
 MIN_SIGMA = 0.001
-"""Deviation of odometry at zero time, radians and metres."""
-SHORTEST_S = 1e-3
+"""Standard deviation of odometry at zero time, radians and metres."""
+MIN_STEP_S = 1e-3
 """Least time between frames, seconds."""
 DAMPING = 1e-6
-"""Damping of a step, share of each diagonal element and of their mean: what nothing measures stays still."""
+"""Levenberg damping relative to each diagonal element plus their mean: unobserved poses stay."""
 CHI_DAMPING = 1e-3
-"""The same in `chi_squares`: what one flat wall does not measure does not count."""
+"""Damping in `chi_squares`, relative to the mean diagonal: unconstrained directions do not count."""
 MAX_ROWS = 2**19
-"""Rows of the Jacobian at a time: a step needs half a gigabyte however long the recording is."""
+"""Rows of the Jacobian per block, which bounds the memory of a step to half a gigabyte."""
 MEDIAN_CHI_SQUARE = 5.348
-"""Median of the chi-square distribution of six degrees of freedom."""
+"""Median of the chi-square distribution with six degrees of freedom."""
 PRIOR_PRECISION = 1e-9
-"""Added to the information so that frames that nothing holds have a finite covariance."""
+"""Added to the information, so that unconstrained frames have a finite covariance."""
 
 
 @dataclass(frozen=True)
 class Correspondences:
-    """Points that should coincide along ``direction``, metres, in the axes of their camera (or the map)."""
+    """Points (metres, in the frame of their camera or the map) that coincide along ``direction_world``."""
 
     first: Int[np.ndarray, "match"]
     second: Int[np.ndarray, "match"]
@@ -48,16 +47,16 @@ class Correspondences:
 
     @staticmethod
     def join(*parts: "Correspondences") -> "Correspondences":
-        """Concatenate sets of correspondences."""
+        """Concatenate correspondences."""
         names = [field.name for field in fields(Correspondences)]
         return Correspondences(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
     def selected(self, matches: slice | Int[np.ndarray, "some"]) -> "Correspondences":
-        """Return some of the matches."""
+        """Return a subset of the correspondences."""
         return Correspondences(*(getattr(self, field.name)[matches] for field in fields(self)))
 
     def inflated(self, factor: float) -> "Correspondences":
-        """Multiply the deviations."""
+        """Multiply the standard deviations."""
         return replace(self, sigma_m=factor * self.sigma_m)
 
 
@@ -72,11 +71,11 @@ class RelativePoseFactors:
     sigma_m: Float[np.ndarray, "edge"]
 
     def inflated(self, factor: float) -> "RelativePoseFactors":
-        """Multiply the deviations."""
+        """Multiply the standard deviations."""
         return replace(self, sigma_rad=factor * self.sigma_rad, sigma_m=factor * self.sigma_m)
 
     def chi_squares(self, world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "edge"]:
-        """Return each factor's squared error, in its deviations."""
+        """Return each factor's squared Mahalanobis error."""
         return (_edge_rows(world_from_camera, self)[1].reshape(-1, 6) ** 2).sum(1)
 
 
@@ -90,12 +89,12 @@ class OptimizedPoses:
 
 
 class PoseTerm(Protocol):
-    """A further term of the cost, with unknowns of its own."""
+    """An additional cost term with latent variables of its own, such as points."""
 
     def normal_equations(
         self, world_from_camera: Float[np.ndarray, "frame 4 4"]
     ) -> tuple[sparse.csc_array, Float[np.ndarray, "parameter"]]:
-        """Return matrix and gradient for the cameras' right-hand twists, its own unknowns eliminated."""
+        """Return matrix and gradient for the cameras' right-hand twists, own variables eliminated."""
         ...
 
 
@@ -106,9 +105,9 @@ def odometry_factors(
     drift_rad_s: float,
     drift_m_s: float,
 ) -> RelativePoseFactors:
-    """Turn odometry into one factor per neighbouring pair; its deviations grow with the time between."""
+    """Return one factor per consecutive pair; standard deviations grow with time."""
     first = np.arange(len(timestamp_s) - 1)
-    gap_s = np.maximum(np.diff(timestamp_s), SHORTEST_S)
+    gap_s = np.maximum(np.diff(timestamp_s), MIN_STEP_S)
     first_from_second = rigid.inverse(odometry_from_camera[:-1]) @ odometry_from_camera[1:]
     sigma_rad, sigma_m = (drift * gap_s + MIN_SIGMA for drift in (drift_rad_s, drift_m_s))
     return RelativePoseFactors(first, first + 1, first_from_second, sigma_rad, sigma_m)
@@ -123,10 +122,10 @@ def optimize_poses(
     fixed: Bool[np.ndarray, "frame"] | None = None,
     term: PoseTerm | None = None,
 ) -> OptimizedPoses:
-    """Minimise sum_c rho(r_c / sigma_c) + sum_e |log(e)|^2 over all poses; rho: Geman-McClure of ``reach_m``.
+    """Minimise sum_c rho(r_c / sigma_c) + sum_e |log(e)|^2 over all poses, rho the Geman-McClure kernel.
 
-    Each round finds the correspondences anew within its reach (metres) and takes one Gauss-Newton step on the
-    right-hand twist of each camera. ``fixed`` frames stay where they are; ``term`` is added to the cost.
+    Each round recomputes the correspondences within its reach (metres, also the kernel's width) and takes one
+    Gauss-Newton step on the right-hand twist of each camera. ``fixed`` poses stay; ``term`` is added.
     """
     poses = np.array(world_from_camera, float)
     free = np.ones(len(poses), bool) if fixed is None else ~fixed
@@ -149,23 +148,23 @@ def marginal_covariance(
 ) -> Float[np.ndarray, "frame 6 6"]:
     """Return the marginal covariance of each camera's right-hand twist (rotation, translation).
 
-    Diagonal blocks of the inverse Gauss-Newton matrix. Correspondences must be with the map and factors
-    between neighbours, so that the matrix is block tridiagonal and one forward and one backward pass suffice.
+    These are diagonal blocks of the inverse Hessian. Correspondences must be with the map and factors between
+    neighbours, so that the Hessian is block tridiagonal: one forward and one backward pass suffice.
     """
     normal, _ = _normal_equations(world_from_camera, correspondences, relative_poses, reach_m)
     blocks = sparse.bsr_array(normal, blocksize=(6, 6))
     row = np.repeat(np.arange(len(world_from_camera)), np.diff(blocks.indptr))
-    assert (np.abs(row - blocks.indices) <= 1).all(), "contacts between cameras"
-    own, next_to = np.zeros((2, len(world_from_camera), 6, 6))
-    own[row[row == blocks.indices]] = blocks.data[row == blocks.indices]
-    next_to[row[row + 1 == blocks.indices]] = blocks.data[row + 1 == blocks.indices]
-    own = own + PRIOR_PRECISION * np.eye(6)
-    past, future = own.copy(), own.copy()
-    for frame in range(1, len(own)):
-        past[frame] -= next_to[frame - 1].T @ np.linalg.solve(past[frame - 1], next_to[frame - 1])
-        back = len(own) - 1 - frame
-        future[back] -= next_to[back] @ np.linalg.solve(future[back + 1], next_to[back].T)
-    return np.linalg.inv(past + future - own)
+    assert (np.abs(row - blocks.indices) <= 1).all(), "correspondences link cameras that are not neighbours"
+    diagonal, upper = np.zeros((2, len(world_from_camera), 6, 6))
+    diagonal[row[row == blocks.indices]] = blocks.data[row == blocks.indices]
+    upper[row[row + 1 == blocks.indices]] = blocks.data[row + 1 == blocks.indices]
+    diagonal = diagonal + PRIOR_PRECISION * np.eye(6)
+    forward, backward = diagonal.copy(), diagonal.copy()
+    for frame in range(1, len(diagonal)):
+        forward[frame] -= upper[frame - 1].T @ np.linalg.solve(forward[frame - 1], upper[frame - 1])
+        back = len(diagonal) - 1 - frame
+        backward[back] -= upper[back] @ np.linalg.solve(backward[back + 1], upper[back].T)
+    return np.linalg.inv(forward + backward - diagonal)
 
 
 def chi_squares(
@@ -174,9 +173,9 @@ def chi_squares(
     group: Int[np.ndarray, "match"],
     reach_m: float,
 ) -> Float[np.ndarray, "group"]:
-    """Return how far each group of correspondences wants its first camera elsewhere: g^T H^-1 g of its own.
+    """Return g^T H^-1 g of each group of correspondences, with respect to its first camera's pose.
 
-    Chi-square distributed with six degrees of freedom where the deviations are true and errors independent.
+    Chi-square distributed with six degrees of freedom if sigmas are correct and errors independent.
     """
     residual = residuals(world_from_camera, correspondences)
     weight = (reach_m**2 / (reach_m**2 + residual**2)) ** 2 / correspondences.sigma_m**2
@@ -192,7 +191,7 @@ def chi_squares(
 
 
 def variance_factor(chi_squares: Float[np.ndarray, "group"]) -> float:
-    """Return by what factor variances are larger than assumed, from errors of six degrees of freedom."""
+    """Return the ratio of actual to assumed variance, from chi-squares of six degrees of freedom."""
     return float(np.median(chi_squares)) / MEDIAN_CHI_SQUARE
 
 
@@ -206,7 +205,7 @@ def residuals(
 
 
 def _normal_equations(poses, correspondences, relative_poses, reach):
-    """Return matrix and gradient of one Gauss-Newton step."""
+    """Return the matrix and gradient of one Gauss-Newton step."""
     normal, gradient = sparse.csc_array((6 * len(poses),) * 2), np.zeros(6 * len(poses))
     for start in range(0, len(correspondences.first), MAX_ROWS):
         part = correspondences.selected(slice(start, start + MAX_ROWS))
@@ -262,7 +261,7 @@ def _edge_rows(poses, relative_poses):
 
 
 def _adjoint(a_from_b):
-    """Return the 6x6 map of twists (rotation, translation) from frame b to frame a."""
+    """Return the 6x6 adjoint that maps twists (rotation, translation) from frame b to frame a."""
     rotation, (x, y, z) = a_from_b[..., :3, :3], np.moveaxis(a_from_b[..., :3, 3], -1, 0)
     zero = np.zeros_like(x)
     hat = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)

@@ -1,4 +1,4 @@
-"""SIFT points: described in the picture, lifted to camera axes by depth, matched between pictures."""
+"""SIFT keypoints: detection, back-projection by depth, and matching."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from jaxtyping import Float, Int, UInt8
 from pipeline.geometry import cameras
 
 RATIO = 0.8
-"""Ratio test: the best match must be this much nearer than the second (Lowe 2004)."""
+"""Largest distance ratio of the best to the second-best match (Lowe 2004)."""
 MIN_NORM = 1e-6
 PEAK_THRESHOLD = 0.04
 """OpenCV's contrast threshold."""
@@ -27,7 +27,7 @@ class Keypoints:
 
 @dataclass(frozen=True)
 class SiftPoints:
-    """Points of one frame that have depth."""
+    """Keypoints of one frame with depth, camera frame, metres."""
 
     descriptors: Float[np.ndarray, "point 128"]
     points_camera: Float[np.ndarray, "point 3"]
@@ -35,20 +35,18 @@ class SiftPoints:
 
 def describe(
     gray: UInt8[np.ndarray, "height width"],
-    most: int = 0,
+    max_points: int = 0,
     peak_threshold: float = PEAK_THRESHOLD,
     usable: UInt8[np.ndarray, "height width"] | None = None,
 ) -> Keypoints:
-    """Describe the ``most`` strongest points of a picture (0: all), where it is ``usable``; plain walls need
-    a low contrast threshold.
-    """
-    # Otherwise OpenCV's points lie a quarter of a pixel to the lower right.
-    sift = cv2.SIFT.create(most, contrastThreshold=peak_threshold, enable_precise_upscale=True)
+    """Describe the ``max_points`` strongest keypoints (0: all) of the ``usable`` pixels."""
+    # Without precise upscaling OpenCV's points are off by a quarter of a pixel to the lower right.
+    sift = cv2.SIFT.create(max_points, contrastThreshold=peak_threshold, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(gray, usable)
     if not keypoints:
         return Keypoints(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
-    rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), MIN_NORM))
-    return Keypoints(np.array([point.pt for point in keypoints]) + 0.5, rooted.astype(np.float32))
+    root_sift = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), MIN_NORM))
+    return Keypoints(np.array([point.pt for point in keypoints]) + 0.5, root_sift.astype(np.float32))
 
 
 def lift(
@@ -57,7 +55,7 @@ def lift(
     depth: Float[np.ndarray, "depth_height depth_width"],
     depth_intrinsics: Float[np.ndarray, "3 3"],
 ) -> SiftPoints:
-    """Lift the keypoints of a picture that have depth, metres."""
+    """Back-project the keypoints that have depth (metres) to the camera frame."""
     ray = cameras.unproject(keypoints.pixel, intrinsics)
     z = cameras.read_depth(depth, depth_intrinsics, ray)
     return SiftPoints(keypoints.descriptors[z > 0], (ray * z[:, None])[z > 0])
@@ -66,7 +64,7 @@ def lift(
 def matches(
     first: Float[np.ndarray, "first 128"], second: Float[np.ndarray, "second 128"]
 ) -> Int[np.ndarray, "match 2"]:
-    """Return index pairs (first, second) of distinctive descriptors by the ratio test."""
+    """Return index pairs (first, second) that pass the ratio test."""
     if not len(first) or len(second) < 2:
         return np.zeros((0, 2), int)
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first, second, k=2)

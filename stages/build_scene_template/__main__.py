@@ -1,9 +1,9 @@
 """Build the scene template from the walk-through.
 
-COLMAP (CPU, one thread) finds the keyframes' poses; depth gives the scale and verifies the poses; where depth
-refutes them, odometry replaces them; gravity turns +y up. Depth and colour are fused to a mesh, every frame
-is aligned to it, pymeshlab cleans it. Writes mesh.ply, vertex_features.npz, cameras.npz, world.json and
-colmap/.
+COLMAP (CPU, one thread) estimates the keyframe poses; depth gives the metric scale and verifies the poses,
+and odometry replaces them where depth contradicts them; +y is aligned with gravity. Depth and colour are
+fused to a mesh, every frame is aligned to it, pymeshlab cleans it. Writes mesh.ply, vertex_features.npz,
+cameras.npz, world.json and colmap/.
 """
 
 from pipeline.workflow import cli

@@ -1,6 +1,6 @@
 """Anchor the walk-through in the world: metric scale from depth, propagation by odometry, gravity.
 
-The sparse model is refuted when depth contradicts it; then odometry is the initial trajectory.
+If depth contradicts the sparse model, odometry is the initial trajectory.
 """
 
 from dataclasses import dataclass
@@ -14,47 +14,47 @@ from pipeline.geometry import align, cameras, ground, rigid
 from pipeline.mapping.bundle_adjustment import MAD_TO_SIGMA
 from pipeline.mapping.colmap import SparseModel
 from stages.build_scene_template.refine import Keyframe
-from stages.build_scene_template.sfm import points_under
+from stages.build_scene_template.sfm import lift_pixels
 
 MIN_REGISTERED = 0.6
-"""Share of the keyframes that must be in the largest model; with less, odometry explains more of the walk."""
+"""Least share of the keyframes in the largest model; with less, odometry is more complete."""
 MAX_SCALE_DEVIATION = 0.06
-"""Robust relative deviation of depth over SfM depth beyond which it is refuted; sound models have 1-3 %."""
+"""Largest robust relative deviation of the ratio of depth to SfM depth; good models have 1-3 %."""
 MAX_GAP_M, MAX_GAP_RATIO = 0.06, 1.5
-"""Gap between depth images that refutes the model, metres, if so many times the gap under the odometry."""
+"""The model is rejected if its depth gap (metres) exceeds the first, and the second times odometry's gap."""
 MIN_RATIOS = 20
-"""Tracks with depth below which there is no scale."""
+"""Least number of observations with depth for the scale."""
 HOPS = (1, 3, 8)
-"""Keyframes that many apart have their depth images compared."""
+"""Index distances of keyframes whose depth images are compared."""
 GAP_QUANTILE, MIN_OVERLAP = 0.75, 50
-"""Quantile of a pair's gaps that counts, and least number of overlapping points of a pair."""
-NEAREST_M = 0.1
-"""Depth below this is none, metres."""
+"""Quantile of a pair's depth differences, and least number of overlapping points of a pair."""
+MIN_DEPTH_M = 0.1
+"""Smaller depth counts as missing, metres."""
 
 
 @dataclass(frozen=True)
 class InitialTrajectory:
-    """Initial poses of every frame, their source, and what was measured about SfM."""
+    """Initial poses of every frame, their source, and the diagnostics of SfM."""
 
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     source: Literal["colmap", "odometry"]
     reason: str
-    """Why SfM is not believed; empty where it is."""
+    """Why SfM was rejected; empty if it was accepted."""
     registered: Int[np.ndarray, "key"]
     scale_deviation: float | None
     """Robust relative standard deviation of depth over SfM depth."""
     odometry_scale: float | None
-    """Length of the odometry's path over the model's, between neighbouring keyframes; 1 is agreement."""
+    """Path length of odometry over that of SfM, at registered keyframes; ideally 1."""
     gap_m: dict[str, float]
-    """Gap between overlapping depth images under each candidate trajectory (`depth_gap`)."""
+    """`depth_gap` of each candidate trajectory."""
 
 
 def metric_scale(sparse: SparseModel, clip: Clip) -> tuple[float, float] | None:
-    """Return metres per model unit and its robust relative deviation, by depth under tracks; None without."""
+    """Return metres per model unit and its robust relative deviation, from depth; None if too few."""
     ratios = []
     for view, frame in enumerate(sparse.frame):
         row = np.flatnonzero(sparse.observed_key == view)
-        measured = points_under(clip, int(frame), sparse.observed_pixel[row])[:, 2]
+        measured = lift_pixels(clip, int(frame), sparse.observed_pixel[row])[:, 2]
         camera_from_model = rigid.inverse(sparse.model_from_camera[view])
         model = rigid.apply(camera_from_model, sparse.points_model[sparse.observed_point[row]])[:, 2]
         ratios.append((measured / model)[np.isfinite(measured) & (model > 0)])
@@ -66,7 +66,7 @@ def metric_scale(sparse: SparseModel, clip: Clip) -> tuple[float, float] | None:
 
 
 def depth_gap(keyframes: list[Keyframe], world_from_camera: Float[np.ndarray, "key 4 4"]) -> float:
-    """Return how far depth images of keyframes `HOPS` apart differ, metres: the mean of their quantiles."""
+    """Return the mean over keyframe pairs `HOPS` apart of a quantile of their depth differences, metres."""
     gaps = []
     for hop in HOPS:
         for first in range(len(keyframes) - hop):
@@ -74,7 +74,7 @@ def depth_gap(keyframes: list[Keyframe], world_from_camera: Float[np.ndarray, "k
             target_from_first = rigid.inverse(world_from_camera[first + hop]) @ world_from_camera[first]
             moved = rigid.apply(target_from_first, keyframes[first].scan.points_camera)
             pixel, z = cameras.project(moved, target.intrinsics)
-            inside = cameras.in_picture(pixel, z, target.depth.shape, NEAREST_M)
+            inside = cameras.in_picture(pixel, z, target.depth.shape, MIN_DEPTH_M)
             column, row = np.floor(pixel[inside]).astype(int).T
             measured = target.depth[row, column]
             gap = np.abs(measured - z[inside])[measured > 0]
@@ -85,7 +85,7 @@ def depth_gap(keyframes: list[Keyframe], world_from_camera: Float[np.ndarray, "k
 def propagate(
     clip: Clip, frames: Int[np.ndarray, "key"], world_from_camera: Float[np.ndarray, "key 4 4"]
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Propagate keyframe poses to all frames: blended along odometry from both neighbours; else in time."""
+    """Propagate keyframe poses to all frames along odometry, blended from both sides; else interpolate."""
     time = clip.timestamp_s
     if clip.odometry_from_camera is None:
         return rigid.interpolate(time[frames], world_from_camera, time)
@@ -100,31 +100,31 @@ def propagate(
     return ends[0] @ rigid.exp(step * blend[:, None])
 
 
-def choose_start(
+def choose_trajectory(
     clip: Clip, frames: Int[np.ndarray, "key"], keyframes: list[Keyframe], sparse: SparseModel | None
 ) -> InitialTrajectory | None:
-    """Return SfM poses if enough keyframes are registered, the scale is steady and depth agrees, or odometry.
+    """Return SfM poses if enough keyframes are registered, scale and depth are consistent; else odometry.
 
-    None where there is neither.
+    None where neither is available.
     """
     odometry = clip.odometry_from_camera
     gap = {} if odometry is None else {"odometry": depth_gap(keyframes, odometry[frames])}
     deviation = ratio = poses = None
     if sparse is None:
-        reason, registered = "no model came out", np.zeros(0, int)
+        reason, registered = "COLMAP found no model", np.zeros(0, int)
     elif (measured := metric_scale(sparse, clip)) is None:
-        reason, registered = "depth lies under too few of its points", sparse.frame
+        reason, registered = "too few of its points have depth", sparse.frame
     else:
         registered, (scale, deviation) = sparse.frame, measured
         poses = sparse.model_from_camera.copy()
         poses[:, :3, 3] *= scale
         poses = propagate(clip, registered, poses)
         gap["colmap"] = depth_gap(keyframes, poses[frames])
-        reason = _refutation(len(registered) / len(frames), deviation, gap)
+        reason = _rejection_reason(len(registered) / len(frames), deviation, gap)
         if odometry is not None:
             steps = (np.diff(path[registered, :3, 3], axis=0) for path in (odometry, poses))
-            own, found = (np.linalg.norm(step, axis=1).sum() for step in steps)
-            ratio = float(own / max(found, 1e-9))
+            odometry_m, sfm_m = (np.linalg.norm(step, axis=1).sum() for step in steps)
+            ratio = float(odometry_m / max(sfm_m, 1e-9))
     if odometry is not None and (poses is None or reason):
         return InitialTrajectory(odometry, "odometry", reason, registered, deviation, ratio, gap)
     if poses is None:
@@ -132,8 +132,8 @@ def choose_start(
     return InitialTrajectory(poses, "colmap", reason, registered, deviation, ratio, gap)
 
 
-def _refutation(registered, deviation, gap):
-    """Return why depth or coverage contradicts the sparse model; empty when nothing does."""
+def _rejection_reason(registered, deviation, gap):
+    """Return why the sparse model is rejected; empty if it is not."""
     if registered < MIN_REGISTERED:
         return f"only {registered:.0%} of the keyframes were registered"
     if deviation > MAX_SCALE_DEVIATION:
@@ -149,13 +149,13 @@ def upright(
     points_world: Float[np.ndarray, "point 3"],
     normals_world: Float[np.ndarray, "point 3"],
 ) -> tuple[Float[np.ndarray, "4 4"], str]:
-    """Return ``upright_from_world`` that turns +y up, and whence up is known: gravity or dominant planes."""
+    """Return ``upright_from_world`` with +y up, and the source of the up direction."""
     if clip.odometry_from_camera is not None and clip.gravity_known:
         odometry_from_camera = clip.odometry_from_camera[:, :3, :3]
         world_from_odometry = world_from_camera[:, :3, :3] @ np.swapaxes(odometry_from_camera, 1, 2)
-        up, how = world_from_odometry[:, :, 1].mean(0), "gravity of the phone"
+        up, source = world_from_odometry[:, :, 1].mean(0), "gravity of the phone"
     else:
         guess = -world_from_camera[:, :3, 1].mean(0)
-        up, how = ground.floor_direction(normals_world, guess / np.linalg.norm(guess)), "dominant planes"
+        up, source = ground.floor_direction(normals_world, guess / np.linalg.norm(guess)), "dominant planes"
     rotation = align.rotation_between(up, np.array([0.0, 1.0, 0.0]))
-    return rigid.make(rotation, -rotation @ points_world.mean(0)), how
+    return rigid.make(rotation, -rotation @ points_world.mean(0)), source

@@ -1,8 +1,7 @@
-"""Clean a mesh with MeshLab's filters; run as a program of its own with one thread: ``clean_mesh.py IN.ply
-OUT.ply MIN_FACES``.
+"""Clean a mesh with MeshLab's filters, as a separate process: ``clean_mesh.py IN.ply OUT.ply MIN_FACES``.
 
-MeshLab's library is GPL-3 and is only ever talked to through files. Islands with fewer faces than
-MIN_FACES, duplicates, slivers and non-manifold edges go; colours and the outline of holes stay.
+pymeshlab is GPL-3, so it is used only through files. Removes connected components with fewer faces than
+MIN_FACES, duplicates, degenerate faces and non-manifold edges; keeps vertex colours and holes.
 """
 
 import sys
@@ -12,7 +11,7 @@ import pymeshlab
 
 def clean(source: str, target: str, min_faces: int) -> None:
     """Read a PLY, clean it and write it with vertex colours."""
-    # Its module is a compiled one without stubs, filled in when it is imported.
+    # The compiled module has no stubs; its members exist only at run time.
     meshes = pymeshlab.MeshSet(verbose=False)  # pyright: ignore[reportAttributeAccessIssue]
     meshes.load_new_mesh(source)
     meshes.meshing_remove_duplicate_vertices()

@@ -8,18 +8,18 @@ class SfmConfig:
     """How keyframes are chosen and matched."""
 
     max_keyframes: int = 90
-    """Upper bound; steps are widened until it holds."""
+    """Upper bound; keyframe spacing is increased until it holds."""
     features: int = 1500
     """SIFT features per keyframe."""
     overlap: int = 6
-    """Successors that each keyframe is matched with."""
+    """Following keyframes that each keyframe is matched with."""
     loops_per_keyframe: int = 4
     """Loop closure candidates per keyframe, at most."""
 
 
 @dataclass(frozen=True)
 class RefinementConfig:
-    """How keyframes are optimized against each other."""
+    """How keyframe poses are optimized jointly."""
 
     neighbours: int = 8
     """Keyframes that each keyframe's depth is compared with."""
@@ -38,11 +38,11 @@ class FusionConfig:
     furthest_m: float = 4.5
     """Depth beyond this is not fused, metres."""
     island_faces: int = 120
-    """Smaller separate pieces of surface are dropped, faces."""
+    """Smaller connected components are removed, faces."""
     align_rounds: int = 4
     """Gauss-Newton steps that align every frame to the surface."""
     align_stride_px: int = 9
-    """One depth pixel in so many, each way, takes part in that alignment."""
+    """Grid spacing of the depth pixels in that alignment."""
     feature_frames: int = 80
     """Frames whose features are averaged on the vertices, evenly spaced."""
 
@@ -58,6 +58,6 @@ class Config:
     fusion: FusionConfig = field(default_factory=FusionConfig)
     """Depth fusion."""
     own_mesh: bool = True
-    """Use a mesh that the recording brings along (Polycam's) where its depth confirms it."""
+    """Use the mesh that comes with the recording (Polycam's) if its depth confirms it."""
     seed: int = 0
     """Seed of COLMAP and RANSAC."""

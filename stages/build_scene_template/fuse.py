@@ -14,24 +14,25 @@ from pipeline.data.clips import Clip
 from pipeline.geometry import cameras, rigid, subsampling, tsdf
 from pipeline.geometry.meshes import Mesh
 from pipeline.mapping import depth_scans, pose_optimization
+from pipeline.mapping.pose_optimization import optimize_poses
 from stages.build_scene_template.config import FusionConfig
 from stages.build_scene_template.refine import DEPTH_INFLATION, odometry_factors
 
 MAX_VOXELS = 150_000_000
-"""More would take over 4 GB."""
+"""Limits memory to 4 GB."""
 CONFIDENCE_WEIGHT = (0.2, 0.6, 1.0)
-"""Weight of depth of low, medium and high confidence; rims and thin legs have low confidence only."""
+"""Fusion weight of low, medium and high confidence; depth edges and thin legs have only low confidence."""
 MIN_WEIGHT = 0.15
-"""A voxel needs this weight, in views from one metre, to carry surface."""
+"""Least weight of a surface voxel, in units of one view from one metre."""
 EXTENT_STRIDE_PX, EXTENT_STEP, EXTENT_TRIM = 12, 4, 0.001
-"""Pixels and keyframes that measure the room's extent, and the share of points cut at each end."""
+"""Pixel and keyframe strides for measuring the room's extent, and the quantile trimmed at each end."""
 ALIGN_REACH_M = (0.1, 0.04)
 """Width of the robust weight in the first and last round of the alignment to the surface, metres."""
 ALIGN_POINTS, ALIGN_MIN_POINTS = 400_000, 40
-"""Depth points that take part, so that memory stays bounded, and least number per frame."""
+"""Total of depth points, which bounds memory, and least number per frame."""
 NO_KEYFRAMES = np.zeros(0, int)
-NEAREST_M, SEEN_WITHIN_M = 0.2, 0.06
-"""A frame sees a vertex beyond the first distance where measured depth agrees within the second, metres."""
+MIN_DEPTH_M, SEEN_WITHIN_M = 0.2, 0.06
+"""A frame sees a vertex beyond the first distance if measured depth agrees within the second, metres."""
 
 
 def fuse(
@@ -40,11 +41,11 @@ def fuse(
     world_from_camera: Float[np.ndarray, "frame 4 4"],
     config: FusionConfig,
 ) -> Mesh:
-    """Fuse the frames into one volume and extract what was seen. Raises InputError MAP-005 if too large."""
+    """Fuse the frames into a TSDF and extract the mesh. Raises InputError MAP-005 if too large."""
     points = []
     for frame in frames[::EXTENT_STEP].tolist():
         depth, intrinsics = clip.depth(frame), clip.depth_intrinsics[frame]
-        scan = depth_scans.scan(depth, intrinsics, stride=EXTENT_STRIDE_PX, furthest_m=config.furthest_m)
+        scan = depth_scans.scan(depth, intrinsics, stride=EXTENT_STRIDE_PX, max_depth_m=config.furthest_m)
         points.append(rigid.apply(world_from_camera[frame], scan.points_camera))
     points = np.concatenate(points)
     extent_m = np.ptp(np.quantile(points, [EXTENT_TRIM, 1 - EXTENT_TRIM], axis=0), axis=0)
@@ -70,36 +71,36 @@ def align_frames(
     config: FusionConfig,
     keyframes: Int[np.ndarray, "key"] = NO_KEYFRAMES,
 ) -> tuple[Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame"]]:
-    """Optimize every frame against surface and odometry; also return each frame's median gap, metres.
+    """Align every frame to the surface, with odometry; also return each frame's median residual, metres.
 
-    Depth counts by how far it contradicts the keyframes; they stay if that is more than its noise explains.
+    Depth noise is rescaled by its chi-square at the keyframes; they stay fixed if it is too large.
     """
     surface, frames = depth_scans.SurfaceMap(mesh), np.arange(len(clip))
-    most = max(ALIGN_POINTS // len(clip), ALIGN_MIN_POINTS)
+    max_points = max(ALIGN_POINTS // len(clip), ALIGN_MIN_POINTS)
     scans = [
         depth_scans.scan(
             clip.depth(f),
             clip.depth_intrinsics[f],
             stride=config.align_stride_px,
             confidence=clip.confidence(f),
-            furthest_m=config.furthest_m,
-        ).subsampled(most)
+            max_depth_m=config.furthest_m,
+        ).subsampled(max_points)
         for f in range(len(clip))
     ]
 
-    def find(poses, reach_m):
+    def associate(poses, reach_m):
         return surface.correspondences(frames, scans, poses, reach_m, inflation)
 
     inflation, fixed = DEPTH_INFLATION, np.zeros(len(clip), bool)
     if len(keyframes):
-        found = find(world_from_camera, ALIGN_REACH_M[0])
+        found = associate(world_from_camera, ALIGN_REACH_M[0])
         squares = pose_optimization.chi_squares(world_from_camera, found, found.first, ALIGN_REACH_M[0])
         variance = pose_optimization.variance_factor(squares[np.isin(np.arange(len(squares)), keyframes)])
         inflation *= np.sqrt(max(1.0, variance))
         fixed[keyframes] = variance > 1
     reach = tuple(np.geomspace(*ALIGN_REACH_M, config.align_rounds))
-    motion = odometry_factors(clip, frames, otherwise=world_from_camera)
-    optimized = pose_optimization.optimize_poses(world_from_camera, find, motion, reach_m=reach, fixed=fixed)
+    motion = odometry_factors(clip, frames, fallback=world_from_camera)
+    optimized = optimize_poses(world_from_camera, associate, motion, reach_m=reach, fixed=fixed)
     gap = np.full(len(clip), np.nan)
     for frame in np.unique(optimized.correspondences.first):
         gap[frame] = np.median(np.abs(optimized.residual_m[optimized.correspondences.first == frame]))
@@ -107,15 +108,15 @@ def align_frames(
 
 
 def clean(mesh: Mesh, workspace: Path, island_faces: int) -> Mesh:
-    """Clean a mesh in MeshLab's own process. Raises InputError MAP-003 when that program fails."""
+    """Clean a mesh with MeshLab in a separate process. Raises InputError MAP-003 when that fails."""
     source, target = workspace / "raw.ply", workspace / "clean.ply"
     mesh_files.write_ply(source, mesh)
     program = Path(__file__).with_name("clean_mesh.py")
     environment = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "PATH": "/usr/bin:/bin"}
     command = [sys.executable, program, source, target, str(island_faces)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    if done.returncode or not target.exists():
-        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+    completed = subprocess.run(command, env=environment, capture_output=True, text=True)
+    if completed.returncode or not target.exists():
+        last = (completed.stderr.strip().splitlines() or ["no message"])[-1]
         remedy = "install its libraries: apt-get install libgl1 libopengl0"
         raise InputError("MAP-003", f"pymeshlab failed: {last}", program.name, remedy)
     return mesh_files.read_ply(target)
@@ -128,12 +129,12 @@ def vertex_features(
     world_from_camera: Float[np.ndarray, "frame 4 4"],
     frames: int,
 ) -> Float[np.ndarray, "vertex channel"]:
-    """Average, by 1 / depth, the features of frames that see each vertex, to unit length; zero if none."""
+    """Average the features of frames that see each vertex, weighted by 1 / depth; unit norm or zero."""
     total = np.zeros((len(mesh.vertices), features.shape[-1]))
     for frame in subsampling.evenly(len(clip), frames):
         local = rigid.apply(rigid.inverse(world_from_camera[frame]), mesh.vertices.astype(float))
         pixel, z = cameras.project(local, clip.intrinsics[frame])
-        inside = np.flatnonzero(cameras.in_picture(pixel, z, clip.color_size, NEAREST_M))
+        inside = np.flatnonzero(cameras.in_picture(pixel, z, clip.color_size, MIN_DEPTH_M))
         depth, size = clip.depth(int(frame)), clip.color_size[::-1]
         scale = np.array(depth.shape[::-1]) / size
         column, row = np.minimum((pixel[inside] * scale).astype(int), np.array(depth.shape[::-1]) - 1).T

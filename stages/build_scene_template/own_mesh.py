@@ -1,7 +1,7 @@
-"""A mesh that the recording brings along, such as Polycam's own, in place of a fused one.
+"""Use the mesh that comes with a recording, such as Polycam's, in place of a fused one.
 
-It is used when the walk-through's depth confirms its place and scale. Parts that no frame saw are cut (apps
-close holes), and the frames colour it.
+The walk-through's depth must confirm its pose and scale. Faces that no frame saw are removed (apps fill
+holes), and vertices are coloured by the frames.
 """
 
 import numpy as np
@@ -17,45 +17,45 @@ from stages.build_scene_template.config import Config
 from stages.build_scene_template.template import REGISTERED_WITHIN_M, SceneTemplate, floor_height
 
 EDGE_M, SUBDIVISIONS = 0.05, 12
-"""Longer edges are divided, at most so often, so that vertices can carry colours, metres."""
+"""Edge length (metres) to which edges are subdivided, in at most so many iterations, for vertex colours."""
 MAX_SCALE_ERROR, MAX_GAP_M, MIN_AGREE = 0.03, 0.05, 0.7
-"""Bounds on its relative scale error, its median distance from depth (metres) and the share of depth that
-meets it; Polycam's meshes have 1 %, 2 cm and 0.85."""
-SEEN_WITHIN_M, NEAREST_M = 0.08, 0.1
-"""A vertex was seen where depth agrees within the first, metres; depth below the second is none."""
+"""Bounds on relative scale error, median depth residual (metres) and share of depth that agrees; Polycam's
+meshes have 1 %, 2 cm and 0.85."""
+SEEN_WITHIN_M, MIN_DEPTH_M = 0.08, 0.1
+"""Depth agreement of a seen vertex, and least valid depth, metres."""
 SCALE_VIEWS, SCALE_STRIDE_PX, COLOR_VIEWS = 10, 4, 60
-"""Frames and pixels that measure the scale, and frames that colour it and vote on what was seen."""
+"""Frames and pixel stride for measuring scale; frames for colouring and visibility."""
 
 
 def build(
     clip: Clip, features: Float[np.ndarray, "frame height width channel"], mesh: Mesh, config: Config
 ) -> SceneTemplate | None:
-    """Make the template of a mesh that stands in the odometry's world; None where depth refutes it."""
+    """Build the template from a mesh in the odometry's world frame; None if depth contradicts it."""
     odometry = clip.odometry_from_camera
     if odometry is None:
         return None
-    parts = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, EDGE_M, max_iter=SUBDIVISIONS)
-    vertices, faces = parts[0].astype(np.float32), parts[1].astype(np.int32)
+    subdivided = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, EDGE_M, max_iter=SUBDIVISIONS)
+    vertices, faces = subdivided[0].astype(np.float32), subdivided[1].astype(np.int32)
     points, normals = vertices.astype(float), Mesh(vertices, faces).vertex_normals()
     upright_from_world, gravity = anchor.upright(clip, odometry, points, normals)
     upright = rigid.apply(upright_from_world, points).astype(np.float32)
     fine = Mesh(upright, faces, np.full((len(vertices), 3), 128, np.uint8))
-    scale, agree = depth_against(clip, fine, upright_from_world @ odometry, SEEN_WITHIN_M)
+    scale, agree = compare_depth(clip, fine, upright_from_world @ odometry, SEEN_WITHIN_M)
     poses, gap = fuse.align_frames(clip, fine, upright_from_world @ odometry, config.fusion)
-    off_m = float(np.nanmedian(gap)) if np.isfinite(gap).any() else np.inf
-    if not abs(scale - 1) < MAX_SCALE_ERROR or agree < MIN_AGREE or off_m > MAX_GAP_M:
+    median_gap_m = float(np.nanmedian(gap)) if np.isfinite(gap).any() else np.inf
+    if not abs(scale - 1) < MAX_SCALE_ERROR or agree < MIN_AGREE or median_gap_m > MAX_GAP_M:
         measured = f"depth / mesh {scale:.3f}, {agree:.0%} of depth agrees"
-        log(f"the recording's own mesh is refuted, one is fused instead: {measured}")
+        log(f"the recording's own mesh is rejected and one is fused instead: {measured}")
         return None
     seen, color = seen_and_colored(clip, fine, poses)
     observed = seen[fine.faces].any(1)
-    used, cut = np.unique(fine.faces[observed], return_inverse=True)
-    own = Mesh(fine.vertices[used], cut.reshape(-1, 3).astype(np.int32), color[used])
-    unseen = f"{1 - observed.mean():.0%} of it was never seen and is cut"
-    log(f"the recording's own mesh: {unseen}; {100 * off_m:.1f} cm from depth")
+    used, new_index = np.unique(fine.faces[observed], return_inverse=True)
+    visible_mesh = Mesh(fine.vertices[used], new_index.reshape(-1, 3).astype(np.int32), color[used])
+    unseen = f"{1 - observed.mean():.0%} of its faces were never seen and are removed"
+    log(f"the recording's own mesh: {unseen}; {100 * median_gap_m:.1f} cm from depth")
     return SceneTemplate(
-        mesh=own,
-        features=fuse.vertex_features(clip, features, own, poses, config.fusion.feature_frames),
+        mesh=visible_mesh,
+        features=fuse.vertex_features(clip, features, visible_mesh, poses, config.fusion.feature_frames),
         world_from_camera=poses,
         registered=np.nan_to_num(gap, nan=np.inf) < REGISTERED_WITHIN_M,
         gap_m=gap,
@@ -63,39 +63,39 @@ def build(
         keyframe=np.ones(len(clip), bool),
         reprojection_px=None,
         gravity=gravity,
-        floor_m=floor_height(own),
+        floor_m=floor_height(visible_mesh),
         scale=clip.scale,
         own_mesh=True,
     )
 
 
-def depth_against(
+def compare_depth(
     clip: Clip, mesh: Mesh, world_from_camera: Float[np.ndarray, "frame 4 4"], within_m: float
 ) -> tuple[float, float]:
-    """Return the median of depth over the mesh's distance along the rays, and the share that meets it."""
-    caster, ratios, meets = RayCaster(mesh), [], []
+    """Return the median ratio of measured to rendered depth, and the share of depth that agrees."""
+    caster, ratios, agrees = RayCaster(mesh), [], []
     for frame in subsampling.evenly(len(clip), SCALE_VIEWS):
         depth = clip.depth(int(frame))[::SCALE_STRIDE_PX, ::SCALE_STRIDE_PX]
         intrinsics = cameras.scale_intrinsics(clip.depth_intrinsics[frame], clip.depth_size, depth.shape)
-        drawn = render_view(caster, world_from_camera[frame], intrinsics, *depth.shape)[0]
-        both = (depth > 0) & (drawn > 0)
-        ratios.append(depth[both] / drawn[both])
-        meets.append((np.abs(depth - drawn) < within_m)[depth > 0])
-    ratio, met = np.concatenate(ratios), np.concatenate(meets)
-    return (float(np.median(ratio)), float(met.mean())) if len(ratio) else (np.nan, 0.0)
+        rendered = render_view(caster, world_from_camera[frame], intrinsics, *depth.shape)[0]
+        both = (depth > 0) & (rendered > 0)
+        ratios.append(depth[both] / rendered[both])
+        agrees.append((np.abs(depth - rendered) < within_m)[depth > 0])
+    ratio, agreed = np.concatenate(ratios), np.concatenate(agrees)
+    return (float(np.median(ratio)), float(agreed.mean())) if len(ratio) else (np.nan, 0.0)
 
 
 def seen_and_colored(
     clip: Clip, mesh: Mesh, world_from_camera: Float[np.ndarray, "frame 4 4"]
 ) -> tuple[Bool[np.ndarray, "vertex"], UInt8[np.ndarray, "vertex 3"]]:
-    """Return which vertices some frame's depth confirms, and the mean colour that those frames give them."""
+    """Return which vertices some frame's depth confirms, and their mean colour, weighted by 1 / depth."""
     total, weight = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
     for frame in subsampling.evenly(len(clip), COLOR_VIEWS):
         local = rigid.apply(rigid.inverse(world_from_camera[frame]), mesh.vertices.astype(float))
         depth, color = clip.depth(int(frame)), clip.color(int(frame))
         in_depth, z = cameras.project(local, clip.depth_intrinsics[frame])
         in_color, _ = cameras.project(local, clip.intrinsics[frame])
-        inside = cameras.in_picture(in_depth, z, depth.shape, NEAREST_M)
+        inside = cameras.in_picture(in_depth, z, depth.shape, MIN_DEPTH_M)
         inside = np.flatnonzero(inside & cameras.in_picture(in_color, z, color.shape[:2]))
         column, row = np.floor(in_depth[inside]).astype(int).T
         inside = inside[np.abs(depth[row, column] - z[inside]) < SEEN_WITHIN_M]

@@ -1,4 +1,4 @@
-"""Quality page of the scene template: a turntable, the bird's-eye coverage, real beside rendered frames."""
+"""Quality page of the scene template: turntable, bird's-eye coverage, recorded and rendered frames."""
 
 from dataclasses import replace
 
@@ -17,9 +17,9 @@ UP = np.array([0.0, 1.0, 0.0])
 FOCAL_PX, HEIGHT_PX, WIDTH_PX = 300.0, 240, 320
 """of the turntable's pictures"""
 EXTENT, REACH = (0.01, 0.99), 0.95
-"""quantiles of the mesh that the turntable goes around, and its radius in diagonals of that extent"""
-EYE_ASIDE, EYE_ABOVE = 0.75, 0.65
-"""where the turntable's camera stands, in its radii"""
+"""vertex quantiles that bound the shown extent, and the turntable's radius in diagonals of it"""
+EYE_OFFSET, EYE_HEIGHT = 0.75, 0.65
+"""offset of the turntable's camera, in its radii"""
 PATH_COLOR = (220, 40, 40)
 CAPTIONS = {
     "turntable": "The fused mesh from four sides, seen through its walls' backs.",
@@ -29,46 +29,46 @@ CAPTIONS = {
 
 
 def pictures(template: SceneTemplate, clip: Clip) -> list[Picture]:
-    """Draw the template for people."""
+    """Draw the pictures of the quality page."""
     caster = RayCaster(template.mesh)
     turned, compared = turntable(template.mesh), frames(template, clip, caster)
     return captioned(CAPTIONS, turntable=turned, coverage=coverage(template), frames=compared)
 
 
 def turntable(mesh: Mesh) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw what of a mesh faces the eye, from four raised corners."""
+    """Render a mesh's front faces from four elevated viewpoints."""
     low, high = np.quantile(mesh.vertices, EXTENT, axis=0)
     centre, reach = (low + high) / 2, np.linalg.norm(high - low) * REACH
     intrinsics = np.array([[FOCAL_PX, 0, WIDTH_PX // 2], [0, FOCAL_PX, HEIGHT_PX // 2], [0, 0, 1]])
     views = []
     for angle in np.pi * (np.arange(4) / 2 + 0.25):
-        eye = centre + reach * np.array([np.cos(angle) * EYE_ASIDE, EYE_ABOVE, np.sin(angle) * EYE_ASIDE])
-        towards = (mesh.face_normals() * (eye - mesh.vertices[mesh.faces[:, 0]])).sum(1) > 0
-        caster = RayCaster(replace(mesh, faces=mesh.faces[towards]))
+        eye = centre + reach * np.array([np.cos(angle) * EYE_OFFSET, EYE_HEIGHT, np.sin(angle) * EYE_OFFSET])
+        facing = (mesh.face_normals() * (eye - mesh.vertices[mesh.faces[:, 0]])).sum(1) > 0
+        caster = RayCaster(replace(mesh, faces=mesh.faces[facing]))
         views.append(overview.view(caster, rigid.look_at(eye, centre, UP), intrinsics, HEIGHT_PX, WIDTH_PX))
     return plots.grid(views, 2)
 
 
 def coverage(template: SceneTemplate) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw the path of the walk-through over the seen surface."""
+    """Draw the walk-through's path over a bird's-eye view."""
     picture = overview.bird_view(template.mesh, floor_m=template.floor_m)
     picture.draw(template.world_from_camera[:, :3, 3], PATH_COLOR)
     return picture.image
 
 
 def frames(template: SceneTemplate, clip: Clip, caster: RayCaster) -> UInt8[np.ndarray, "height width 3"]:
-    """Put frames beside the mesh as their cameras see it."""
+    """Draw frames above the mesh rendered from their cameras."""
     chosen = np.linspace(0, len(clip) - 1, 7).astype(int)[1:-1]
     height, width = clip.color_size
-    drawn = [
+    rendered = [
         overview.view(caster, template.world_from_camera[frame], clip.intrinsics[frame], height, width)
         for frame in chosen
     ]
-    return plots.grid([clip.color(int(frame)) for frame in chosen] + drawn, len(chosen))
+    return plots.grid([clip.color(int(frame)) for frame in chosen] + rendered, len(chosen))
 
 
 def checks(template: SceneTemplate) -> list[Check]:
-    """Judge the template."""
+    """Return the quality checks."""
     start = template.start
     surface = [
         Check("metres known", float(template.scale != "relative"), "", 0.5, better="higher"),
@@ -89,7 +89,7 @@ def checks(template: SceneTemplate) -> list[Check]:
 
 
 def _scale(template: SceneTemplate) -> str:
-    """Return what makes lengths metres, in words."""
+    """Return the source of metric scale, in words."""
     if template.scale == "relative":
         return "relative: from pictures alone, lengths are no metres"
     if template.scale != "measured":
@@ -98,7 +98,7 @@ def _scale(template: SceneTemplate) -> str:
 
 
 def world(template: SceneTemplate) -> dict:
-    """Describe the world frame and how it was found, for ``world.json``."""
+    """Return ``world.json``: the world frame and how it was determined."""
     start = template.start
     low, high = template.mesh.vertices.min(0), template.mesh.vertices.max(0)
     return {

@@ -1,8 +1,8 @@
-"""Refine the walk-through's keyframes against each other by what they share.
+"""Refine the walk-through's keyframe poses jointly.
 
-Matched points (`pipeline.mapping.bundle_adjustment`), overlapping depth (along surface normals) and odometry
-between neighbours count by measured variances: points by their reprojection errors, depth and odometry by how
-far they contradict cameras from points.
+Tracked points (`pipeline.mapping.bundle_adjustment`), overlapping depth (point to plane) and odometry are
+weighted by estimated variances: points by reprojection errors, depth and odometry by their residuals under
+cameras from points.
 """
 
 from dataclasses import dataclass
@@ -14,35 +14,36 @@ from pipeline.data.clips import Clip, usable_depth
 from pipeline.geometry import cameras, rigid
 from pipeline.mapping import depth_scans, pose_optimization
 from pipeline.mapping.bundle_adjustment import PointTerm, TrackedPoints
+from pipeline.mapping.pose_optimization import optimize_poses
 from stages.build_scene_template.config import RefinementConfig
 
 DRIFT_RAD_S, DRIFT_M_S = np.deg2rad(0.5), 0.02
-"""Drift of the odometry that the graph allows, several times that of phones: depth decides."""
+"""Odometry drift assumed by the pose graph, several times that of phones, so that depth dominates."""
 DEPTH_INFLATION = 4.0
-"""Depth noise is multiplied by this, since neighbouring pixels err together."""
+"""Factor on depth noise, since errors of neighbouring pixels are correlated."""
 STRIDE_PX = 10
-"""One depth pixel in so many, each way, is used."""
+"""Grid spacing of the depth pixels."""
 REACH_M = (0.15, 0.04)
-"""Width of the robust weight in the first and last round, metres."""
-CANDIDATE_REACH = 1.5
-"""Point pairs up to so many reaches apart are candidates."""
-NEAREST_M = 0.1
-"""Depth below this is none, metres."""
+"""Width of the robust kernel in the first and last round, metres."""
+CANDIDATE_RATIO = 1.5
+"""Largest point-to-plane distance of a correspondence, in reaches."""
+MIN_DEPTH_M = 0.1
+"""Smaller depth counts as missing, metres."""
 MIN_COSINE = 0.7
-"""Normals of a pair, both known, agree within 45 degrees: rims and backs of thin walls are other surfaces."""
+"""Least cosine between the normals of a correspondence; rejects edges and backs of thin walls."""
 FIRST_ROUNDS, FIRST_INFLATION = 6, 3.0
-"""Steps that place keyframes by points and odometry, and factor on the deviation of depth in them."""
+"""Initial steps that rely on points and odometry, and factor on the depth noise in them."""
 SHARED_POINTS, MIN_PAIRS = 30, 10
-"""Depth of pairs that share so many points is judged by them; fewer pairs judge nothing."""
+"""Depth variance is estimated from pairs that share so many points, if there are enough such pairs."""
 MIN_VARIANCE = 0.25
-"""Least factor on the assumed variance of depth: neighbouring pixels err together more than pairs show."""
+"""Least factor on the assumed depth variance, since correlated errors are underestimated."""
 OVERLAP_STEP, MIN_OVERLAP = 7, 0.3
-"""One point in so many measures the overlap of two keyframes; the least share that makes them neighbours."""
+"""Stride of the points that measure the overlap of two keyframes, and least overlap of a pair."""
 
 
 @dataclass(frozen=True)
 class Keyframe:
-    """One keyframe: subsampled points, and the full depth to compare with (metres, camera axes)."""
+    """Subsampled points, full depth and normals of one keyframe (metres, camera frame)."""
 
     scan: depth_scans.Scan
     depth: Float[np.ndarray, "height width"]
@@ -51,7 +52,7 @@ class Keyframe:
 
 
 def load_keyframe(clip: Clip, frame: int) -> Keyframe:
-    """Read one frame's depth, its subsampled points and its normals (camera axes, zero where unknown)."""
+    """Load one frame's depth, subsampled points and normals."""
     depth, intrinsics = usable_depth(clip, frame), clip.depth_intrinsics[frame]
     scan = depth_scans.scan(depth, intrinsics, stride=STRIDE_PX)
     return Keyframe(scan, depth, depth_scans.image_normals(depth, intrinsics), intrinsics)
@@ -63,7 +64,7 @@ def depth_correspondences(
     world_from_camera: Float[np.ndarray, "key 4 4"],
     reach_m: float,
 ) -> pose_optimization.Correspondences:
-    """Project each pair's points into the other's depth image and pair them with the plane seen there."""
+    """Return projective point-to-plane correspondences of keyframe pairs."""
     parts = [_pair_correspondences(keyframes, int(a), int(b), world_from_camera, reach_m) for a, b in pairs]
     return pose_optimization.Correspondences.join(*parts)
 
@@ -73,24 +74,24 @@ def _pair_correspondences(keyframes, first, second, world_from_camera, reach_m):
     second_from_first = rigid.inverse(world_from_camera[second]) @ world_from_camera[first]
     moved = rigid.apply(second_from_first, source.points_camera)
     pixel, z = cameras.project(moved, target.intrinsics)
-    inside = np.flatnonzero(cameras.in_picture(pixel, z, target.depth.shape, NEAREST_M))
+    inside = np.flatnonzero(cameras.in_picture(pixel, z, target.depth.shape, MIN_DEPTH_M))
     column, row = np.floor(pixel[inside]).astype(int).T
-    met = cameras.unproject(pixel[inside], target.intrinsics) * target.depth[row, column, None]
+    hit = cameras.unproject(pixel[inside], target.intrinsics) * target.depth[row, column, None]
     normal = target.normals[row, column]
-    gap = np.abs(np.einsum("ci,ci->c", moved[inside] - met, normal))
+    gap = np.abs(np.einsum("ci,ci->c", moved[inside] - hit, normal))
     own = keyframes[first].normals.reshape(-1, 3)[source.pixel_index[inside]] @ second_from_first[:3, :3].T
-    good = (np.einsum("ci,ci->c", own, normal) > MIN_COSINE) & (gap < CANDIDATE_REACH * reach_m)
-    inside, met = inside[good], met[good]
-    sigma = DEPTH_INFLATION * np.hypot(source.sigma_m[inside], depth_scans.depth_noise(met[:, 2]))
+    good = (np.einsum("ci,ci->c", own, normal) > MIN_COSINE) & (gap < CANDIDATE_RATIO * reach_m)
+    inside, hit = inside[good], hit[good]
+    sigma = DEPTH_INFLATION * np.hypot(source.sigma_m[inside], depth_scans.depth_noise(hit[:, 2]))
     direction = normal[good] @ world_from_camera[second, :3, :3].T
     a, b = (np.full(len(inside), key) for key in (first, second))
-    return pose_optimization.Correspondences(a, b, source.points_camera[inside], met, direction, sigma)
+    return pose_optimization.Correspondences(a, b, source.points_camera[inside], hit, direction, sigma)
 
 
-def overlapping(
+def overlapping_pairs(
     world_from_camera: Float[np.ndarray, "key 4 4"], keyframes: list[Keyframe], neighbours: int
 ) -> Int[np.ndarray, "pair 2"]:
-    """Pick for each keyframe its successor and the others that see most of its points."""
+    """Pair each keyframe with its successor and with overlapping keyframes."""
     pairs = []
     for first, keyframe in enumerate(keyframes):
         points = keyframe.scan.points_camera[::OVERLAP_STEP]
@@ -98,7 +99,7 @@ def overlapping(
         for second in range(len(keyframes)):
             local = rigid.apply(rigid.inverse(world_from_camera[second]) @ world_from_camera[first], points)
             pixel, z = cameras.project(local, keyframe.intrinsics)
-            inside = cameras.in_picture(pixel, z, keyframe.depth.shape, NEAREST_M)
+            inside = cameras.in_picture(pixel, z, keyframe.depth.shape, MIN_DEPTH_M)
             seen[second] = inside.mean() if len(points) else 0
         seen[first] = 0
         ranked = np.argsort(-seen, kind="stable")
@@ -116,27 +117,25 @@ def refine_keyframes(
     tracked: TrackedPoints,
     config: RefinementConfig,
 ) -> Float[np.ndarray, "key 4 4"]:
-    """Optimize the keyframes against each other by points, depth and odometry; the first one is fixed."""
+    """Optimize keyframe poses by points, depth and odometry; the first one is fixed."""
     fixed, odometry = np.arange(len(frames)) == 0, odometry_factors(clip, frames)
     poses, term, inflation = world_from_camera, None, 1.0
-    pairs = overlapping(poses, keyframes, config.neighbours)
+    pairs = overlapping_pairs(poses, keyframes, config.neighbours)
 
-    def find(poses, reach_m):
+    def associate(poses, reach_m):
         return depth_correspondences(keyframes, pairs, poses, reach_m).inflated(inflation)
 
     if len(tracked.camera):
         term, inflation, reach = PointTerm(tracked, poses), FIRST_INFLATION, (REACH_M[0],) * FIRST_ROUNDS
-        first = pose_optimization.optimize_poses(
-            poses, find, odometry, reach_m=reach, fixed=fixed, term=term
-        )  # fmt: skip
+        first = optimize_poses(poses, associate, odometry, reach_m=reach, fixed=fixed, term=term)
         poses = first.world_from_camera
-        pairs = overlapping(poses, keyframes, config.neighbours)
+        pairs = overlapping_pairs(poses, keyframes, config.neighbours)
         inflation = np.sqrt(depth_variance(keyframes, pairs, poses, tracked))
         if odometry is not None:
             variance = pose_optimization.variance_factor(odometry.chi_squares(poses))
             odometry = odometry.inflated(np.sqrt(max(1.0, variance)))
     reach = tuple(np.geomspace(*REACH_M, config.rounds))
-    found = pose_optimization.optimize_poses(poses, find, odometry, reach_m=reach, fixed=fixed, term=term)
+    found = optimize_poses(poses, associate, odometry, reach_m=reach, fixed=fixed, term=term)
     return found.world_from_camera
 
 
@@ -146,13 +145,10 @@ def depth_variance(
     world_from_camera: Float[np.ndarray, "key 4 4"],
     tracked: TrackedPoints,
 ) -> float:
-    """Return the variance of overlapping depth over the assumed one, judged by cameras that share points.
-
-    It is 1 where too few pairs do.
-    """
-    shared = tracked.shared(len(keyframes))
-    judged = [(int(a), int(b)) for a, b in pairs if shared[a, b] >= SHARED_POINTS]
-    parts = [_pair_correspondences(keyframes, a, b, world_from_camera, REACH_M[0]) for a, b in judged]
+    """Return the ratio of actual to assumed depth variance, from covisible pairs; 1 if they are too few."""
+    covisibility = tracked.covisibility(len(keyframes))
+    covisible = [(int(a), int(b)) for a, b in pairs if covisibility[a, b] >= SHARED_POINTS]
+    parts = [_pair_correspondences(keyframes, a, b, world_from_camera, REACH_M[0]) for a, b in covisible]
     parts = [part for part in parts if len(part.first) >= SHARED_POINTS]
     if len(parts) < MIN_PAIRS:
         return 1.0
@@ -163,10 +159,10 @@ def depth_variance(
 
 
 def odometry_factors(
-    clip: Clip, frames: Int[np.ndarray, "key"], otherwise: Float[np.ndarray, "key 4 4"] | None = None
+    clip: Clip, frames: Int[np.ndarray, "key"], fallback: Float[np.ndarray, "key 4 4"] | None = None
 ) -> pose_optimization.RelativePoseFactors | None:
-    """Return the odometry between neighbouring frames of a selection; without it, that of ``otherwise``."""
-    odometry = otherwise if clip.odometry_from_camera is None else clip.odometry_from_camera[frames]
+    """Return odometry factors between consecutive frames of a selection; ``fallback`` replaces odometry."""
+    odometry = fallback if clip.odometry_from_camera is None else clip.odometry_from_camera[frames]
     if odometry is None:
         return None
     drift = dict(drift_rad_s=DRIFT_RAD_S, drift_m_s=DRIFT_M_S)

@@ -1,8 +1,8 @@
-"""Structure from motion over keyframes of the walk-through, matches verified by depth.
+"""Structure from motion over keyframes of the walk-through, with matches verified by depth.
 
-`choose_keyframes` subsamples the clip, `reconstruct` returns the largest model in its own scale, or None.
-A repeating rug matches one tile further on, at the wrong distance: `confirm` keeps the matches of each pair
-that one rigid motion of their depth points explains, and drops pairs that are few or contradict odometry.
+`choose_keyframes` subsamples the clip, `reconstruct` returns the largest model at its own scale, or None.
+Repetitive texture passes epipolar verification one period off. `verify_matches` keeps the inliers of one
+rigid motion of the matched depth points, and drops pairs with few inliers or that contradict odometry.
 """
 
 import itertools
@@ -16,40 +16,40 @@ from pipeline.core.progress import log
 from pipeline.data.clips import Clip
 from pipeline.geometry import align, cameras, rigid
 from pipeline.mapping import colmap
-from pipeline.mapping.bundle_adjustment import TrackedPoints, chained
+from pipeline.mapping.bundle_adjustment import TrackedPoints, build_tracks
 from pipeline.mapping.colmap import SparseModel, read_sparse_model
 from stages.build_scene_template.config import SfmConfig
 
 KEYFRAME_M, KEYFRAME_DEG = 0.12, 9.0
-"""A keyframe follows the last one after this much motion or turning, by odometry, metres and degrees."""
+"""Translation (metres) or rotation (degrees) between keyframes, by odometry."""
 KEYFRAME_S = 0.4
 """Time between keyframes where there is no odometry, seconds."""
 FIRST_OCTAVE = -1
-"""Doubles the picture before SIFT: stored pictures are small; 0 costs a third and finds half."""
+"""First SIFT octave; -1 upsamples the small stored pictures by two. 0 costs a third and finds half."""
 PEAK_THRESHOLD = 0.004
 """SIFT's contrast threshold; plain walls need a low one (COLMAP's default is 0.0067)."""
 LOOP_M, LOOP_DEG = 1.0, 35.0
-"""Loop candidates by odometry: keyframes this close, metres, whose axes differ by less, degrees."""
+"""Loop candidates by odometry: largest distance (metres) and angle between optical axes (degrees)."""
 FIRST_STEP, SECOND_STEP = 5, 3
 """Without odometry every fifth keyframe is matched with every third one."""
 DATABASE = "database.db"
 MIN_KEYFRAMES = 3
-"""A smaller model is none."""
-AGREE_M = 0.06
-"""Matched depth points this close after one rigid motion agree, metres: twice the depth noise at 4 m."""
-MIN_SHARE, MIN_MATCHES = 0.5, 8
-"""Share and number of the matches with depth that must agree."""
-MAX_DEG, MAX_M = 6.0, 0.3
-"""The motion may differ by this much from the odometry's, degrees and metres: drift, not another tile."""
+"""Least registered keyframes of an accepted model."""
+INLIER_M = 0.06
+"""RANSAC inlier threshold, metres: twice the depth noise at 4 m."""
+MIN_INLIER_RATIO, MIN_MATCHES = 0.5, 8
+"""Least inlier ratio and number of inliers among matches with depth."""
+MAX_DIFF_DEG, MAX_DIFF_M = 6.0, 0.3
+"""Largest difference from odometry, degrees and metres: allows drift, but not a repeated texture."""
 RANSAC_TRIPLETS = 80
 MIN_SIDE_M = 0.15
-"""Least side of a RANSAC triplet, metres."""
-NEAREST_M = 0.1
-"""Depth below this is none, metres."""
+"""Least side of a RANSAC sample's triangle, metres."""
+MIN_DEPTH_M = 0.1
+"""Smaller depth counts as missing, metres."""
 
 
 def choose_keyframes(clip: Clip, config: SfmConfig) -> Int[np.ndarray, "key"]:
-    """Subsample a clip by its odometry's motion, or by time where there is none; fewer than the bound."""
+    """Subsample a clip by odometry, or by time without it, to at most ``max_keyframes`` sharpest frames."""
     if clip.odometry_from_camera is None:
         progress = clip.timestamp_s / KEYFRAME_S
     else:
@@ -67,7 +67,7 @@ def choose_keyframes(clip: Clip, config: SfmConfig) -> Int[np.ndarray, "key"]:
 def choose_pairs(
     clip: Clip, keyframes: Int[np.ndarray, "key"], config: SfmConfig
 ) -> Int[np.ndarray, "pair 2"]:
-    """Pair each keyframe with successors and with loop candidates by odometry, or a coarse grid without."""
+    """Pair each keyframe with its successors and loop candidates by odometry; without it, with a grid."""
     count = len(keyframes)
     first, second = np.triu_indices(count, 1)
     chosen = second - first <= config.overlap
@@ -86,7 +86,7 @@ def choose_pairs(
 
 
 def reconstruct(clip: Clip, config: SfmConfig, workspace: Path, seed: int) -> SparseModel | None:
-    """Run COLMAP on the keyframes in an empty workspace; None when no model has at least three of them."""
+    """Run COLMAP on the keyframes in an empty workspace; None if no model has at least three of them."""
     colmap.seed_everything(seed)
     keyframes = choose_keyframes(clip, config)
     names = [f"{frame:06d}.jpg" for frame in keyframes]
@@ -94,8 +94,8 @@ def reconstruct(clip: Clip, config: SfmConfig, workspace: Path, seed: int) -> Sp
     sift = dict(max_num_features=config.features, first_octave=FIRST_OCTAVE, peak_threshold=PEAK_THRESHOLD)
     colmap.extract(database, pictures, names, colmap.pinhole(np.median(clip.intrinsics, axis=0)), sift)
     colmap.match(database, ((names[a], names[b]) for a, b in choose_pairs(clip, keyframes, config)), seed)
-    confirmed, pairs = confirm(clip, database, np.random.default_rng(seed))
-    log(f"depth confirms {confirmed} of {pairs} matched pairs of {len(keyframes)} keyframes")
+    verified, pairs = verify_matches(clip, database, np.random.default_rng(seed))
+    log(f"depth confirms {verified} of {pairs} matched pairs of {len(keyframes)} keyframes")
     models = pycolmap.incremental_mapping(database, pictures, workspace, colmap.mapping_options(seed))
     if not models:
         return None
@@ -103,61 +103,58 @@ def reconstruct(clip: Clip, config: SfmConfig, workspace: Path, seed: int) -> Sp
     return read_sparse_model(largest) if largest.num_reg_images() >= MIN_KEYFRAMES else None
 
 
-def points_under(
+def lift_pixels(
     clip: Clip, frame: int, pixel: Float[np.ndarray, "sample 2"]
 ) -> Float[np.ndarray, "sample 3"]:
-    """Lift colour pixels by the depth under them to camera axes; NaN where unknown or of low confidence."""
+    """Back-project colour pixels to the camera frame; NaN where depth is unknown or of low confidence."""
     depth, confidence = clip.depth(frame), clip.confidence(frame)
     limit = np.array(clip.depth_size[::-1])
-    at = np.floor(pixel * limit / np.array(clip.color_size[::-1])).astype(int)
-    column, row = np.clip(at, 0, limit - 1).T
+    depth_pixel = np.floor(pixel * limit / np.array(clip.color_size[::-1])).astype(int)
+    column, row = np.clip(depth_pixel, 0, limit - 1).T
     z = np.where(confidence[row, column] >= 1, depth[row, column], 0)
     points = cameras.unproject(pixel, clip.intrinsics[frame]) * z[:, None]
-    return np.where((z > NEAREST_M)[:, None], points, np.nan)
+    return np.where((z > MIN_DEPTH_M)[:, None], points, np.nan)
 
 
-def confirm(clip: Clip, database: Path, rng: np.random.Generator) -> tuple[int, int]:
-    """Rewrite COLMAP's verified matches to those that depth confirms; return the pairs left, and all."""
+def verify_matches(clip: Clip, database: Path, rng: np.random.Generator) -> tuple[int, int]:
+    """Keep only matches that depth confirms; return the number of pairs left and of all pairs."""
     with pycolmap.Database.open(database) as table:
         frames = {image.image_id: int(image.name[:6]) for image in table.read_all_images()}
         points = {
-            key: points_under(clip, frame, table.read_keypoints(key)[:, :2].astype(float))
+            key: lift_pixels(clip, frame, table.read_keypoints(key)[:, :2].astype(float))
             for key, frame in frames.items()
         }
         pairs = sorted(pycolmap.pair_id_to_image_pair(pair) for pair in table.read_two_view_geometries()[0])
-        confirmed = 0
+        verified = 0
         for pair in pairs:
             geometry = table.read_two_view_geometry(*pair)
-            good = _confirmed(clip, frames, points, *pair, geometry.inlier_matches, rng)
+            inlier_matches = _verified_matches(clip, frames, points, *pair, geometry.inlier_matches, rng)
             table.delete_two_view_geometry(*pair)
-            if len(good):
-                geometry.inlier_matches = good
+            if len(inlier_matches):
+                geometry.inlier_matches = inlier_matches
                 table.write_two_view_geometry(*pair, geometry)
-                confirmed += 1
-    return confirmed, len(pairs)
+                verified += 1
+    return verified, len(pairs)
 
 
 def tracked_points(clip: Clip, database: Path, keyframes: Int[np.ndarray, "key"]) -> TrackedPoints:
-    """Chain COLMAP's matches to points, with the depth under each pixel.
-
-    Matches of keyframes that no model registered count too. What shows twice in a keyframe is no point.
-    """
+    """Chain COLMAP's matches to tracks with depth, also those of unregistered keyframes."""
     with pycolmap.Database.open(database) as table:
         images = sorted(table.read_all_images(), key=lambda image: image.name)
         pixels = [table.read_keypoints(image.image_id)[:, :2].astype(float) for image in images]
         pairs = sorted(pycolmap.pair_id_to_image_pair(pair) for pair in table.read_two_view_geometries()[0])
         matches = {pair: table.read_two_view_geometry(*pair).inlier_matches.astype(int) for pair in pairs}
     assert len(images) == len(keyframes), f"{len(images)} pictures of {len(keyframes)} keyframes"
-    place = {image.image_id: index for index, image in enumerate(images)}
-    links = [(place[a], place[b], found) for (a, b), found in matches.items()]
+    index_of = {image.image_id: index for index, image in enumerate(images)}
+    links = [(index_of[a], index_of[b], found) for (a, b), found in matches.items()]
     depths = [
-        points_under(clip, int(frame), pixel)[:, 2] for frame, pixel in zip(keyframes, pixels, strict=True)
+        lift_pixels(clip, int(frame), pixel)[:, 2] for frame, pixel in zip(keyframes, pixels, strict=True)
     ]
-    return chained(pixels, depths, clip.intrinsics[keyframes], np.zeros(len(pixels), int), links)
+    return build_tracks(pixels, depths, clip.intrinsics[keyframes], np.zeros(len(pixels), int), links)
 
 
-def _confirmed(clip, frames, points, first, second, matches, rng) -> Num[np.ndarray, "match 2"]:
-    """Return the matches of a pair that depth confirms, none where the pair as a whole is not believed."""
+def _verified_matches(clip, frames, points, first, second, matches, rng) -> Num[np.ndarray, "match 2"]:
+    """Return the depth-consistent matches of a pair; none if the pair is rejected."""
     if len(matches) == 0:
         return matches
     source, target = points[second][matches[:, 1]], points[first][matches[:, 0]]
@@ -166,15 +163,15 @@ def _confirmed(clip, frames, points, first, second, matches, rng) -> Num[np.ndar
         return matches[:0]
     first_from_second, inlier = align.ransac_rigid(
         source[known], target[known],
-        threshold_m=AGREE_M, iterations=RANSAC_TRIPLETS, rng=rng, min_side_m=MIN_SIDE_M,
+        threshold_m=INLIER_M, iterations=RANSAC_TRIPLETS, rng=rng, min_side_m=MIN_SIDE_M,
     )  # fmt: skip
-    if inlier.sum() < max(MIN_MATCHES, MIN_SHARE * known.sum()):
+    if inlier.sum() < max(MIN_MATCHES, MIN_INLIER_RATIO * known.sum()):
         return matches[:0]
     if clip.odometry_from_camera is not None:
         odometry = clip.odometry_from_camera
         expected = rigid.inverse(odometry[frames[first]]) @ odometry[frames[second]]
         turned = np.rad2deg(rigid.rotation_angle(expected[:3, :3], first_from_second[:3, :3]))
-        if turned > MAX_DEG or np.linalg.norm(expected[:3, 3] - first_from_second[:3, 3]) > MAX_M:
+        if turned > MAX_DIFF_DEG or np.linalg.norm(expected[:3, 3] - first_from_second[:3, 3]) > MAX_DIFF_M:
             return matches[:0]
     known[known] = inlier
     return matches[known]

@@ -1,4 +1,4 @@
-"""From the walk-through's frames and features to the scene template's files."""
+"""Build the scene template from the walk-through's frames and features, and write its files."""
 
 import json
 import tempfile
@@ -31,25 +31,25 @@ def run(inputs: Inputs, config: Config, out: Path) -> template.SceneTemplate:
     """Build the template and write it. Raises InputError MAP-001, MAP-002, MAP-003 and MAP-005."""
     (video, frames), *others = inputs.frames.items()
     if others:
-        log(f"several walk-throughs: {video} is used")
+        log(f"several walk-throughs: using {video}")
     clip = Clip.open(frames)
     features = open_features(inputs.features[video])
-    made, sparse, mesh = None, None, frames / "mesh.ply"
+    built, sparse, mesh = None, None, frames / "mesh.ply"
     if mesh.exists() and config.own_mesh:
-        made = own_mesh.build(clip, features, ply.read_ply(mesh), config)
-    if made is None:
+        built = own_mesh.build(clip, features, ply.read_ply(mesh), config)
+    if built is None:
         with tempfile.TemporaryDirectory() as workspace:
-            made, sparse = template.build(clip, features, config, Path(workspace))
-    normals = made.mesh.vertex_normals()
-    ply.write_ply(out / "mesh.ply", made.mesh, nx=normals[:, 0], ny=normals[:, 1], nz=normals[:, 2])
-    write_vertex_features(out, made.features.astype(np.float16))
-    cameras = made.world_from_camera, clip.intrinsics, made.registered, made.keyframe
+            built, sparse = template.build(clip, features, config, Path(workspace))
+    normals = built.mesh.vertex_normals()
+    ply.write_ply(out / "mesh.ply", built.mesh, nx=normals[:, 0], ny=normals[:, 1], nz=normals[:, 2])
+    write_vertex_features(out, built.features.astype(np.float16))
+    cameras = built.world_from_camera, clip.intrinsics, built.registered, built.keyframe
     SceneCameras(clip.timestamp_s, *cameras).write(out)
-    (out / "world.json").write_text(json.dumps(pictures.world(made), indent=1) + "\n")
-    template.write_model(sparse, made.world_from_camera, out / "colmap")
+    (out / "world.json").write_text(json.dumps(pictures.world(built), indent=1) + "\n")
+    template.write_model(sparse, built.world_from_camera, out / "colmap")
     qa.write(
         out, good="walls are straight, furniture is whole, frames and renderings agree",
         bad="walls are doubled or bent, the path jumps, large parts are missing",
-        checks=pictures.checks(made), pictures=pictures.pictures(made, clip),
+        checks=pictures.checks(built), pictures=pictures.pictures(built, clip),
     )  # fmt: skip
-    return made
+    return built

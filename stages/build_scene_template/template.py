@@ -1,4 +1,4 @@
-"""From a walk-through to its template: structure from motion, refinement, fusion and alignment, in order."""
+"""Build a template from a walk-through: structure from motion, refinement, fusion, alignment."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,11 +17,11 @@ from stages.build_scene_template import anchor, fuse, refine, sfm
 from stages.build_scene_template.config import Config
 
 MIN_POINTS = 100
-"""Measured points with a normal, and faces of the fused mesh, below which there is no surface."""
+"""Least number of depth points with a normal, and of faces of the fused mesh."""
 REGISTERED_WITHIN_M = 0.1
-"""A frame whose median depth gap is larger is not registered, metres."""
+"""Largest median depth residual of a registered frame, metres."""
 UP_COSINE, FLOOR_SHARE = 0.9, 0.05
-"""Surface is level above this cosine; the floor is the height below which this share of it lies."""
+"""Least upward normal component of level surface, and quantile of its heights that is the floor's."""
 
 
 @dataclass(frozen=True)
@@ -33,49 +33,49 @@ class SceneTemplate:
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     registered: Bool[np.ndarray, "frame"]
     gap_m: Float[np.ndarray, "frame"]
-    """Median distance of each frame's depth from the surface."""
+    """Median distance of each frame's depth from the surface, metres."""
     start: anchor.InitialTrajectory
     keyframe: Bool[np.ndarray, "frame"]
-    """Frames whose cameras were optimized together."""
+    """Frames whose cameras were jointly optimized."""
     reprojection_px: float | None
     gravity: str
     floor_m: float
     """Height of the floor, world y."""
     scale: str
-    """What makes lengths metres (`Clip.scale`)."""
+    """Source of metric scale (`Clip.scale`)."""
     own_mesh: bool = False
-    """Whether the recording brought its surface along."""
+    """Whether the mesh came with the recording."""
 
 
 def build(
     clip: Clip, features: Float[np.ndarray, "frame height width channel"], config: Config, workspace: Path
 ) -> tuple[SceneTemplate, SparseModel | None]:
-    """Build the template; return SfM's model too. Raises InputError MAP-001, MAP-002, MAP-003, MAP-005."""
+    """Build the template; also return the SfM model. Raises InputError MAP-001, MAP-002, MAP-003, MAP-005."""
     sparse = sfm.reconstruct(clip, config.sfm, workspace, config.seed)
     frames = sfm.choose_keyframes(clip, config.sfm)
     keyframes = [refine.load_keyframe(clip, int(frame)) for frame in frames]
-    start = anchor.choose_start(clip, frames, keyframes, sparse)
+    start = anchor.choose_trajectory(clip, frames, keyframes, sparse)
     if start is None:
         what = "the walk-through has no odometry, and COLMAP found no metric model in it"
         raise InputError("MAP-001", what, str(clip.folder), "record a slower walk-through in better light")
     why = f": {start.reason}" if start.reason else ""
     log(f"start from {start.source}{why}; {len(start.registered)} of {len(frames)} keyframes in the model")
     tracked = sfm.tracked_points(clip, workspace / sfm.DATABASE, frames)
-    keys = start.world_from_camera[frames]
-    keys = refine.refine_keyframes(clip, frames, keyframes, keys, tracked, config.refinement)
-    poses = anchor.propagate(clip, frames, keys)
-    points, normals = _measured(keyframes, keys)
+    key_poses = start.world_from_camera[frames]
+    key_poses = refine.refine_keyframes(clip, frames, keyframes, key_poses, tracked, config.refinement)
+    poses = anchor.propagate(clip, frames, key_poses)
+    points, normals = _oriented_points(keyframes, key_poses)
     if len(points) < MIN_POINTS:
-        raise _no_surface(clip)
+        raise _no_surface_error(clip)
     upright_from_world, gravity = anchor.upright(clip, poses, points, normals)
     mesh = fuse.fuse(clip, frames, upright_from_world @ poses, config.fusion)
     if len(mesh.faces) < MIN_POINTS:
-        raise _no_surface(clip)
+        raise _no_surface_error(clip)
     poses, gap = fuse.align_frames(clip, mesh, upright_from_world @ poses, config.fusion, frames)
     mesh = fuse.fuse(clip, np.arange(len(clip)), poses, config.fusion)
     mesh = fuse.clean(mesh, workspace, config.fusion.island_faces)
     log(f"{len(mesh.faces)} faces; median gap of depth from the surface {np.nanmedian(gap) * 100:.1f} cm")
-    made = SceneTemplate(
+    built = SceneTemplate(
         mesh=mesh,
         features=fuse.vertex_features(clip, features, mesh, poses, config.fusion.feature_frames),
         world_from_camera=poses,
@@ -88,11 +88,11 @@ def build(
         floor_m=floor_height(mesh),
         scale=clip.scale,
     )
-    return made, sparse
+    return built, sparse
 
 
-def _measured(keyframes, world_from_camera):
-    """Return the keyframes' measured points that have a normal, and the normals, in the world."""
+def _oriented_points(keyframes, world_from_camera):
+    """Return the keyframes' depth points with normals, world frame."""
     pairs = list(zip(keyframes, world_from_camera, strict=True))
     normals = np.concatenate([k.normals.reshape(-1, 3)[k.scan.pixel_index] @ p[:3, :3].T for k, p in pairs])
     points = np.concatenate([rigid.apply(p, k.scan.points_camera) for k, p in pairs])
@@ -100,13 +100,13 @@ def _measured(keyframes, world_from_camera):
     return points[known], normals[known]
 
 
-def _no_surface(clip: Clip) -> InputError:
+def _no_surface_error(clip: Clip) -> InputError:
     remedy = "check that the recording has LiDAR depth within 4 m"
     return InputError("MAP-002", "depth fused to no surface", str(clip.folder), remedy)
 
 
 def floor_height(mesh: Mesh) -> float:
-    """Return the height below which only a twentieth of the upward-facing surface lies."""
+    """Return a low quantile of the heights of upward-facing surface, world y."""
     up = mesh.vertex_normals()[:, 1] > UP_COSINE
     if up.any():
         return float(np.quantile(mesh.vertices[up, 1], FLOOR_SHARE))
@@ -116,7 +116,7 @@ def floor_height(mesh: Mesh) -> float:
 def write_model(
     sparse: SparseModel | None, world_from_camera: Float[np.ndarray, "frame 4 4"], folder: Path
 ) -> None:
-    """Write COLMAP's model as text, moved into the world by the best similarity of its camera centres."""
+    """Write COLMAP's model as text, aligned to the world by a similarity of camera centres."""
     folder.mkdir()
     if sparse is None:
         (folder / "README.txt").write_text("COLMAP found no model in this walk-through.\n")

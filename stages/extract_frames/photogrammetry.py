@@ -145,7 +145,7 @@ def _depths(
     views: list[SweepView], sparse: SparseModel, config: PhotogrammetryConfig
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return depth (model units, 0 = unknown) and confidence (0..2) of every view."""
-    others = plane_sweep.neighbours(sparse, config.depth_sources)
+    others = plane_sweep.source_views(sparse, config.depth_sources)
     swept, depth, confidence = [], [], []
     for key, view in enumerate(track(views, "depth from pictures")):
         near, reach = [views[other] for other in others[key]], plane_sweep.depth_range(sparse, key)

@@ -1,1 +1,1 @@
-"""Register one session to the scene template: votes, one motion per video, alignment, agent roots."""
+"""Register one session to the scene template: pose votes, joint alignment of all frames, agent roots."""

@@ -1,8 +1,8 @@
-"""Register one session to the scene and the animal's roots to the world.
+"""Register one session's cameras to the scene, and the animal's root poses to the world.
 
-Frames are localized and vote for one motion of the whole recording; odometry, votes, depth, optical flow and
-features then align all frames at once; the animal is placed in every frame that shows it. Writes poses.npz
-and status.json; a recording that does not fit has no poses.npz, and status.json gives the reason.
+Localized frames vote for the transform of the whole recording; odometry, votes, depth, optical flow and
+features then align all frames jointly; the animal is placed in every frame that shows it. Writes poses.npz
+and status.json; a rejected recording has no poses.npz, and status.json gives the reason.
 """
 
 from pipeline.workflow import cli

@@ -1,4 +1,4 @@
-"""A recorded picture beside the template rendered from its pose, at half size, and how alike they are."""
+"""Recorded pictures and the template rendered from their poses, at half size, and their correlation."""
 
 from dataclasses import dataclass
 
@@ -13,21 +13,21 @@ from pipeline.geometry.meshes import RayCaster, render_view
 BLUR_PX = 9.0
 """Neighbourhood of the local contrast normalization, standard deviation in half-size pixels."""
 MIN_VARIANCE = 9.0
-"""Variance of grey values below which a neighbourhood is noise."""
-GREY, CONTRAST = 128, 48
-"""Grey value of the local mean, and grey values per standard deviation."""
+"""Floor of the local variance of grey values."""
+MEAN_GREY, GREY_PER_SIGMA = 128, 48
+"""Output grey value of the local mean, and grey values per standard deviation."""
 SHARE_FLOOR = 1e-3
-"""Added to the share of known pixels in a neighbourhood."""
-FITS_M, MIN_SHARE = 0.05, 0.1
-"""Pixels are correlated where depth and rendering agree within the first, metres; frames with a smaller share
+"""Added to the share of known pixels, against division by zero."""
+FIT_M, MIN_SHARE = 0.05, 0.1
+"""Pixels are compared where depth and rendering agree within the first, metres; frames with a smaller share
 of such pixels have no score."""
-SOFTNESS_PX, MIN_NORM = 1.5, 1e-9
-"""Blur before the correlation, half-size pixels: the template's colours are that soft."""
+SMOOTHING_PX, MIN_NORM = 1.5, 1e-9
+"""Blur before correlation, half-size pixels, to match the template's smooth colours."""
 
 
 @dataclass(frozen=True)
 class RenderedComparison:
-    """One frame at half the size of its picture."""
+    """One recorded and rendered frame, at half the picture's size."""
 
     intrinsics: Float[np.ndarray, "3 3"]
     depth: Float[np.ndarray, "height width"]
@@ -35,7 +35,7 @@ class RenderedComparison:
     rendered: Float[np.ndarray, "height width 3"]
     recorded: UInt8[np.ndarray, "height width 3"]
     known: Bool[np.ndarray, "height width"]
-    """Where there is template and surely no animal."""
+    """Template visible, and certainly no animal."""
 
 
 def compare(
@@ -55,13 +55,13 @@ def compare(
 def local_contrast_normalization(
     color: Num[np.ndarray, "height width 3"], known: Bool[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width"]:
-    """Remove differences of light: grey minus its local mean over its deviation (Jarrett et al. 2009)."""
+    """Normalize grey values by their local mean and standard deviation (Jarrett et al. 2009)."""
     gray = cv2.cvtColor(color.astype(np.float32), cv2.COLOR_RGB2GRAY)
     weight = known.astype(np.float32)
     share = _blur(weight) + SHARE_FLOOR
     mean = _blur(gray * weight) / share
     deviation = np.sqrt(np.maximum(_blur((gray - mean) ** 2 * weight) / share, MIN_VARIANCE))
-    return np.clip(GREY + CONTRAST * (gray - mean) / deviation * weight, 0, 255).astype(np.uint8)
+    return np.clip(MEAN_GREY + GREY_PER_SIGMA * (gray - mean) / deviation * weight, 0, 255).astype(np.uint8)
 
 
 def _blur(picture):
@@ -71,17 +71,19 @@ def _blur(picture):
 def ncc(
     clip: Clip, masks: Masks, caster: RayCaster, frame: int, world_from_camera: Float[np.ndarray, "4 4"]
 ) -> float:
-    """Return the normalized cross-correlation, -1..1, of one frame with its rendering where both have the
-    same shape, for flats differ only in looks; NaN where too little is comparable."""
+    """Return the normalized cross-correlation of one frame with its rendering, where their depth agrees.
+
+    In -1..1; NaN where too few pixels are comparable.
+    """
     pair = compare(clip, masks, caster, frame, world_from_camera)
     depth = cv2.resize(clip.depth(frame), pair.depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    same = pair.known & (np.abs(depth - pair.depth) < FITS_M)
-    if same.mean() < MIN_SHARE:
+    comparable = pair.known & (np.abs(depth - pair.depth) < FIT_M)
+    if comparable.mean() < MIN_SHARE:
         return np.nan
     normalized = [
         local_contrast_normalization(picture, pair.known).astype(np.float64)
         for picture in (pair.rendered, pair.recorded)
     ]
-    first, second = (cv2.GaussianBlur(each, (0, 0), SOFTNESS_PX)[same] for each in normalized)
+    first, second = (cv2.GaussianBlur(each, (0, 0), SMOOTHING_PX)[comparable] for each in normalized)
     first, second = first - first.mean(), second - second.mean()
     return float(first @ second / max(np.linalg.norm(first) * np.linalg.norm(second), MIN_NORM))

@@ -1,8 +1,8 @@
-"""Confidence of each pose: its covariance, and whether its picture looks like the place.
+"""Confidence of each pose: its covariance, and whether its picture matches the rendering.
 
-A wrong pose can have a small covariance, since rooms have floors and walls everywhere; but then its picture
-resembles its rendering no more than renderings from poses that are wrong on purpose (targets and decoys,
-Elias and Gygi 2007).
+A wrong pose can have a small covariance, since floors and walls are everywhere; but then its picture
+correlates with its rendering no better than with renderings from deliberately wrong poses (target-decoy
+approach, Elias and Gygi 2007).
 """
 
 from dataclasses import dataclass
@@ -14,32 +14,31 @@ from pipeline.data.clips import Clip, Masks
 from pipeline.geometry import rigid, subsampling
 from pipeline.geometry.meshes import RayCaster
 from stages.register_videos.agent_roots import Roots
-from stages.register_videos.agent_tracking import excess
+from stages.register_videos.agent_tracking import excess_cost
 from stages.register_videos.comparison import ncc
 from stages.register_videos.config import ConfidenceConfig
 
-NEAR_RAD, NEAR_M = np.deg2rad(2.0), 0.05
-"""Within which a camera's pose counts as right."""
-DECOY_SIZE = (1.5, 10.0)
-"""Decoys are wrong by between these multiples of `NEAR_RAD` or `NEAR_M`."""
+TOL_RAD, TOL_M = np.deg2rad(2.0), 0.05
+"""Largest error of a correct camera pose, radians and metres."""
+DECOY_RANGE = (1.5, 10.0)
+"""Range of the decoys' errors, in multiples of `TOL_RAD` and `TOL_M`."""
 ATTEMPTS = 3
-"""A frame is held against the best of so many decoys, since alignment took the best pose in reach."""
+"""Frames are compared with the best of so many decoys, since alignment chose the best pose in reach."""
 AVERAGING_S = 1.0
-"""Time constant over which scores are averaged, seconds: neighbouring poses err together."""
-UNANCHORED = 0.2
-"""Factor on frames that neither a vote nor unbroken odometry from one holds."""
+"""Standard deviation of the Gaussian that averages scores, seconds: neighbouring errors are correlated."""
+UNANCHORED_FACTOR = 0.2
+"""Factor on the confidence of frames without a vote in their odometry segment."""
 MIN_SCORED = 20
-"""Short recordings are compared in at least so many frames."""
+"""Least number of scored frames, for short recordings."""
 DRAWS = 400
 """Monte Carlo samples of a pose's covariance."""
 COST_SCALE_M, ENOUGH_SHARE = 0.012, 0.15
-"""Roots: excess of cost that halves the confidence or so (metres), and visible share from which on visibility
-no longer counts."""
+"""Roots: standard deviation of the excess cost (metres), and visible share of full confidence."""
 
 
 @dataclass(frozen=True)
 class NccScores:
-    """Normalized cross-correlation of frames with renderings, from their poses and wrong ones; NaN: none."""
+    """Normalized cross-correlation of frames with renderings from their poses and from decoys; may be NaN."""
 
     frame: Int[np.ndarray, "compared"]
     targets: Float[np.ndarray, "compared"]
@@ -54,37 +53,37 @@ def score_appearance(
     config: ConfidenceConfig,
     rng: np.random.Generator,
 ) -> NccScores:
-    """Score frames against renderings from their poses and from poses that are wrong on purpose (decoys)."""
+    """Score frames against renderings from their poses and from deliberately wrong poses (decoys)."""
     chosen = subsampling.evenly(len(clip), max(len(clip) // config.every_frames, MIN_SCORED))
     wrong = rng.integers(0, len(clip), config.decoys)
-    decoys = world_from_camera[wrong] @ rigid.exp(_wrong_twists(config.decoys, rng))
+    decoys = world_from_camera[wrong] @ rigid.exp(_decoy_twists(config.decoys, rng))
 
-    def scored(frames, poses) -> Float[np.ndarray, "_"]:
+    def score(frames, poses) -> Float[np.ndarray, "_"]:
         pairs = zip(frames.tolist(), poses, strict=True)
         return np.array([ncc(clip, masks, caster, frame, pose) for frame, pose in pairs])
 
-    return NccScores(chosen, scored(chosen, world_from_camera[chosen]), scored(wrong, decoys))
+    return NccScores(chosen, score(chosen, world_from_camera[chosen]), score(wrong, decoys))
 
 
-def _wrong_twists(count, rng):
-    """Draw motions whose turn or step, or both, is the drawn multiple of what counts as near."""
-    low, high = np.log(DECOY_SIZE)
+def _decoy_twists(count, rng):
+    """Draw twists whose larger part, rotation or translation, is a random multiple of the tolerance."""
+    low, high = np.log(DECOY_RANGE)
     size = np.exp(rng.uniform(low, high, count))[:, None]
-    part = rng.uniform(0, 1, (count, 2))
-    part /= part.max(1, keepdims=True)
+    ratio = rng.uniform(0, 1, (count, 2))
+    ratio /= ratio.max(1, keepdims=True)
     turn, step = (
         each / np.linalg.norm(each, axis=1, keepdims=True) for each in rng.normal(size=(2, count, 3))
     )
-    return np.concatenate([turn * part[:, :1] * size * NEAR_RAD, step * part[:, 1:] * size * NEAR_M], axis=1)
+    return np.concatenate([turn * ratio[:, :1] * size * TOL_RAD, step * ratio[:, 1:] * size * TOL_M], axis=1)
 
 
 def appearance_probability(
     timestamp_s: Float[np.ndarray, "frame"], scores: NccScores
 ) -> Float[np.ndarray, "frame"]:
-    """Return the probability that each frame shows the place of its pose, by the pictures around it."""
+    """Return the probability that each frame shows the place of its pose, from the scores around it."""
     known = np.isfinite(scores.targets)
-    targets = averaged(timestamp_s, timestamp_s[scores.frame[known]], scores.targets[known], AVERAGING_S)
-    return right_place(targets, scores.decoys, ATTEMPTS)
+    targets = kernel_mean(timestamp_s, timestamp_s[scores.frame[known]], scores.targets[known], AVERAGING_S)
+    return place_probability(targets, scores.decoys, ATTEMPTS)
 
 
 def camera_confidence(
@@ -94,14 +93,16 @@ def camera_confidence(
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "frame"]:
     """Return P(camera within 2 deg and 5 cm): by its covariance, times P(right place) by appearance."""
-    return near_probability(pose_covariance, rng) * appearance * np.where(anchored, 1.0, UNANCHORED)
+    return within_tolerance(pose_covariance, rng) * appearance * np.where(anchored, 1.0, UNANCHORED_FACTOR)
 
 
-def right_place(
+def place_probability(
     targets: Float[np.ndarray, "frame"], decoys: Float[np.ndarray, "decoy"], attempts: int
 ) -> Float[np.ndarray, "frame"]:
-    """Return one minus the q-value: the least share of decoys over the share of targets that look at least so
-    much alike, of all limits that a frame passes; 0 where nothing can be compared."""
+    """Return one minus each frame's q-value, the least false discovery rate at which it passes.
+
+    The rate at a threshold is the share of decoys over the share of targets above it; 0 without a score.
+    """
     decoys, known = decoys[np.isfinite(decoys)], np.flatnonzero(np.isfinite(targets))
     order = known[np.argsort(targets[known], kind="stable")]
     limit, found = targets[order], np.zeros(len(targets))
@@ -113,27 +114,27 @@ def right_place(
     return found
 
 
-def near_probability(
+def within_tolerance(
     pose_covariance: Float[np.ndarray, "frame 6 6"], rng: np.random.Generator, draws: int = DRAWS
 ) -> Float[np.ndarray, "frame"]:
-    """Return how likely a twist of zero mean and this covariance stays within 2 deg and 5 cm."""
+    """Return the probability that a zero-mean twist of this covariance is within 2 deg and 5 cm."""
     normal, found = rng.normal(size=(6, draws)), np.empty(len(pose_covariance))
     variance, axes = np.linalg.eigh(pose_covariance)
     for frame, root in enumerate(axes * np.sqrt(np.maximum(variance, 0))[:, None, :]):
         drawn = root @ normal
         found[frame] = (
-            (np.linalg.norm(drawn[:3], axis=0) < NEAR_RAD) & (np.linalg.norm(drawn[3:], axis=0) < NEAR_M)
+            (np.linalg.norm(drawn[:3], axis=0) < TOL_RAD) & (np.linalg.norm(drawn[3:], axis=0) < TOL_M)
         ).mean()
     return found
 
 
-def averaged(
+def kernel_mean(
     timestamp_s: Float[np.ndarray, "frame"],
     known_s: Float[np.ndarray, "known"],
     values: Float[np.ndarray, "known"],
     sigma_s: float,
 ) -> Float[np.ndarray, "frame"]:
-    """Average values known at some times with Gaussian weights, cut at four sigma; NaN beyond."""
+    """Average known values with Gaussian weights in time, truncated at four sigma; NaN beyond."""
     low = np.searchsorted(known_s, timestamp_s - 4 * sigma_s)
     high = np.searchsorted(known_s, timestamp_s + 4 * sigma_s, side="right")
     result = np.full(len(timestamp_s), np.nan)
@@ -145,7 +146,6 @@ def averaged(
 
 
 def agent_confidence(roots: Roots) -> Float[np.ndarray, "frame"]:
-    """Score each root 0..1: full for the video's usual fit in good view, less where it fits worse or little
-    is seen; 0 unseen."""
-    worse = excess(roots.cost_m) / COST_SCALE_M
+    """Score each root 0..1 by excess cost and visible share; 0 where not visible."""
+    worse = excess_cost(roots.cost_m) / COST_SCALE_M
     return np.where(roots.visible, np.exp(-0.5 * worse**2) * np.minimum(roots.share / ENOUGH_SHARE, 1.0), 0.0)

@@ -6,10 +6,10 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class VoteConfig:
-    """Which frames vote for a pose, and when votes agree."""
+    """Localization of single frames, and agreement of their votes."""
 
     every_frames: int = 5
-    """One frame in so many is localized."""
+    """Stride of the localized frames."""
     min_probability: float = 0.2
     """Poses below this probability do not vote."""
     agree_deg: float = 8.0
@@ -25,14 +25,13 @@ class AlignmentConfig:
     """Terms and rounds of the alignment of all frames."""
 
     rounds: int = 8
-    """Gauss-Newton steps by depth and votes; 0: poses stay as votes and odometry give them."""
+    """Gauss-Newton steps by depth and votes; 0: keep the poses of votes and odometry."""
     stride_px: int = 11
-    """One depth pixel in so many, each way, takes part."""
+    """Grid spacing of the depth pixels."""
     flow_every_frames: int = 5
-    """One frame in so many is aligned by optical flow from the rendered template; 0: none."""
+    """Stride of the frames aligned by optical flow from the rendered template; 0: none."""
     feature_every_frames: int = 5
-    """One frame in so many is aligned by features against the template's features (feature-metric alignment);
-    0: none."""
+    """Stride of the frames of feature-metric alignment to the template's features; 0: none."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ class GateConfig:
     min_certainty: float = 0.5
     """Probability of a vote that needs no confirmation by appearance."""
     min_appearance: float = 0.3
-    """Share of the frames that must look more like their renderings than like renderings from wrong poses."""
+    """Least share of the frames that match their renderings better than renderings from wrong poses."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +51,9 @@ class ConfidenceConfig:
     """How each frame's confidence is measured."""
 
     every_frames: int = 5
-    """One frame in so many is compared with its rendering."""
+    """Stride of the frames compared with their rendering."""
     decoys: int = 120
-    """Renderings from poses that are wrong on purpose."""
+    """Number of renderings from deliberately wrong poses."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class RootConfig:
     """How the animal is placed."""
 
     headings: int = 12
-    """Headings tried from scratch in every frame."""
+    """Initial headings in every frame."""
     smooth_s: float = 0.15
     """Time constant of the smoothing, seconds."""
 
@@ -73,9 +72,9 @@ class Config:
 
     initialization: Literal["votes", "middle"] = "votes"
     """votes: localized frames place the recording; middle: it starts in the middle of the room with the
-    heading of its odometry, and is never refused (the ablation without a localizer)."""
+    heading of its odometry, and is never rejected (the ablation without a localizer)."""
     odometry: Literal["device", "pictures"] = "device"
-    """device: its own poses where the recording has them; pictures: visual odometry with depth, always."""
+    """device: the recording's own poses if it has them; pictures: always RGB-D visual odometry."""
     vote: VoteConfig = field(default_factory=VoteConfig)
     """Single-frame localization."""
     alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
@@ -85,7 +84,7 @@ class Config:
     confidence: ConfidenceConfig = field(default_factory=ConfidenceConfig)
     """Confidence of the camera poses."""
     animal: bool = True
-    """False: cameras alone, for tables that compare nothing else."""
+    """False: cameras only, for tables that compare only cameras."""
     root: RootConfig = field(default_factory=RootConfig)
     """The animal's root."""
     seed: int = 0

@@ -11,33 +11,33 @@ from pipeline.mapping.pose_optimization import MAP, Correspondences
 from stages.register_videos.comparison import compare, local_contrast_normalization
 
 SIGMA_PX = 16.0
-"""Standard deviation of the flow, half-size pixels: neighbouring pixels err together by hundreds."""
-RETURN_PX = 1.0
-"""Flow there and back must return to within this, half-size pixels: on mirrors it does not."""
+"""Standard deviation of the flow, half-size pixels; large, since errors of hundreds of pixels correlate."""
+MAX_CYCLE_ERROR_PX = 1.0
+"""Largest forward-backward error, half-size pixels; rejects mirrors."""
 STRIDE_PX, MARGIN_PX = 9, 4
-"""One pixel in so many, each way, takes part, away from the margin, half-size pixels."""
-LONGEST_PX = 12
-"""Longer flow is none, half-size pixels."""
-DEPTH_FITS_M = 0.12
-"""Measured depth at the end of the flow must agree with the template's at its start, metres."""
-MIN_KNOWN, MIN_PAIRS = 0.1, 20
-"""Share of the picture that must show template, and pairs that must remain."""
+"""Grid spacing of the matched pixels, and margin at the border, half-size pixels."""
+MAX_FLOW_PX = 12
+"""Longest valid flow, half-size pixels."""
+MAX_DEPTH_ERROR_M = 0.12
+"""Largest difference of measured depth at the flow's end and template depth at its start, metres."""
+MIN_KNOWN_SHARE, MIN_PAIRS = 0.1, 20
+"""Least share of pixels that show the template, and least number of matches."""
 OUTSIDE_PX = 1e3
-"""Flow of pixels outside the picture."""
+"""Flow assigned outside the picture."""
 
 
 def flow_correspondences(
     clip: Clip, masks: Masks, caster: RayCaster, frame: int, world_from_camera: Float[np.ndarray, "4 4"]
 ) -> Correspondences | None:
-    """Match one frame with the template rendered from its pose; None where too little can be matched."""
+    """Match one frame to the template rendered from its pose; None if too few pixels match."""
     pair = compare(clip, masks, caster, frame, world_from_camera)
     known, intrinsics = pair.known, pair.intrinsics
-    if known.mean() < MIN_KNOWN:
+    if known.mean() < MIN_KNOWN_SHARE:
         return None
-    flow, return_px = _flow(
+    flow, cycle_error_px = _flow(
         local_contrast_normalization(pair.rendered, known), local_contrast_normalization(pair.recorded, known)
     )
-    inner = tuple(slice(MARGIN_PX, side - MARGIN_PX, STRIDE_PX) for side in known.shape)
+    inner = tuple(slice(MARGIN_PX, size - MARGIN_PX, STRIDE_PX) for size in known.shape)
     rows, columns = np.mgrid[inner].reshape(2, -1)
     start = np.stack([columns, rows], axis=-1) + 0.5
     ray = cameras.unproject(start + flow[rows, columns], intrinsics)
@@ -46,9 +46,9 @@ def flow_correspondences(
     good = (
         known[rows, columns]
         & (z > 0)
-        & (np.abs(z - template_z) < DEPTH_FITS_M)
-        & (np.abs(flow[rows, columns]).max(1) < LONGEST_PX)
-        & (return_px[rows, columns] < RETURN_PX)
+        & (np.abs(z - template_z) < MAX_DEPTH_ERROR_M)
+        & (np.abs(flow[rows, columns]).max(1) < MAX_FLOW_PX)
+        & (cycle_error_px[rows, columns] < MAX_CYCLE_ERROR_PX)
     )
     if good.sum() < MIN_PAIRS:
         return None
@@ -58,14 +58,14 @@ def flow_correspondences(
     points_camera = ray[good] * z[good, None]
     count, sigma = int(good.sum()), SIGMA_PX / intrinsics[0, 0] * z[good]
     first, second = np.full(count, frame), np.full(count, MAP)
-    sides = [np.broadcast_to(world_from_camera[:3, axis], (count, 3)) for axis in (0, 1)]
+    axes = [np.broadcast_to(world_from_camera[:3, i], (count, 3)) for i in (0, 1)]
     return Correspondences.join(
-        *(Correspondences(first, second, points_camera, points_map, side, sigma) for side in sides)
+        *(Correspondences(first, second, points_camera, points_map, axis, sigma) for axis in axes)
     )
 
 
 def _flow(first, second):
-    """Return optical flow and how far from its start it ends there and back, pixels."""
+    """Return optical flow and its forward-backward error, pixels."""
     dense = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     no_guess = np.zeros(0, np.float32)
     forward, backward = dense.calc(first, second, no_guess), dense.calc(second, first, no_guess)

@@ -1,10 +1,9 @@
-"""The animal's heading over time: Viterbi decoding over a grid of headings, and the hypothesis of each frame
-on it.
+"""The animal's heading over time, by Viterbi decoding over a grid of headings.
 
-In depth, front and back look almost alike, and every fit errs by some degrees; over time an animal turns
-steadily and walks head first. The head is the template's, a guess from shape that a hen's tail spoils: where
-a recording clearly shows the animal walking the other way, that is its head. Frames that show little, fit
-badly or repeat earlier views count little.
+Depth hardly distinguishes front from back, and every fit is off by some degrees; but animals turn smoothly
+and walk head first. The head end of the template is guessed from shape, and reversed if the recording clearly
+shows the animal walking the other way. Frames that show little, fit badly or repeat earlier views have low
+weight.
 """
 
 from dataclasses import dataclass
@@ -15,40 +14,40 @@ from jaxtyping import Float
 from pipeline.geometry import rigid, viterbi
 
 HEADINGS = 36
-"""Headings of the grid: steps of 10 degrees."""
-NOISE_DEG, MAX_COST = 20.0, 12.0
-"""A hypothesis turned by the first from a heading costs one unit more; one frame costs at most the second."""
+"""Number of grid headings: steps of 10 degrees."""
+HEADING_SIGMA_DEG, MAX_FRAME_COST = 20.0, 12.0
+"""Heading difference between hypothesis and grid that costs one unit, and largest cost of one frame."""
 MOTION_WEIGHT, WALKING_M_S = 4.0, (0.25, 0.6)
-"""Units for walking tail first, counting from the first speed, fully from the second, m/s: an animal that
-turns on the spot shows other sides."""
+"""Cost of walking tail first, ramping up between these speeds, m/s: the centre of visible points also moves
+when an animal turns on the spot."""
 REVERSED_SHARE = 0.6
-"""The template's head is the tail if that saves this share of what walking tail first costs at most, and more
-than a turn to the other side."""
+"""The template's head and tail are swapped if that saves this share of the cost of always walking tail first,
+and more than `FLIP_COST`."""
 TURN_DEG, TURN_S, FLIP_COST = 30.0, 0.1, 40.0
-"""A turn by so many degrees in so many seconds costs one unit, up to the last."""
+"""Turning by so many degrees in so many seconds costs one unit; largest cost of a turn."""
 STILL_WEIGHT, NEW_VIEW_M_S, CAMERA_SHARE = 0.06, 0.4, 0.5
-"""Weight of a frame in which neither animal nor phone moves, speed from which a frame shows something new,
-m/s, and the part of the phone's speed in it."""
-ENOUGH_SHARE, MISFIT = 0.2, 6.0
-"""Frames that show less of the animal than this share count less in proportion; frames whose best hypothesis
-costs so many units more than the median frame's count half."""
-SHORTEST_S, LONGEST_S = 0.15, 1.2
-"""Velocities are measured over times between these, seconds."""
+"""Weight of a frame in which neither animal nor phone moves, speed of full weight (m/s), and weight of the
+phone's speed in it."""
+ENOUGH_SHARE, MISFIT_SCALE = 0.2, 6.0
+"""Visible share of full weight, and excess of the best hypothesis' cost over the median that halves the
+weight, units."""
+MIN_SPAN_S, MAX_SPAN_S = 0.15, 1.2
+"""Range of time differences over which velocities are measured, seconds."""
 
 
 @dataclass(frozen=True)
 class RootHypotheses:
-    """Hypotheses of one frame and their costs, in units; pictures are read again when needed."""
+    """Pose hypotheses of one frame and their costs, in units."""
 
     frame: int
     world_from_agent: Float[np.ndarray, "hypothesis 4 4"]
     cost: Float[np.ndarray, "hypothesis"]
     min_misfit: float
-    """Cost of the best placement, by shape and colour alone."""
+    """Cost of the best pose by shape and colour alone."""
     share: float
-    """Visible area over the area in full view, 0..1."""
-    middle_world: Float[np.ndarray, "3"]
-    """Middle of the points that were seen."""
+    """Visible share, 0..1."""
+    center_world: Float[np.ndarray, "3"]
+    """Median of the visible points."""
     eye_world: Float[np.ndarray, "3"]
 
 
@@ -57,87 +56,87 @@ class MotionCues:
     """Motion around each observation."""
 
     velocity: Float[np.ndarray, "observation 3"]
-    """Horizontal velocity of the seen points' middle, m/s; zero across gaps."""
+    """Horizontal velocity of the visible points' median, m/s; zero across gaps."""
     novelty: Float[np.ndarray, "observation"]
-    """0..1: how much a frame shows that its neighbours did not; repeated views err together."""
+    """0..1: how much new a frame shows; errors of repeated views are correlated."""
 
 
-def choose(timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypotheses]) -> list[int]:
-    """Choose one hypothesis per frame: the one of least cost, its turn from the decoded heading included."""
-    decoded = path(timestamp_s, candidates)
-    return [int(_turned_cost(each, angle).argmin()) for each, angle in zip(candidates, decoded, strict=True)]
+def choose_hypotheses(timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypotheses]) -> list[int]:
+    """Choose the hypothesis of least cost per frame, including its difference from the decoded heading."""
+    decoded = decode_headings(timestamp_s, candidates)
+    return [int(_heading_cost(each, angle).argmin()) for each, angle in zip(candidates, decoded, strict=True)]
 
 
-def path(
+def decode_headings(
     timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypotheses]
 ) -> Float[np.ndarray, "observation"]:
-    """Return the likeliest heading of each observation, radians, by Viterbi decoding over a grid of headings.
+    """Return the most likely heading of each observation, radians, by Viterbi decoding.
 
-    It is decoded for an animal that walks along +z of its template, and for one that walks along -z.
+    Decodes once for an animal that walks along its template's +z and once for -z.
     """
     grid = 2 * np.pi * np.arange(HEADINGS) / HEADINGS - np.pi
-    moves, weight = motion_cues(timestamp_s, candidates), weights(candidates)
-    walking = MOTION_WEIGHT * weight * _walking(moves)
-    look = [_own_cost(each, grid, moves.novelty[index]) for index, each in enumerate(candidates)]
+    cues, weight = motion_cues(timestamp_s, candidates), weights(candidates)
+    walking = MOTION_WEIGHT * weight * _walking_weight(cues)
+    visual = [_visual_cost(each, grid, cues.novelty[index]) for index, each in enumerate(candidates)]
     turn = (rigid.wrap(grid[:, None] - grid[None]) / np.deg2rad(TURN_DEG)) ** 2
 
     def turn_cost(index: int) -> Float[np.ndarray, "before after"]:
-        elapsed = timestamp_s[candidates[index].frame] - timestamp_s[candidates[index - 1].frame]
-        tenths = max(elapsed / TURN_S, 1.0)
+        elapsed_s = timestamp_s[candidates[index].frame] - timestamp_s[candidates[index - 1].frame]
+        tenths = max(elapsed_s / TURN_S, 1.0)
         return np.minimum(turn / tenths, FLIP_COST / np.sqrt(tenths))
 
-    def decoded(sense: float) -> tuple[Float[np.ndarray, "observation"], float]:
-        against = 1 - sense * np.cos(grid - np.arctan2(*moves.velocity[:, [0, 2]].T)[:, None])
-        unary = weight[:, None] * look + walking[:, None] * against / 2
+    def decoded(direction: float) -> tuple[Float[np.ndarray, "observation"], float]:
+        opposition = 1 - direction * np.cos(grid - np.arctan2(*cues.velocity[:, [0, 2]].T)[:, None])
+        unary = weight[:, None] * visual + walking[:, None] * opposition / 2
         state = viterbi.viterbi_decode(unary, turn_cost)
         turns = sum(turn_cost(index)[state[index - 1], state[index]] for index in range(1, len(state)))
         return grid[state], float(unary[np.arange(len(state)), state].sum() + turns)
 
     (head_first, cost), (tail_first, reversed_cost) = decoded(1.0), decoded(-1.0)
-    clearly = max(FLIP_COST, REVERSED_SHARE * walking.sum())
-    return tail_first if cost - reversed_cost > clearly else head_first
+    margin = max(FLIP_COST, REVERSED_SHARE * walking.sum())
+    return tail_first if cost - reversed_cost > margin else head_first
 
 
 def weights(candidates: list[RootHypotheses]) -> Float[np.ndarray, "observation"]:
-    """Return the weight of each frame, 0..1: less where little is seen and where nothing fits."""
+    """Return the weight of each frame, 0..1, by visible share and misfit."""
     misfit, share = (
         np.array([getattr(each, name) for each in candidates]) for name in ("min_misfit", "share")
     )
-    worse = np.maximum(misfit - np.median(misfit), 0) / MISFIT
-    return np.minimum(share / ENOUGH_SHARE, 1.0) / (1 + worse**2)
+    excess = np.maximum(misfit - np.median(misfit), 0) / MISFIT_SCALE
+    return np.minimum(share / ENOUGH_SHARE, 1.0) / (1 + excess**2)
 
 
 def motion_cues(
     timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypotheses], span: int = 3
 ) -> MotionCues:
-    """Measure motion over ``span`` observations before and after each."""
-    middle = np.stack([each.middle_world for each in candidates]) * (1, 0, 1)
-    phone = np.stack([each.eye_world for each in candidates])
+    """Measure motion between ``span`` observations before and after each one."""
+    center = np.stack([each.center_world for each in candidates]) * (1, 0, 1)
+    camera = np.stack([each.eye_world for each in candidates])
     time = timestamp_s[[each.frame for each in candidates]]
     before = np.maximum(np.arange(len(time)) - span, 0)
     after = np.minimum(np.arange(len(time)) + span, len(time) - 1)
-    elapsed = np.maximum(time[after] - time[before], 1e-3)[:, None]
-    velocity = (middle[after] - middle[before]) / elapsed
+    elapsed_s = np.maximum(time[after] - time[before], 1e-3)[:, None]
+    velocity = (center[after] - center[before]) / elapsed_s
     moved = np.linalg.norm(velocity, axis=1) + CAMERA_SHARE * np.linalg.norm(
-        (phone[after] - phone[before]) / elapsed, axis=1
+        (camera[after] - camera[before]) / elapsed_s, axis=1
     )
-    velocity[(elapsed[:, 0] > LONGEST_S) | (elapsed[:, 0] < SHORTEST_S)] = 0
+    velocity[(elapsed_s[:, 0] > MAX_SPAN_S) | (elapsed_s[:, 0] < MIN_SPAN_S)] = 0
     return MotionCues(velocity, STILL_WEIGHT + (1 - STILL_WEIGHT) * np.minimum(moved / NEW_VIEW_M_S, 1.0))
 
 
-def _turned_cost(candidates, angle):
-    """Return the cost of each hypothesis if the animal faces ``angle``."""
-    turned = rigid.wrap(angle - rigid.yaw(candidates.world_from_agent)) / np.deg2rad(NOISE_DEG)
+def _heading_cost(candidates, angle):
+    """Return the cost of each hypothesis given the heading ``angle``, radians."""
+    turned = rigid.wrap(angle - rigid.yaw(candidates.world_from_agent)) / np.deg2rad(HEADING_SIGMA_DEG)
     return candidates.cost + np.minimum(turned**2, FLIP_COST)
 
 
-def _walking(moves: MotionCues) -> Float[np.ndarray, "observation"]:
-    """Return 0..1: how surely the animal walks."""
+def _walking_weight(cues: MotionCues) -> Float[np.ndarray, "observation"]:
+    """Return 0..1: confidence that the animal walks."""
     slow, fast = WALKING_M_S
-    return np.clip((np.hypot(*moves.velocity[:, [0, 2]].T) - slow) / (fast - slow), 0, 1)
+    return np.clip((np.hypot(*cues.velocity[:, [0, 2]].T) - slow) / (fast - slow), 0, 1)
 
 
-def _own_cost(candidates, grid, novelty):
-    """Return one frame's cost of each heading of the grid, by looks alone."""
-    seen = _turned_cost(candidates, grid[:, None]).min(1)
-    return novelty * np.minimum(seen - seen.min(), MAX_COST)
+def _visual_cost(candidates, grid, novelty):
+    """Return one frame's cost of each grid heading, by appearance and shape alone."""
+    cost = _heading_cost(candidates, grid[:, None]).min(1)
+    return novelty * np.minimum(cost - cost.min(), MAX_FRAME_COST)

@@ -1,4 +1,4 @@
-"""Quality page, checks and status file of a registered recording."""
+"""Quality page, checks and status file of a recording."""
 
 import cv2
 import numpy as np
@@ -11,13 +11,13 @@ from pipeline.geometry import rigid, views
 from pipeline.geometry.meshes import RayCaster, render_view
 from stages.register_videos.registration import Maps, Registered, Rejected
 
-EDGE, PHONE, ANIMAL, HEAD = (255, 60, 200), (40, 90, 220), (230, 120, 20), (250, 210, 60)
-DEPTH_EDGE_M, OUTLINE = 0.08, 1.0
-"""steps that are drawn as edges: of depth, and of the animal's silhouette (any step is larger)"""
+EDGE_RGB, PHONE_RGB, ANIMAL_RGB, HEAD_RGB = (255, 60, 200), (40, 90, 220), (230, 120, 20), (250, 210, 60)
+DEPTH_EDGE_M, OUTLINE_STEP = 0.08, 1.0
+"""thresholds of drawn edges: of depth, and of the animal's silhouette (any step is larger)"""
 HEADING_M = 0.2
 """length of the line that shows where the animal faces"""
-WALK_FRAMES, WALK_M = 5, 0.2
-"""an animal walks that goes further than this in so many frames"""
+STEP_FRAMES, MIN_STEP_M = 5, 0.2
+"""an animal walks if it moves farther than this in so many frames, metres"""
 CAPTIONS = {
     "edges": "Template edges (magenta) and the placed animal (orange) over frames.",
     "bird": "From above: the phone's path (blue), the animal's (orange, yellow towards its head).",
@@ -27,9 +27,9 @@ CAPTIONS = {
 def status(
     result: Registered | Rejected, walk_time_s: Float[np.ndarray, "walk"], walk: Float[np.ndarray, "walk 4 4"]
 ) -> dict:
-    """Describe the outcome for ``status.json``; the nearest view also as a moment of the walk-through."""
+    """Return the content of ``status.json``, with the nearest view's time in the walk-through."""
     votes = result.votes
-    figures = {"frames_localized": votes.asked, "votes": len(votes.frame)}
+    figures = {"frames_localized": votes.queries, "votes": len(votes.frame)}
     nearest = None
     if votes.nearest is not None:
         nearest = {
@@ -41,7 +41,7 @@ def status(
         return {"registered": False, "reason": result.reason, "nearest_view": nearest, "figures": figures}
     placed = result.agent_confidence[result.roots.visible]
     figures |= {
-        "votes_agreeing": int(result.supports.sum()),
+        "votes_agreeing": int(result.inliers.sum()),
         "depth_gap_m": _finite(result.aligned.median_gap_m),
         "depth_fit": _finite(result.aligned.median_fit),
         "appearance": result.appearance,
@@ -53,26 +53,26 @@ def status(
 
 
 def _finite(figure):
-    """Return a figure for JSON: null where nothing was measured."""
+    """Return a JSON value, None for NaN."""
     return figure if np.isfinite(figure) else None
 
 
 def nearest_frame(walk: Float[np.ndarray, "walk 4 4"], world_from_camera: Float[np.ndarray, "4 4"]) -> int:
-    """Return the walk-through's frame taken most nearly from there: a metre counts as much as a radian."""
-    away = np.linalg.norm(walk[:, :3, 3] - world_from_camera[:3, 3], axis=1)
-    return int(np.argmin(away + rigid.rotation_angle(walk[:, :3, :3], world_from_camera[:3, :3])))
+    """Return the walk-through's frame of the nearest camera: a metre counts as much as a radian."""
+    distance_m = np.linalg.norm(walk[:, :3, 3] - world_from_camera[:3, 3], axis=1)
+    return int(np.argmin(distance_m + rigid.rotation_angle(walk[:, :3, :3], world_from_camera[:3, :3])))
 
 
 def checks(result: Registered | Rejected) -> list[Check]:
-    """Judge the outcome."""
+    """Return the quality checks."""
     if isinstance(result, Rejected):
         return [Check("registered", 0.0, "", 0.5, 0.5, "higher")]
-    agreed = float(result.supports.mean()) if len(result.supports) else None
+    agreeing = float(result.inliers.mean()) if len(result.inliers) else None
     roots = result.roots.world_from_agent
     gap_cm = _finite(result.aligned.median_gap_m * 100)
     return [
         Check("registered", 1.0, "", 0.5, 0.5, "higher"),
-        Check("frame votes that agree", agreed, "share", 0.5, 0.25, "higher"),
+        Check("frame votes that agree", agreeing, "share", 0.5, 0.25, "higher"),
         Check("depth against the template", gap_cm, "cm, median", 2.5, 6.0),
         Check("static depth within 5 cm", _finite(result.aligned.median_fit), "share", 0.6, 0.35, "higher"),
         Check("appearance of frames and renderings", result.appearance, "share", 0.5, None, "higher"),
@@ -83,21 +83,21 @@ def checks(result: Registered | Rejected) -> list[Check]:
 
 
 def head_first(world_from_agent: Float[np.ndarray, "frame 4 4"]) -> float | None:
-    """Return the share of the animal's way on which it faced ahead; None where it does not walk.
+    """Return the share of the walked distance on which the animal faced ahead; None if it does not walk.
 
-    Little where the template's head is the tail (`[build_agent_template] turn_deg`).
+    Low if the template's head and tail are swapped (`[build_agent_template] turn_deg`).
     """
-    step = world_from_agent[WALK_FRAMES:, :3, 3] - world_from_agent[:-WALK_FRAMES, :3, 3]
-    ahead = (step * world_from_agent[:-WALK_FRAMES, :3, 2])[:, [0, 2]].sum(-1)
+    step = world_from_agent[STEP_FRAMES:, :3, 3] - world_from_agent[:-STEP_FRAMES, :3, 3]
+    ahead = (step * world_from_agent[:-STEP_FRAMES, :3, 2])[:, [0, 2]].sum(-1)
     length = np.linalg.norm(step[:, [0, 2]], axis=-1)
-    walks = length > WALK_M
+    walks = length > MIN_STEP_M
     return float(length[walks & (ahead > 0)].sum() / length[walks].sum()) if walks.any() else None
 
 
 def pictures(result: Registered | Rejected, clip: Clip, maps: Maps) -> list[Picture]:
-    """Draw the outcome for people."""
+    """Draw the pictures of the quality page."""
     if isinstance(result, Rejected):
-        return _refused(result, clip, maps)
+        return _rejected_pictures(result, clip, maps)
     scene, agent = RayCaster(maps.scene), RayCaster(maps.agent)
     chosen = np.linspace(0, len(clip) - 1, 9).astype(int)[1:-1]
     edges = plots.grid([outlined(result, clip, scene, agent, int(frame)) for frame in chosen], len(chosen))
@@ -112,11 +112,11 @@ def outlined(
     camera = result.aligned.world_from_camera[frame]
     picture = clip.color(frame).copy()
     depth, _ = render_view(scene, camera, clip.intrinsics[frame], height, width)
-    picture[_edges(depth, DEPTH_EDGE_M)] = EDGE
+    picture[_edges(depth, DEPTH_EDGE_M)] = EDGE_RGB
     root = result.roots.world_from_agent[frame]
     if np.isfinite(root).all():
         body, _ = render_view(agent, rigid.inverse(root) @ camera, clip.intrinsics[frame], height, width)
-        picture[_edges((body > 0).astype(np.float32) * 9, OUTLINE)] = ANIMAL
+        picture[_edges((body > 0).astype(np.float32) * 9, OUTLINE_STEP)] = ANIMAL_RGB
     return picture
 
 
@@ -126,23 +126,23 @@ def _edges(depth, jump_m):
 
 
 def paths(result: Registered, maps: Maps) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw both paths over the room."""
+    """Draw the camera's and the animal's path over the room."""
     picture = views.bird_view(maps.scene, floor_m=maps.floor_m)
     root = result.roots.world_from_agent
-    picture.draw(result.aligned.world_from_camera[:, :3, 3], PHONE)
-    picture.draw(root[:, :3, 3], ANIMAL)
+    picture.draw(result.aligned.world_from_camera[:, :3, 3], PHONE_RGB)
+    picture.draw(root[:, :3, 3], ANIMAL_RGB)
     for frame in np.flatnonzero(result.roots.visible)[::10]:
         middle = root[frame, :3, 3]
-        picture.draw(np.stack([middle, middle + HEADING_M * root[frame, :3, 2]]), HEAD)
+        picture.draw(np.stack([middle, middle + HEADING_M * root[frame, :3, 2]]), HEAD_RGB)
     return picture.image
 
 
-def _refused(result, clip, maps):
+def _rejected_pictures(result, clip, maps):
     frame = len(clip) // 2
     middle = clip.color(frame)
     if result.votes.nearest is None:
-        return [Picture("frame", middle, "A frame of the recording; no view of the template is like it.")]
-    camera, lens = result.votes.nearest.map_from_camera, clip.intrinsics[frame]
-    near = views.view(RayCaster(maps.scene), camera, lens, *clip.color_size)
+        return [Picture("frame", middle, "A frame of the recording; the template has no similar view.")]
+    camera, intrinsics = result.votes.nearest.map_from_camera, clip.intrinsics[frame]
+    nearest = views.view(RayCaster(maps.scene), camera, intrinsics, *clip.color_size)
     caption = "A frame of the recording, and the nearest view of the template."
-    return [Picture("nearest", plots.grid([middle, near], 2), caption)]
+    return [Picture("nearest", plots.grid([middle, nearest], 2), caption)]

@@ -1,4 +1,4 @@
-"""From one session's frames, masks and features to its poses and status."""
+"""Register one session from its frames, masks and features, and write its poses and status."""
 
 import json
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from pipeline.data.templates import SceneCameras, read_vertex_features
 from pipeline.localization import localizer as localizers
 from stages.register_videos import pictures, registration
 from stages.register_videos.config import Config
-from stages.register_videos.point_alignment import Walk
+from stages.register_videos.point_alignment import Walkthrough
 from stages.register_videos.registration import Maps, Registered, Rejected
 
 
@@ -36,7 +36,7 @@ class Inputs:
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") -> Registered | Rejected:
-    """Register one session and write its poses, or the reason why it does not fit."""
+    """Register one session and write its poses, or the reason for its rejection."""
     clip, masks = Clip.open(inputs.frames), Masks.open(inputs.masks)
     walk = SceneCameras.open(inputs.scene_template)
     features, scene_features = None, None
@@ -49,7 +49,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") ->
         scene_localizer=localizers.load(inputs.scene_localizer, device),
         agent_localizer=localizers.load(inputs.agent_localizer, device),
         scene_features=scene_features,
-        walk=Walk(Clip.open(next(iter(inputs.walk.values()))), walk.world_from_keyframe),
+        walk=Walkthrough(Clip.open(next(iter(inputs.walk.values()))), walk.world_from_keyframe),
     )
     rng = np.random.default_rng(config.seed)
     result = registration.register(clip, masks, maps, config, rng, features)

@@ -6,7 +6,7 @@ from scipy import sparse
 
 from pipeline.geometry import cameras, rigid
 from pipeline.mapping import pose_optimization
-from pipeline.mapping.bundle_adjustment import PointTerm, TrackedPoints, chained
+from pipeline.mapping.bundle_adjustment import PointTerm, TrackedPoints, build_tracks
 
 CAMERAS, POINTS, FOCAL_PX = 6, 80, 300.0
 NO_INDEX, NO_POINT = np.zeros(0, int), np.zeros((0, 3))
@@ -110,11 +110,11 @@ def test_points_that_show_twice_in_a_picture_are_none():
     pixels = [np.array([[1.0, 2], [3, 4], [5, 6]]), np.array([[7.0, 8], [9, 10]])]
     depths, pinhole = [np.array([1.0, np.nan, 2]), np.array([3.0, 4])], np.repeat(np.eye(3)[None], 2, axis=0)
     links = [(0, 1, np.array([[0, 0], [1, 1], [2, 1]]))]
-    found = chained(pixels, depths, pinhole, np.array([0, 1]), links)
+    found = build_tracks(pixels, depths, pinhole, np.array([0, 1]), links)
     assert found.pixel.tolist() == [[1, 2], [7, 8]] and found.depth_m.tolist() == [1, 3]
     assert found.camera.tolist() == found.lens.tolist() == [0, 1] and found.points == 1
 
 
 def test_points_that_pairs_of_cameras_share_are_counted():
     _, tracked = seen(np.random.default_rng(4))
-    assert (tracked.shared(CAMERAS) == POINTS).all()
+    assert (tracked.covisibility(CAMERAS) == POINTS).all()

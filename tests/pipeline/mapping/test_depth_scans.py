@@ -28,7 +28,7 @@ def test_scan_leaves_out_jumps_far_and_doubtful_depth():
     confidence[40:] = 0
     ignore = np.zeros(depth.shape, bool)
     ignore[:, :10] = True
-    found = depth_scans.scan(depth, K, stride=2, confidence=confidence, ignore=ignore, furthest_m=2.5)
+    found = depth_scans.scan(depth, K, stride=2, confidence=confidence, ignore=ignore, max_depth_m=2.5)
     row, column = np.unravel_index(found.pixel_index, depth.shape)
     assert row.min() >= 8
     assert row.max() < 40

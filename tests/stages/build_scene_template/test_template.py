@@ -75,11 +75,11 @@ def test_wrong_structure_is_refuted_by_depth(clip):
     rows = np.arange(len(frames) * 40)
     key, pixel = rows % len(frames), np.random.default_rng(0).uniform(20, 100, (len(rows), 2))
     points = np.stack(
-        [sfm.points_under(clip, int(frames[k]), p[None])[0] for k, p in zip(key, pixel, strict=True)]
+        [sfm.lift_pixels(clip, int(frames[k]), p[None])[0] for k, p in zip(key, pixel, strict=True)]
     )
     world = np.stack([rigid.apply(bent[k], p[None])[0] for k, p in zip(key, points, strict=True)])
     sparse = SparseModel(frames, bent, world, rows, key, pixel, 0.5, None)
-    start = anchor.choose_start(clip, frames, keyframes, sparse)
+    start = anchor.choose_trajectory(clip, frames, keyframes, sparse)
     assert start.source == "odometry"
     assert "depth" in start.reason
 
@@ -135,7 +135,7 @@ def test_points_are_chained_and_lie_where_the_room_is(clip, matched):
     assert np.bincount(tracked.point).min() >= 2
     pairs = np.stack([tracked.camera, tracked.point])
     assert len(np.unique(pairs, axis=1).T) == len(tracked.camera), "no point twice in a keyframe"
-    gap = clip.caster.mesh.vertices[:, None, 1].min() - tracked.lifted(clip.truth[frames])[:, 1]
+    gap = clip.caster.mesh.vertices[:, None, 1].min() - tracked.unproject(clip.truth[frames])[:, 1]
     assert np.quantile(gap, 0.95) < 0.05, "metres below the floor"
 
 
@@ -227,7 +227,7 @@ def test_false_matches_are_dropped_by_depth(clip, tmp_path):
         geometry.inlier_matches = wrong
         table.delete_two_view_geometry(*pairs[0])
         table.write_two_view_geometry(*pairs[0], geometry)
-    confirmed, all_pairs = sfm.confirm(clip, tmp_path / "database.db", np.random.default_rng(0))
+    confirmed, all_pairs = sfm.verify_matches(clip, tmp_path / "database.db", np.random.default_rng(0))
     assert all_pairs == len(pairs)
     assert confirmed == len(pairs) - 1, "the scrambled pair goes, the others stay"
 

@@ -12,13 +12,13 @@ from stages.register_videos import confidence
 def test_near_probability_is_the_share_of_draws_that_stay_near():
     rng = np.random.default_rng(0)
     sigma = (
-        np.array([0.5, 1.0, 3.0])[:, None] * np.array([confidence.NEAR_RAD] * 3 + [confidence.NEAR_M] * 3) / 2
+        np.array([0.5, 1.0, 3.0])[:, None] * np.array([confidence.TOL_RAD] * 3 + [confidence.TOL_M] * 3) / 2
     )
     pose_covariance = np.einsum("fi,ij->fij", sigma**2, np.eye(6))
-    found = confidence.near_probability(pose_covariance, rng, draws=4000)
+    found = confidence.within_tolerance(pose_covariance, rng, draws=4000)
     drawn = rng.normal(size=(3, 20000, 6)) * sigma[:, None]
-    near = (np.linalg.norm(drawn[..., :3], axis=-1) < confidence.NEAR_RAD) & (
-        np.linalg.norm(drawn[..., 3:], axis=-1) < confidence.NEAR_M
+    near = (np.linalg.norm(drawn[..., :3], axis=-1) < confidence.TOL_RAD) & (
+        np.linalg.norm(drawn[..., 3:], axis=-1) < confidence.TOL_M
     )
     assert np.abs(found - near.mean(1)).max() < 0.04
 
@@ -28,23 +28,23 @@ def test_what_looks_like_decoys_is_not_the_right_place(right, low, high):
     rng = np.random.default_rng(1)
     decoys = rng.normal(0.1, 0.15, 100)
     targets = np.where(np.arange(400) < right * 400, rng.normal(0.85, 0.05, 400), rng.normal(0.1, 0.15, 400))
-    found = confidence.right_place(targets, decoys, 3)
+    found = confidence.place_probability(targets, decoys, 3)
     assert low <= found.mean() <= high
     assert np.corrcoef(found, targets)[0, 1] > 0.9 or right in (0.0, 1.0)
 
 
 def test_nothing_to_compare_is_no_confidence():
-    assert (confidence.right_place(np.full(5, np.nan), np.array([0.1]), 3) == 0).all()
-    assert (confidence.right_place(np.full(5, 0.9), np.array([np.nan]), 3) < 0.2).all(), (
+    assert (confidence.place_probability(np.full(5, np.nan), np.array([0.1]), 3) == 0).all()
+    assert (confidence.place_probability(np.full(5, 0.9), np.array([np.nan]), 3) < 0.2).all(), (
         "no decoy, no evidence"
     )
 
 
 def test_decoys_are_wrong():
-    twist = confidence._wrong_twists(120, np.random.default_rng(0))
+    twist = confidence._decoy_twists(120, np.random.default_rng(0))
     turned, stepped = (
-        np.linalg.norm(twist[:, :3], axis=1) / confidence.NEAR_RAD,
-        np.linalg.norm(twist[:, 3:], axis=1) / confidence.NEAR_M,
+        np.linalg.norm(twist[:, :3], axis=1) / confidence.TOL_RAD,
+        np.linalg.norm(twist[:, 3:], axis=1) / confidence.TOL_M,
     )
     assert np.maximum(turned, stepped).min() > 1.49
     assert np.allclose(rigid.log(rigid.exp(twist))[:, 3:], twist[:, 3:], atol=1e-6)
@@ -52,6 +52,6 @@ def test_decoys_are_wrong():
 
 def test_averages_leave_what_is_far_unknown():
     time = np.arange(20.0)
-    found = confidence.averaged(time, time[:5], np.linspace(0, 1, 5), 1.0)
+    found = confidence.kernel_mean(time, time[:5], np.linspace(0, 1, 5), 1.0)
     assert found[2] == pytest.approx(0.5, abs=0.02)
     assert np.isnan(found[12:]).all()

@@ -31,7 +31,7 @@ def seen(
 
 
 def chosen(sights: list[RootHypotheses]) -> list[int]:
-    return headings.choose(np.arange(len(sights)) * 0.1, sights)
+    return headings.choose_hypotheses(np.arange(len(sights)) * 0.1, sights)
 
 
 def test_animals_walk_head_first():
@@ -70,7 +70,7 @@ def test_noise_of_single_placements_is_no_turn():
         for frame in range(60)
     ]
     assert chosen(sights) == [0] * 60
-    faced = headings.path(np.arange(60) * 0.1, sights)
+    faced = headings.decode_headings(np.arange(60) * 0.1, sights)
     assert np.abs(np.rad2deg(rigid.wrap(faced - np.deg2rad(1.5 * np.arange(60))))).mean() < 15, (
         "degrees, of 20 in single frames"
     )

@@ -19,10 +19,10 @@ def test_displaced_cameras_return():
     truth = truth @ rigid.exp(np.tile([0.03, -0.02, 0.02, 0.03, 0.02, -0.03], (FRAMES, 1)))
     known = path.copy()
     known[::4] = np.nan
-    walked = point_alignment.Walk(MemoryClip(caster, path, None), known)
+    walked = point_alignment.Walkthrough(MemoryClip(caster, path, None), known)
     session = MemoryClip(caster, truth, None)
     start = truth @ rigid.exp(np.random.default_rng(0).normal(0, 1, (FRAMES, 6)) * ([0.01] * 3 + [0.02] * 3))
-    term = point_alignment.WalkTerm(session, NoAgent(FRAMES), start, walked)
+    term = point_alignment.WalkthroughTerm(session, NoAgent(FRAMES), start, walked)
     found = optimize_poses(start, lambda *_: NOTHING, None, reach_m=(1.0,) * 8, term=term).world_from_camera
     before, after = (model.errors(poses, truth) for poses in (start, found))
     assert np.median(after[1]) < 0.3 * np.median(before[1]) and np.median(after[0]) < 0.3 * np.median(

@@ -145,18 +145,18 @@ def test_a_repainted_room_of_the_same_shape_is_refused(maps):
     assert right["dim"] > 2 * config.gate.min_appearance
     votes = voting.collect(clip, NoAgent(40), maps.scene_localizer, VoteConfig(every_frames=8))
     doubtful, sure = (
-        replace(votes, answers=[replace(answer, probability=p) for answer in votes.answers])
+        replace(votes, hypotheses=[replace(hypothesis, probability=p) for hypothesis in votes.hypotheses])
         for p in (0.3, 0.9)
     )
-    supports, fit = np.ones(len(votes.frame), bool), np.full(40, 0.9)
-    assert "looks different" in registration.rejection_reason(fit, right["other"], doubtful, supports, config)
-    assert registration.rejection_reason(fit, right["dim"], doubtful, supports, config) is None
-    assert registration.rejection_reason(fit, right["other"], sure, supports, config) is None, (
+    inliers, fit = np.ones(len(votes.frame), bool), np.full(40, 0.9)
+    assert "looks different" in registration.rejection_reason(fit, right["other"], doubtful, inliers, config)
+    assert registration.rejection_reason(fit, right["dim"], doubtful, inliers, config) is None
+    assert registration.rejection_reason(fit, right["other"], sure, inliers, config) is None, (
         "recognised with certainty"
     )
-    rare = replace(doubtful, asked=10 * len(votes.frame))
+    rare = replace(doubtful, queries=10 * len(votes.frame))
     assert "were recognised and agree" in registration.rejection_reason(
-        fit, right["dim"], rare, supports, config
+        fit, right["dim"], rare, inliers, config
     ), "chance, of so many"
 
 
@@ -168,20 +168,20 @@ def test_frames_without_static_depth_do_not_speak_against_a_recording(maps):
     ]
     blind = depth_scans.scan(np.zeros(clip.depth_size), clip.depth_intrinsics[0], stride=9)
     votes = voting.collect(clip, NoAgent(12), maps.scene_localizer, VoteConfig(every_frames=2))
-    votes, supports = (
-        replace(votes, answers=[replace(one, probability=0.9) for one in votes.answers]),
+    votes, inliers = (
+        replace(votes, hypotheses=[replace(one, probability=0.9) for one in votes.hypotheses]),
         np.ones(len(votes.frame), bool),
     )
     gap, fit = alignment.measure_fit(surface, [blind] * 8 + seen[8:], truth)
     assert (np.isnan(fit) == np.isnan(gap)).all()
     assert np.isnan(fit).sum() == 8
-    assert registration.rejection_reason(fit, 0.9, votes, supports, config) is None, "the four others fit"
+    assert registration.rejection_reason(fit, 0.9, votes, inliers, config) is None, "the four others fit"
     _, fit = alignment.measure_fit(surface, [blind] * 11 + seen[11:], truth)
-    assert "only 1 of 12 frames measured" in registration.rejection_reason(fit, 0.9, votes, supports, config)
+    assert "only 1 of 12 frames measured" in registration.rejection_reason(fit, 0.9, votes, inliers, config)
     away = rigid.make(np.eye(3), np.array([0.0, 3.0, 0.0])) @ truth
     gap, fit = alignment.measure_fit(surface, seen, away)
     assert (fit[np.isnan(gap)] == 0).all(), "depth that meets nothing is no fit"
-    assert "5 cm of the room" in registration.rejection_reason(fit, 0.9, votes, supports, config)
+    assert "5 cm of the room" in registration.rejection_reason(fit, 0.9, votes, inliers, config)
 
 
 @pytest.mark.filterwarnings("error")
@@ -193,7 +193,7 @@ def test_what_was_not_measured_is_null(maps):
         np.ones(3),
         registration.Roots.unseen(3),
         np.zeros(3),
-        voting.none_cast(),
+        voting.no_votes(),
         np.zeros(0, bool),
         1.0,
     )

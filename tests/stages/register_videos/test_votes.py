@@ -16,13 +16,13 @@ from tests.stages.textured_room import UP, drifting, walk
 
 def cast(truth, frames, wrong, rng) -> voting.FrameVotes:
     """Return votes with 1 deg and 2 cm of noise, some of them anywhere."""
-    answers = []
+    hypotheses = []
     for frame, bad in zip(frames, wrong, strict=True):
         pose = truth[frame] @ rigid.exp(rng.normal(0, 1, 6) * ([np.deg2rad(1.0)] * 3 + [0.02] * 3))
         if bad:
             pose = rigid.exp(np.concatenate([UP * rng.uniform(-3, 3), rng.uniform(-1, 1, 3)])) @ pose
-        answers.append(PoseHypothesis(pose, 0.4, 0.4 if bad else 0.8, np.zeros((0, 3)), np.zeros((0, 3))))
-    return voting.FrameVotes(frames, answers, len(frames), answers[0])
+        hypotheses.append(PoseHypothesis(pose, 0.4, 0.4 if bad else 0.8, np.zeros((0, 3)), np.zeros((0, 3))))
+    return voting.FrameVotes(frames, hypotheses, len(frames), hypotheses[0])
 
 
 def test_one_motion_is_found_among_wrong_votes():
@@ -30,13 +30,13 @@ def test_one_motion_is_found_among_wrong_votes():
     frames = np.arange(2, 60, 5)
     wrong = rng.random(len(frames)) < 0.5
     drifted = drifting(truth, 4)
-    agreement = voting.agree(cast(truth, frames, wrong, rng), drifted, True, VoteConfig())
+    agreement = voting.find_agreement(cast(truth, frames, wrong, rng), drifted, True, VoteConfig())
     carried = agreement.world_from_odometry @ drifted
     assert np.rad2deg(rigid.rotation_angle(carried[:, :3, :3], truth[:, :3, :3])).max() < 3.0, (
         "degrees, drift included"
     )
     assert np.linalg.norm(carried[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.12, "metres"
-    assert (agreement.supports == ~wrong).mean() > 0.9
+    assert (agreement.inliers == ~wrong).mean() > 0.9
     assert agreement.world_from_odometry[1, 1] > 1 - 1e-9, "gravity stays"
 
 
@@ -44,9 +44,9 @@ def test_scattered_votes_are_refused():
     rng, truth, options = np.random.default_rng(1), walk(60), VoteConfig()
     frames = np.arange(2, 60, 5)
     votes = cast(truth, frames, np.ones(len(frames), bool), rng)
-    agreement = voting.agree(votes, drifting(truth, 4), True, options)
-    assert "agree" in voting.rejection_reason(votes, agreement.supports if agreement else None)
-    few = voting.FrameVotes(frames[:1], votes.answers[:1], 12, votes.nearest)
+    agreement = voting.find_agreement(votes, drifting(truth, 4), True, options)
+    assert "agree" in voting.rejection_reason(votes, agreement.inliers if agreement else None)
+    few = voting.FrameVotes(frames[:1], votes.hypotheses[:1], 12, votes.nearest)
     assert "recognised" in voting.rejection_reason(few, None)
 
 
@@ -65,11 +65,11 @@ def test_without_odometry_votes_are_propagated_by_visual_odometry_and_outliers_d
     wrong = np.isin(np.arange(len(frames)), [3, 8])
     votes = cast(truth, frames, wrong, rng)
     for index in np.flatnonzero(wrong):
-        votes.answers[index].map_from_camera[:3, 3] += 3.0
+        votes.hypotheses[index].map_from_camera[:3, 3] += 3.0
     motion, time = broken_odometry(truth, 31), np.arange(60) * 0.1
-    supports = odometry.consistent_votes(votes, time, motion, options)
-    assert (supports == ~wrong).all()
-    poses = odometry.propagate_votes(votes, supports, time, motion)
+    inliers = odometry.consistent_votes(votes, time, motion, options)
+    assert (inliers == ~wrong).all()
+    poses = odometry.propagate_votes(votes, inliers, time, motion)
     error = np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1)
     assert np.median(error) < 0.04, "metres"
     assert error.max() < 0.15, "metres, the jump included"
