@@ -1,6 +1,6 @@
-"""What a field reads places from: dense grids of several resolutions, or an MLP on a positional encoding.
+"""Spatial encodings of fields: multi-resolution dense grids, or an MLP with positional encoding.
 
-Both map points in the field's frame, metres, to channels and say in ``channels`` how many.
+Both map points in the field's frame, metres, to ``channels`` channels.
 """
 
 import math
@@ -42,7 +42,7 @@ class DenseGrid(nn.Module):
         self.channels = channels * len(voxel_m)
 
     def forward(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point channel"]:
-        """Interpolate at points, metres, in the field's frame; outside the box the border's values hold."""
+        """Interpolate at points in the field's frame, metres; outside the box the border values hold."""
         found = []
         for extent, level in zip(self.extents, self.levels, strict=True):
             place = ((points - self.low) / extent * 2 - 1).view(1, 1, 1, -1, 3)

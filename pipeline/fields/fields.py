@@ -1,4 +1,4 @@
-"""The canonical structure T: what is where in the scene and on the agent (paper 001, Eqs. 1-2).
+"""The canonical structure T: neural fields of the scene and the agent (paper 001, Eqs. 1-2).
 
 `Field` maps points to signed distance, color and feature: a multi-resolution dense grid or an MLP with
 positional encoding, and two small heads, with a learnable code per video for the scene. Where geometry was
@@ -27,30 +27,30 @@ from pipeline.fields.fused_depth import FusedGeometry
 
 FEATURE_CHANNELS = 16
 FUSED_CHANNELS = fused.CHANNELS
-SOFTNESS_M = (0.003, 0.006)
-"""range of the density's scale beta: sharper ones lose the gradient between samples, softer ones blur thin
-limbs and give everything a rim, which is rendered between it and what lies behind"""
-START_SOFTNESS_M, START_RANGE_M = 0.1, (0.004, 0.2)
-"""beta and its range where rendering alone finds surfaces: samples are a decimetre apart at first"""
-START_SATURATION = 0.9
+BETA_RANGE_M = (0.003, 0.006)
+"""range of the density's scale beta: below it the gradient vanishes between samples, above it thin limbs blur
+and silhouettes get a halo"""
+INITIAL_BETA_M, WIDE_RANGE_M = 0.1, (0.004, 0.2)
+"""initial beta and its range where rendering alone finds surfaces: samples are 0.1 m apart at first"""
+MAX_START_SATURATION = 0.9
 """share of the truncation that an untrained distance stays below: at 1 its tanh has no gradient"""
-START_LOG_BETA = -5.1
-"""of fields supervised by distances: the upper end of the range"""
+INITIAL_LOG_BETA = -5.1
+"""initial log(beta) of fields supervised by distances: the upper end of the range"""
 MIN_FEATURE = 1e-4
-"""shorter features are not brought to unit length: their gradient would explode"""
+"""shorter features are not normalized: their gradient would explode"""
 CODE_STD = 0.1
 """standard deviation of untrained codes"""
 LATTICE_M = 0.05
 """resolution at which a learned scene is extracted, below its finest cell"""
-CORRECTION_M = 0.1
-"""cells of the learned correction of skinning weights"""
+DELTA_VOXEL_M = 0.1
+"""cell size of the grid of learned corrections of skinning weights"""
 MIN_PROBABILITY = 0.02
 """fused colors are kept this far from 0 and 1 for their logit"""
 
 
 @dataclass(frozen=True)
 class FieldShape:
-    """Everything that fixes the parameters' shapes of a field."""
+    """Everything that determines the shapes of a field's parameters."""
 
     low_m: tuple[float, float, float]
     """lower corner of the box"""
@@ -74,15 +74,15 @@ class FieldShape:
 
 @dataclass(frozen=True)
 class Values:
-    """What a field holds at points."""
+    """Values of a field at points."""
 
     signed_distance: Float[Tensor, "point"]
     color: Float[Tensor, "point 3"]
     feature: Float[Tensor, "point 16"]
 
 
-def encoding_of(shape: FieldShape) -> DenseGrid | PositionalMLP:
-    """Return what a field reads places from."""
+def make_encoding(shape: FieldShape) -> DenseGrid | PositionalMLP:
+    """Build the spatial encoding of a field."""
     match shape.encoding:
         case "grid":
             return DenseGrid(shape.low_m, shape.high_m, shape.voxel_m, shape.grid_channels)
@@ -99,7 +99,7 @@ class Field(nn.Module):
         """``free_m`` is the signed distance that an untrained field gives where nothing is fused."""
         super().__init__()
         self.shape, self.fused = shape, fused
-        self.grid = encoding_of(shape)
+        self.grid = make_encoding(shape)
         self.codes = nn.Embedding(max(shape.videos, 1), shape.code_channels) if shape.videos else None
         inputs = (
             self.grid.channels
@@ -115,7 +115,7 @@ class Field(nn.Module):
                 nn.init.zeros_(last.bias)
             elif limit:
                 nn.init.constant_(
-                    last.bias, torch.atanh(torch.tensor(min(free_m / limit, START_SATURATION))).item()
+                    last.bias, torch.atanh(torch.tensor(min(free_m / limit, MAX_START_SATURATION))).item()
                 )
             else:
                 nn.init.constant_(last.bias, free_m)
@@ -124,7 +124,7 @@ class Field(nn.Module):
             nn.init.zeros_(last.weight.data[:3])
             nn.init.zeros_(last.bias.data[:3])
         self.log_beta = nn.Parameter(
-            torch.tensor(math.log(START_SOFTNESS_M) if shape.starts_as_box else START_LOG_BETA)
+            torch.tensor(math.log(INITIAL_BETA_M) if shape.starts_as_box else INITIAL_LOG_BETA)
         )
         if self.codes:
             nn.init.normal_(self.codes.weight, std=CODE_STD)
@@ -147,19 +147,19 @@ class Field(nn.Module):
             video: whose scene; -1 for the scene that the videos share. None without codes.
             code: whose code instead of the video's own (scene annealing).
         """
-        read = [self.grid(points)]
+        parts = [self.grid(points)]
         if self.codes is not None:
             code = video if code is None else code
-            assert code is not None, "the scene of several videos is asked for one of them"
-            read.append(
+            assert code is not None, "a scene with codes needs the index of a video"
+            parts.append(
                 torch.where(code[:, None] < 0, self.codes.weight.mean(0), self.codes(code.clamp_min(0)))
             )
         if self.fused:
-            read.append(self.fused(points, video))
+            parts.append(self.fused(points, video))
         if self.shape.starts_as_box:
             low, high = (points.new_tensor(corner) for corner in (self.shape.low_m, self.shape.high_m))
-            read.append(torch.minimum(points - low, high - points).amin(-1, keepdim=True))
-        return torch.cat(read, dim=-1)
+            parts.append(torch.minimum(points - low, high - points).amin(-1, keepdim=True))
+        return torch.cat(parts, dim=-1)
 
     def distance(self, encoded: Float[Tensor, "point channel"]) -> Float[Tensor, "point"]:
         """Return signed distances, metres, positive in free space: fused ones, or else the head's."""
@@ -206,21 +206,21 @@ class Field(nn.Module):
     @property
     def beta_m(self) -> Float[Tensor, ""]:
         """The scale of the Laplace distribution in `density`, metres."""
-        return self.log_beta.exp().clamp(*(START_RANGE_M if self.shape.starts_as_box else SOFTNESS_M))
+        return self.log_beta.exp().clamp(*(WIDE_RANGE_M if self.shape.starts_as_box else BETA_RANGE_M))
 
     def density(
         self, signed_distance: Float[Tensor, "*point"], min_beta_m: float = 0.0
     ) -> Float[Tensor, "*point"]:
-        """Return the density of its signed distances, per metre; saturated ones are free.
+        """Convert signed distances to density per metre; saturated distances are free space.
 
-        A first pass of importance sampling asks for a beta of at least half the spacing of its samples, so
-        that no surface is lost between two of them.
+        ``min_beta_m``: the coarse pass of importance sampling sets it to half its sample spacing, so that no
+        surface falls between two samples.
         """
         return density(signed_distance, self.beta_m.clamp_min(min_beta_m), self.shape.truncation_m)
 
 
 def _head(inputs: int, width: int, outputs: int) -> tuple[nn.Sequential, nn.Linear]:
-    """Return two layers, and the last of them."""
+    """Return a two-layer MLP and its last layer."""
     first, last = nn.Linear(inputs, width), nn.Linear(width, outputs)
     return nn.Sequential(first, nn.ReLU(), last), last
 
@@ -230,8 +230,8 @@ def density(
 ) -> Float[Tensor, "*point"]:
     """Turn signed distance into volume density per metre: a Laplace CDF (Yariv et al., VolSDF, Eqs. 2-3).
 
-    Distances that saturate at ``truncation_m`` say no more than that space is free: what the CDF has left
-    there is subtracted, or metres of free space would add up to a fog.
+    For distances that saturate at ``truncation_m`` the remaining tail of the CDF is subtracted; otherwise
+    free space would accumulate opacity.
     """
     tail = 0.5 * torch.exp(-signed_distance.abs() / beta_m)
     cdf = torch.where(signed_distance > 0, tail, 1 - tail)
@@ -251,11 +251,11 @@ class ArticulatedBody(nn.Module):
         bone_scale_m: Float[Tensor, "bone 3"],
         shape: FieldShape,
     ):
-        """The learned correction of the weights lives on a grid of `CORRECTION_M` in the box of ``shape``."""
+        """``shape``: box of the grid (`DELTA_VOXEL_M`) that holds the learned correction of the weights."""
         super().__init__()
         self.register_buffer("agent_from_bone_rest", agent_from_bone_rest)
         self.log_scale = nn.Parameter(bone_scale_m.log())
-        self.delta = DenseGrid(shape.low_m, shape.high_m, (CORRECTION_M,), len(bone_scale_m), initial=0.0)
+        self.delta = DenseGrid(shape.low_m, shape.high_m, (DELTA_VOXEL_M,), len(bone_scale_m), initial=0.0)
 
     @property
     def bone_scale_m(self) -> Float[Tensor, "bone 3"]:
@@ -288,17 +288,17 @@ class ArticulatedBody(nn.Module):
     ) -> Float[Tensor, "*#batch point 3"]:
         """Move posed points back to the rest shape (backward warp).
 
-        The weights come from the posed bones; the learned correction is read where they alone would land.
+        The weights come from the posed bones; the learned correction is read at the uncorrected rest points.
         """
         scale = self.bone_scale_m
         distance = -skinning.squared_mahalanobis(points_posed, agent_from_bone, scale)
         with torch.no_grad():
-            landing = self._back(points_posed, agent_from_bone, distance.softmax(-1))
-        return self._back(points_posed, agent_from_bone, (distance + self._delta(landing)).softmax(-1))
+            guess = self._unwarp(points_posed, agent_from_bone, distance.softmax(-1))
+        return self._unwarp(points_posed, agent_from_bone, (distance + self._delta(guess)).softmax(-1))
 
-    def _back(self, points_posed: Tensor, agent_from_bone: Tensor, weights: Tensor) -> Tensor:
+    def _unwarp(self, points_posed: Tensor, agent_from_bone: Tensor, weights: Tensor) -> Tensor:
         posed_from_rest = skinning.blend(weights, agent_from_bone, self.agent_from_bone_rest)
-        return skinning.move(posed_from_rest, points_posed, back=True)
+        return skinning.move(posed_from_rest, points_posed, inverse=True)
 
 
 @dataclass(frozen=True)
@@ -336,15 +336,15 @@ def save(folder: Path, reconstruction: Reconstruction) -> None:
 
 
 def load(folder: Path, device: str = "cpu") -> Reconstruction:
-    """Read what `save` wrote, ready to be asked (no gradients)."""
+    """Read what `save` wrote, in evaluation mode without gradients."""
     table = json.loads((folder / "fields.json").read_text())
     shapes = {name: _shape_of(table[name]) for name in ("scene", "agent")}
     state = load_file(folder / "scene_field.safetensors")
-    ground = {key.removeprefix("fused."): value for key, value in state.items() if key.startswith("fused.")}
+    stored = {key.removeprefix("fused."): value for key, value in state.items() if key.startswith("fused.")}
     geometry = None
-    if ground:
-        voxel_m, truncation_m = ground["sizes"].tolist()
-        geometry = FusedGeometry(ground["low"], voxel_m, truncation_m, ground["table"], ground["blocks"])
+    if stored:
+        voxel_m, truncation_m = stored["sizes"].tolist()
+        geometry = FusedGeometry(stored["low"], voxel_m, truncation_m, stored["table"], stored["blocks"])
     scene = Field(shapes["scene"], free_m=0.1, fused=geometry)
     agent = Field(shapes["agent"], free_m=0.1)
     body = ArticulatedBody(

@@ -1,4 +1,4 @@
-"""What a camera sees of 3D Gaussians before they are blended: the footprint that all rasterizers share."""
+"""Image-space footprints of 3D Gaussians, shared by all rasterizers."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,13 @@ NEAREST_M = 0.1
 """Gaussians nearer than this to the camera are not drawn"""
 ALPHA_MIN, ALPHA_MAX = 1 / 255, 0.99
 """opacities below the first are not drawn, those above the second are held there (Kerbl et al. 2023)"""
-REACH = 3.33
-"""footprints end at this many standard deviations, where 0.99 has fallen to 1/255"""
+CUTOFF = 3.33
+"""standard deviations at which footprints are cut off: there an opacity of 0.99 has fallen to 1/255"""
 
 
 @dataclass(frozen=True)
 class Footprints:
-    """Gaussians as one camera sees them."""
+    """Gaussians projected into one camera."""
 
     pixel: Float[Tensor, "point 2"]
     conic: Float[Tensor, "point 3"]

@@ -1,9 +1,9 @@
 """Measured depth of a scene, fused into sparse blocks of voxels: signed distance and color.
 
-`FusedGeometry` is the fixed geometry of the scene's field. A table holds for each video the block of 8 x 8 x
-8 cells at each place, or none (free or unseen); videos share their blocks except where one saw something else
-(moved things), and the last row of the table is the scene that all share. Blocks hold the nodes on all their
-faces, so that interpolation never leaves a block.
+`FusedGeometry` is the fixed geometry of the scene's field. A table maps each video and place to a block of
+8 x 8 x 8 cells, or to none (free or unseen). Videos share blocks except where one saw something else (moved
+things); the last row is the shared scene. Blocks include the nodes on all their faces, so that interpolation
+never leaves a block.
 """
 
 import torch
@@ -15,8 +15,8 @@ CELLS = 8
 NODES = CELLS + 1
 CHANNELS = 5
 """signed distance / truncation, red, green, blue in 0..1 times the next, 1 where a color is known"""
-NOWHERE = 0
-"""the block that stands for free and for unseen space"""
+EMPTY_BLOCK = 0
+"""index of the block for free and unseen space"""
 
 
 class FusedGeometry(nn.Module):
@@ -56,7 +56,7 @@ class FusedGeometry(nn.Module):
         return float(self.sizes[1])
 
     def is_own(self, points: Float[Tensor, "point 3"], video: int) -> Bool[Tensor, "point"]:
-        """Return where a video has a block of its own: it saw something else than all videos together."""
+        """Return where a video has a block of its own because it differs from the shared scene."""
         cell = ((points - self.low) / self.sizes[0]).floor().long()
         return self._block(cell, torch.full_like(cell[:, 0], video)) != self._block(
             cell, torch.full_like(cell[:, 0], -1)
@@ -71,7 +71,7 @@ class FusedGeometry(nn.Module):
     def forward(
         self, points: Float[Tensor, "point 3"], video: Int[Tensor, "point"]
     ) -> Float[Tensor, "point 5"]:
-        """Interpolate at world points, metres, as a video (-1: all together) saw them.
+        """Interpolate at world points, metres, in a video's scene (-1: the shared scene).
 
         Returns signed distance in units of the truncation, color in 0..1 (grey where unknown), and its
         confidence.
@@ -80,22 +80,22 @@ class FusedGeometry(nn.Module):
         place = (points - self.low) / self.sizes[0]
         cell = place.detach().floor().long()
         block = self._block(cell, video)
-        near = torch.nonzero(block != NOWHERE)[:, 0]
+        hit = torch.nonzero(block != EMPTY_BLOCK)[:, 0]
         return (
-            result.index_put((near,), self._mix(block[near], cell[near] % CELLS, (place - cell)[near]))
-            if len(near)
+            result.index_put((hit,), self._trilinear(block[hit], cell[hit] % CELLS, (place - cell)[hit]))
+            if len(hit)
             else result
         )
 
-    def _mix(
-        self, block: Int[Tensor, "point"], within: Int[Tensor, "point 3"], part: Float[Tensor, "point 3"]
+    def _trilinear(
+        self, block: Int[Tensor, "point"], within: Int[Tensor, "point 3"], offset: Float[Tensor, "point 3"]
     ) -> Float[Tensor, "point 5"]:
-        """Interpolate in blocks: ``within`` counts cells from the block's corner, ``part`` is the rest."""
+        """Interpolate in blocks: ``within`` counts cells from the block's corner, ``offset`` is the rest."""
         nodes = (within[:, None] + self.corners) @ torch.tensor(
             [NODES * NODES, NODES, 1], device=within.device
         )
         values = self.blocks.view(-1, CHANNELS)[(block * NODES**3)[:, None] + nodes].float()
-        share = torch.where(self.corners.bool(), part[:, None], 1 - part[:, None]).prod(-1)
+        share = torch.where(self.corners.bool(), offset[:, None], 1 - offset[:, None]).prod(-1)
         mixed = (share[..., None] * values).sum(1)
         known = mixed[:, 4:]
         color = torch.where(
@@ -110,4 +110,4 @@ class FusedGeometry(nn.Module):
         inside = ((block >= 0) & (block < size)).all(-1)
         row = torch.where(video < 0, len(self.table) - 1, video)
         x, y, z = torch.minimum(block.clamp_min(0), size - 1).unbind(-1)
-        return torch.where(inside, self.table[row, x, y, z].long(), NOWHERE)
+        return torch.where(inside, self.table[row, x, y, z].long(), EMPTY_BLOCK)

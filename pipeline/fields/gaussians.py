@@ -1,7 +1,7 @@
-"""3D Gaussians of scene and agent: made from meshes, posed by bones, drawn together, kept in PLY.
+"""3D Gaussians of scene and agent: initialized from meshes, posed by bones, rendered, stored as PLY.
 
-`Gaussians` holds learnable Gaussians; `from_mesh` covers a surface with them; `Splats` puts the room and the
-posed agent before one camera; `save_ply` and `load_ply` use the 62 floats a row that every viewer of 3DGS
+`Gaussians` holds learnable Gaussians; `from_mesh` covers a surface with them; `Splats` holds the room and the
+articulated agent; `save_ply` and `load_ply` use the 62 floats a row that every viewer of 3DGS
 reads, `load_scene` the room as it stood in one video.
 """
 
@@ -20,10 +20,10 @@ from pipeline.geometry import rigid_torch
 from pipeline.geometry.meshes import Mesh
 
 BAND0 = 0.28209479177387814
-"""value of the constant spherical harmonic"""
-FOOTPRINT = 0.7
+"""value of the spherical harmonic of degree 0"""
+SIGMA_PER_SPACING = 0.7
 """standard deviation of a surface's Gaussians, in spacings of its points: neighbours overlap"""
-START_OPACITY = 0.9
+INITIAL_OPACITY = 0.9
 """of a surface's Gaussians; nearer to 1 the logit has no gradient"""
 OPACITY_MARGIN = 1e-4
 """opacities are kept this far from 0 and 1 for their logit"""
@@ -33,7 +33,7 @@ ROTATION = slice(SCALE.stop, SCALE.stop + 4)
 HIGHER_BANDS = sum(name.startswith("f_rest") for name in gaussian_ply.COLUMNS)
 """columns of a file of Gaussians; the higher bands are 0 here"""
 THICKEST_M = 0.004
-"""a surface's Gaussians are no thicker, or wide ones would stand out of it"""
+"""maximum thickness of surface Gaussians, so that wide ones do not stick out"""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Gaussians(nn.Module):
         return self.band0 * BAND0 + 0.5
 
     def cloud(self, which: Int[Tensor, "chosen"] | slice = slice(None)) -> Cloud:
-        """Return all or some of them as they stand, in their own frame."""
+        """Return all or some Gaussians in their own frame."""
         opacity = self.opacity_logit[which].sigmoid()
         color = self.band0[which] * BAND0 + 0.5
         return Cloud(
@@ -106,20 +106,20 @@ class SurfaceSamples:
     color: Float[np.ndarray, "point 3"]
     """0..1"""
     spacing_m: float
-    """how far apart they lie"""
+    """mean distance of neighbours"""
 
 
 def sample_surface(mesh: Mesh, number: int, rng: np.random.Generator) -> SurfaceSamples:
-    """Spread points over a colored surface, the same number on equal areas."""
+    """Sample a colored surface uniformly by area (stratified)."""
     assert mesh.color is not None, "the surface has no colors"
-    corner = mesh.vertices[mesh.faces].astype(np.float64)
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    triangle = mesh.vertices[mesh.faces].astype(np.float64)
+    normal = np.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
     area = 0.5 * np.linalg.norm(normal, axis=-1)
-    along = np.cumsum(area) / area.sum()
-    face = np.searchsorted(along, (np.arange(number) + rng.random()) / number).clip(0, len(area) - 1)
-    mix = rng.dirichlet(np.ones(3), number)
-    points = np.einsum("pk,pkd->pd", mix, corner[face])
-    color = np.einsum("pk,pkc->pc", mix, mesh.color[mesh.faces[face]] / 255)
+    cdf = np.cumsum(area) / area.sum()
+    face = np.searchsorted(cdf, (np.arange(number) + rng.random()) / number).clip(0, len(area) - 1)
+    bary = rng.dirichlet(np.ones(3), number)
+    points = np.einsum("pk,pkd->pd", bary, triangle[face])
+    color = np.einsum("pk,pkc->pc", bary, mesh.color[mesh.faces[face]] / 255)
     return SurfaceSamples(
         points,
         normal[face] / np.maximum(2 * area[face, None], 1e-12),
@@ -134,24 +134,24 @@ def surface_gaussians(
     color: Float[np.ndarray, "point 3"],
     spacing_m: float | Float[np.ndarray, "point"],
 ) -> Gaussians:
-    """Lay a flat Gaussian on each point of a surface, as wide as the points lie apart; colors in 0..1."""
-    size = np.log(FOOTPRINT * np.broadcast_to(spacing_m, len(points)))
-    log_scale = np.stack([size, size, np.minimum(size - np.log(5), np.log(THICKEST_M))], axis=-1)
+    """Place a flat Gaussian at each surface point, scaled by the point spacing; colors in 0..1."""
+    wide = np.log(SIGMA_PER_SPACING * np.broadcast_to(spacing_m, len(points)))
+    log_scale = np.stack([wide, wide, np.minimum(wide - np.log(5), np.log(THICKEST_M))], axis=-1)
     parts = (
         torch.from_numpy(part).float()
-        for part in (points, _facing(normal), log_scale, np.full(len(points), START_OPACITY), color)
+        for part in (points, _facing(normal), log_scale, np.full(len(points), INITIAL_OPACITY), color)
     )
     return Gaussians(*parts)
 
 
 def from_mesh(mesh: Mesh, number: int, rng: np.random.Generator) -> Gaussians:
     """Cover a colored surface evenly with flat Gaussians."""
-    covered = sample_surface(mesh, number, rng)
-    return surface_gaussians(covered.points, covered.normal, covered.color, covered.spacing_m)
+    samples = sample_surface(mesh, number, rng)
+    return surface_gaussians(samples.points, samples.normal, samples.color, samples.spacing_m)
 
 
 def _facing(normal: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point 4"]:
-    """Return quaternions that turn the z axis onto unit normals, by the shortest way."""
+    """Return the shortest-arc quaternions from the z axis to unit normals."""
     w = 1 + normal[:, 2]
     turned = np.stack([w, -normal[:, 1], normal[:, 0], np.zeros_like(w)], axis=-1)
     turned[w < 1e-6] = [0.0, 1.0, 0.0, 0.0]
@@ -174,7 +174,7 @@ class Splats(nn.Module):
         videos: int,
         stands: Bool[Tensor, "row point"] | None = None,
     ):
-        """``stands``: which Gaussians each video shows and, last, which all share; None: all of them."""
+        """``stands``: which Gaussians each video and, last, the shared scene contains; None: all."""
         super().__init__()
         self.scene, self.agent = scene, agent
         self.register_buffer("agent_weights", agent_weights)
@@ -186,7 +186,7 @@ class Splats(nn.Module):
         """per video: red, green, blue <- matrix @ (red, green, blue, 1)"""
 
     def place_scene(self, video: int | None, which: Int[Tensor, "chosen"] | None = None) -> Cloud:
-        """Return the room, or Gaussians of it, as it was in one video (None: as all videos share it)."""
+        """Return the room, or some of its Gaussians, in one video (None: the shared scene)."""
         here = self.stands[-1 if video is None else video]
         which = torch.nonzero(here)[:, 0] if which is None else which[here[which]]
         return self._exposed(self.scene.cloud(which), video)
@@ -197,12 +197,12 @@ class Splats(nn.Module):
         agent_from_bone: Float[Tensor, "bone 4 4"],
         video: int | None,
     ) -> Cloud:
-        """Return the animal in one pose, in the light of one video."""
+        """Return the animal in one pose, with the exposure of one video."""
         agent = self.agent.cloud()
         agent_from_rest = skinning.blend(self.agent_weights, agent_from_bone, self.agent_from_bone_rest)
         heading = rigid_torch.quaternion_from_rotation(world_from_agent[:3, :3])
-        turn = skinning.multiply(heading, agent_from_rest[:4].T)
-        rotation = skinning.multiply(turn, functional.normalize(agent.rotation, dim=-1))
+        turn = skinning.multiply_quaternions(heading, agent_from_rest[:4].T)
+        rotation = skinning.multiply_quaternions(turn, functional.normalize(agent.rotation, dim=-1))
         posed = replace(
             agent,
             means=rigid_torch.apply(world_from_agent, skinning.move(agent_from_rest, agent.means)),
@@ -219,7 +219,7 @@ class Splats(nn.Module):
 
 
 def concatenate(*clouds: Cloud) -> Cloud:
-    """Put clouds into one."""
+    """Concatenate clouds."""
     return Cloud(
         *(torch.cat([getattr(cloud, name) for cloud in clouds]) for name in Cloud.__dataclass_fields__)
     )
@@ -232,7 +232,7 @@ class RenderedCloud:
     color: Float[Tensor, "height width 3"]
     """over black"""
     depth: Float[Tensor, "height width"]
-    """mean z where something is, metres"""
+    """mean z, normalized by coverage, metres"""
     agent: Float[Tensor, "height width"]
     coverage: Float[Tensor, "height width"]
     extra: Float[Tensor, "height width channel"]
@@ -264,7 +264,7 @@ def render(
 
 
 def save_ply(path: Path, gaussians: Gaussians, which: Bool[Tensor, "point"]) -> None:
-    """Write some Gaussians as a standard 3D Gaussian PLY; others than `drawable` no reader could draw."""
+    """Write some Gaussians as a standard 3DGS PLY; exclude those that are not `drawable`."""
     with torch.no_grad():
         rotation = functional.normalize(gaussians.rotation, dim=-1)
         rest = torch.zeros(len(gaussians), HIGHER_BANDS, device=rotation.device)
@@ -286,7 +286,7 @@ def save_ply(path: Path, gaussians: Gaussians, which: Bool[Tensor, "point"]) -> 
 
 @torch.no_grad()
 def drawable(gaussians: Gaussians) -> Bool[Tensor, "point"]:
-    """Return which Gaussians are worth a file: finite ones of an opacity of at least 1/255."""
+    """Return which Gaussians are finite and have an opacity of at least 1/255."""
     finite = torch.stack(
         [
             getattr(gaussians, name).reshape(len(gaussians), -1).isfinite().all(-1)

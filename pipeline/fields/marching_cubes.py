@@ -54,7 +54,7 @@ def paint(field: Field, mesh: Mesh, code: int) -> Mesh:
 
 
 def extract_scene(field: Field, code: int, step_m: float) -> Mesh:
-    """Return the scene's surface as one video's code (-1: all videos') shapes it, colored."""
+    """Return the scene's surface for one video's code (-1: the shared scene), colored."""
     low, high = _box(field)
     volume = sample_distance(
         lambda points: field.distance_at(points, torch.full((len(points),), code, device=points.device)),
@@ -67,7 +67,7 @@ def extract_scene(field: Field, code: int, step_m: float) -> Mesh:
 
 @torch.no_grad()
 def extract_moved(field: Field, code: int) -> Mesh:
-    """Return the surfaces that one video saw and that are not where all videos together have one, colored."""
+    """Return the surfaces of one video that the shared scene does not have, colored."""
     assert field.fused is not None, "only fused scenes differ from video to video"
     pieces, count = [Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))], 0
     for low, distance in zip(*field.fused.own_blocks(code), strict=True):
@@ -103,7 +103,7 @@ def extract_agent(field: Field, step_m: float) -> Mesh:
 
 
 def keep_vertices(mesh: Mesh, keep: Bool[np.ndarray, "vertex"]) -> Mesh:
-    """Return the mesh without the other vertices and the faces that need them."""
+    """Return the mesh restricted to the kept vertices and the faces between them."""
     index = np.cumsum(keep) - 1
     faces = index[mesh.faces[keep[mesh.faces].all(-1)]].astype(np.int32)
     return Mesh(mesh.vertices[keep], faces, None if mesh.color is None else mesh.color[keep])

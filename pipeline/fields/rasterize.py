@@ -1,6 +1,6 @@
 """Draw 3D Gaussians (Kerbl et al. 2023): `project` them into a camera, then blend them front to back.
 
-`blend_dense` is the readable reference in torch, for a handful of Gaussians. `draw` uses the tile rasteriser
+`blend_dense` is the readable reference in torch, for few Gaussians. `draw` uses the tile rasteriser
 for a CPU or gsplat on CUDA; the tile rasteriser is tested against the reference, values and gradients.
 """
 
@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.fields.footprints import ALPHA_MAX, ALPHA_MIN, BLUR_PX2, NEAREST_M, REACH, Footprints
+from pipeline.fields.footprints import ALPHA_MAX, ALPHA_MIN, BLUR_PX2, CUTOFF, NEAREST_M, Footprints
 from pipeline.geometry import rigid_torch
 
 Backend = Literal["tiles", "dense", "gsplat"]
-BEYOND = 0.15
-"""footprints are linearised at most this share of the picture beyond its edges, as in 3DGS"""
+VIEW_MARGIN = 0.15
+"""footprints are linearized at most this share of the picture outside its edges, as in 3DGS"""
 
 
 def project(
@@ -25,28 +25,28 @@ def project(
 ) -> Footprints:  # fmt: skip
     """Project Gaussians by the local affine approximation of the camera (Zwicker et al. 2002).
 
-    The approximation is taken no farther than 15 % outside the picture, where it would explode.
+    The linearization point is clamped to 15 % outside the picture; farther out it would diverge.
 
     Args:
         rotation: quaternions wxyz, world from the Gaussian's own axes.
         log_scale: logarithm of the standard deviations in metres.
     """
-    turn = camera_from_world[:3, :3]
-    x, y, depth = (means_world @ turn.T + camera_from_world[:3, 3]).unbind(-1)
+    view = camera_from_world[:3, :3]
+    x, y, depth = (means_world @ view.T + camera_from_world[:3, 3]).unbind(-1)
     z = depth.clamp_min(NEAREST_M)
     fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
     zero = torch.zeros_like(z)
-    right = (x / z).clamp(-(BEYOND * width + cx) / fx, ((1 + BEYOND) * width - cx) / fx)
-    down = (y / z).clamp(-(BEYOND * height + cy) / fy, ((1 + BEYOND) * height - cy) / fy)
+    right = (x / z).clamp(-(VIEW_MARGIN * width + cx) / fx, ((1 + VIEW_MARGIN) * width - cx) / fx)
+    down = (y / z).clamp(-(VIEW_MARGIN * height + cy) / fy, ((1 + VIEW_MARGIN) * height - cy) / fy)
     affine = torch.stack(
         [torch.stack([fx / z, zero, -fx * right / z], -1), torch.stack([zero, fy / z, -fy * down / z], -1)],
         dim=1,
     )
-    spread = affine @ turn @ (rigid_torch.rotation_from_quaternion(rotation) * log_scale.exp()[:, None])
-    covariance = spread @ spread.transpose(1, 2)
+    factor = affine @ view @ (rigid_torch.rotation_from_quaternion(rotation) * log_scale.exp()[:, None])
+    covariance = factor @ factor.transpose(1, 2)
     a, b, c = covariance[:, 0, 0] + BLUR_PX2, covariance[:, 0, 1], covariance[:, 1, 1] + BLUR_PX2
     determinant = (a * c - b * b).clamp_min(1e-6)
-    radius = REACH * (0.5 * (a + c) + (0.25 * (a - c) ** 2 + b * b).clamp_min(1e-9).sqrt()).detach().sqrt()
+    radius = CUTOFF * (0.5 * (a + c) + (0.25 * (a - c) ** 2 + b * b).clamp_min(1e-9).sqrt()).detach().sqrt()
     return Footprints(
         torch.stack([fx * x / z + cx, fy * y / z + cy], -1),
         torch.stack([c, -b, a], -1) / determinant[:, None],
@@ -60,10 +60,10 @@ def in_view(
     means_world: Float[Tensor, "point 3"], log_scale: Float[Tensor, "point 3"],
     camera_from_world: Float[Tensor, "4 4"], intrinsics: Float[Tensor, "3 3"], height: int, width: int,
 ) -> Int[Tensor, "chosen"]:  # fmt: skip
-    """Return which Gaussians may touch the picture, quickly: a sphere around each does."""
+    """Return which Gaussians may overlap the picture, by their bounding spheres."""
     camera = means_world @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
     z = camera[:, 2].clamp_min(NEAREST_M)
-    reach = REACH * log_scale.amax(-1).exp() / z * intrinsics[0, 0] + 2
+    reach = CUTOFF * log_scale.amax(-1).exp() / z * intrinsics[0, 0] + 2
     x, y = (intrinsics[axis, axis] * camera[:, axis] / z + intrinsics[axis, 2] for axis in (0, 1))
     inside = (x > -reach) & (x < width + reach) & (y > -reach) & (y < height + reach)
     return torch.nonzero(inside & (camera[:, 2] > NEAREST_M))[:, 0]
@@ -81,14 +81,14 @@ def blend_dense(
     order = order[footprints.depth[order] > NEAREST_M]
     down, right = (torch.arange(side, device=opacity.device) + 0.5 for side in (height, width))
     y, x = torch.meshgrid(down, right, indexing="ij")
-    across = torch.stack([x, y], dim=-1)[None] - footprints.pixel[order][:, None, None]
-    dx, dy = across.unbind(-1)
+    offset = torch.stack([x, y], dim=-1)[None] - footprints.pixel[order][:, None, None]
+    dx, dy = offset.unbind(-1)
     a, b, c = (part[:, None, None] for part in footprints.conic[order].unbind(-1))
-    energy = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-    alpha = (opacity[order][:, None, None] * torch.exp(-energy)).clamp_max(ALPHA_MAX)
-    alpha = torch.where((alpha < ALPHA_MIN) | (energy > 0.5 * REACH**2), torch.zeros_like(alpha), alpha)
-    through = torch.cumprod(1 - alpha, dim=0)
-    weight = alpha * torch.cat([torch.ones_like(through[:1]), through[:-1]])
+    power = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    alpha = (opacity[order][:, None, None] * torch.exp(-power)).clamp_max(ALPHA_MAX)
+    alpha = torch.where((alpha < ALPHA_MIN) | (power > 0.5 * CUTOFF**2), torch.zeros_like(alpha), alpha)
+    transmittance = torch.cumprod(1 - alpha, dim=0)
+    weight = alpha * torch.cat([torch.ones_like(transmittance[:1]), transmittance[:-1]])
     return torch.einsum("phw,pc->hwc", weight, values[order]), weight.sum(0)
 
 

@@ -12,13 +12,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.fields.footprints import ALPHA_MAX, ALPHA_MIN, NEAREST_M, REACH, Footprints
+from pipeline.fields.footprints import ALPHA_MAX, ALPHA_MIN, CUTOFF, NEAREST_M, Footprints
 
 TILE = 8
-PARTS = 4
-"""buffers of gradients; tiles are dealt to them in turn"""
-THROUGH_MIN = np.float32(1e-4)
-_MIN, _MAX, _ENERGY = np.float32(ALPHA_MIN), np.float32(ALPHA_MAX), np.float32(0.5 * REACH**2)
+BUFFERS = 4
+"""gradient buffers; tiles are assigned to them round-robin"""
+MIN_TRANSMITTANCE = np.float32(1e-4)
+_MIN, _MAX, _MAX_POWER = np.float32(ALPHA_MIN), np.float32(ALPHA_MAX), np.float32(0.5 * CUTOFF**2)
 _HALF, _ONE = np.float32(0.5), np.float32(1.0)
 
 
@@ -50,12 +50,12 @@ def _bin(pixel, radius, order, height, width):
 
 @numba.njit(cache=True, inline="always")
 def _alpha(pixel, conic, opacity, i, x, y):
-    """Return (alpha, unclamped alpha, dx, dy); alpha 0 where the Gaussian does not count."""
+    """Return (alpha, unclamped alpha, dx, dy); alpha is 0 where the Gaussian is negligible."""
     dx, dy = x - pixel[i, 0], y - pixel[i, 1]
-    energy = _HALF * (conic[i, 0] * dx * dx + conic[i, 2] * dy * dy) + conic[i, 1] * dx * dy
-    if energy > _ENERGY or energy < 0:
+    power = _HALF * (conic[i, 0] * dx * dx + conic[i, 2] * dy * dy) + conic[i, 1] * dx * dy
+    if power > _MAX_POWER or power < 0:
         return np.float32(0), np.float32(0), dx, dy
-    raw = opacity[i] * np.float32(math.exp(-energy))
+    raw = opacity[i] * np.float32(math.exp(-power))
     if raw < _MIN:
         return np.float32(0), raw, dx, dy
     return min(_MAX, raw), raw, dx, dy
@@ -65,13 +65,13 @@ def _alpha(pixel, conic, opacity, i, x, y):
 def _forward(pixel, conic, opacity, values, start, ids, height, width):
     across, channels = (width + TILE - 1) // TILE, values.shape[1]
     image = np.zeros((height, width, channels), np.float32)
-    through = np.ones((height, width), np.float32)
+    final_t = np.ones((height, width), np.float32)
     last = np.zeros((height, width), np.int64)
     for tile in numba.prange(len(start) - 1):
         top, left = (tile // across) * TILE, (tile % across) * TILE
         for row in range(top, min(height, top + TILE)):
             for column in range(left, min(width, left + TILE)):
-                left_over, end = _ONE, start[tile]
+                transmittance, end = _ONE, start[tile]
                 for k in range(start[tile], start[tile + 1]):
                     i = ids[k]
                     alpha, _, _, _ = _alpha(
@@ -80,32 +80,32 @@ def _forward(pixel, conic, opacity, values, start, ids, height, width):
                     if alpha == 0:
                         continue
                     for channel in range(channels):
-                        image[row, column, channel] += alpha * left_over * values[i, channel]
-                    left_over *= _ONE - alpha
+                        image[row, column, channel] += alpha * transmittance * values[i, channel]
+                    transmittance *= _ONE - alpha
                     end = k + 1
-                    if left_over < THROUGH_MIN:
+                    if transmittance < MIN_TRANSMITTANCE:
                         break
-                through[row, column] = left_over
+                final_t[row, column] = transmittance
                 last[row, column] = end
-    return image, through, last
+    return image, final_t, last
 
 
 @numba.njit(cache=True, parallel=True)
-def _backward(pixel, conic, opacity, values, start, ids, through, last, grad_image, grad_coverage):
+def _backward(pixel, conic, opacity, values, start, ids, final_t, last, grad_image, grad_coverage):
     """Walk each pixel's Gaussians far to near, undoing the blending, and gather gradients per Gaussian.
 
     Columns: pixel x y, conic a b c, opacity, then the values.
     """
     height, width, channels = grad_image.shape
     across = (width + TILE - 1) // TILE
-    grads = np.zeros((PARTS, len(pixel), 6 + channels), np.float32)
-    for part in numba.prange(PARTS):
+    grads = np.zeros((BUFFERS, len(pixel), 6 + channels), np.float32)
+    for buffer in numba.prange(BUFFERS):
         behind = np.zeros(channels, np.float32)
-        for tile in range(part, len(start) - 1, PARTS):
+        for tile in range(buffer, len(start) - 1, BUFFERS):
             top, left = (tile // across) * TILE, (tile % across) * TILE
             for row in range(top, min(height, top + TILE)):
                 for column in range(left, min(width, left + TILE)):
-                    left_over = through[row, column]
+                    transmittance = final_t[row, column]
                     behind[:] = 0
                     for k in range(last[row, column] - 1, start[tile] - 1, -1):
                         i = ids[k]
@@ -114,24 +114,24 @@ def _backward(pixel, conic, opacity, values, start, ids, through, last, grad_ima
                         )
                         if alpha == 0:
                             continue
-                        left_over /= _ONE - alpha
-                        weight = alpha * left_over
-                        slope = through[row, column] / (_ONE - alpha) * grad_coverage[row, column]
+                        transmittance /= _ONE - alpha
+                        weight = alpha * transmittance
+                        grad_alpha = final_t[row, column] / (_ONE - alpha) * grad_coverage[row, column]
                         for channel in range(channels):
                             upstream = grad_image[row, column, channel]
-                            grads[part, i, 6 + channel] += weight * upstream
-                            slope += (
-                                left_over * values[i, channel] - behind[channel] / (_ONE - alpha)
+                            grads[buffer, i, 6 + channel] += weight * upstream
+                            grad_alpha += (
+                                transmittance * values[i, channel] - behind[channel] / (_ONE - alpha)
                             ) * upstream
                             behind[channel] += weight * values[i, channel]
                         if raw < _MAX:
-                            grads[part, i, 5] += slope * raw / opacity[i]
-                            pull = -slope * raw
-                            grads[part, i, 0] -= pull * (conic[i, 0] * dx + conic[i, 1] * dy)
-                            grads[part, i, 1] -= pull * (conic[i, 2] * dy + conic[i, 1] * dx)
-                            grads[part, i, 2] += pull * _HALF * dx * dx
-                            grads[part, i, 3] += pull * dx * dy
-                            grads[part, i, 4] += pull * _HALF * dy * dy
+                            grads[buffer, i, 5] += grad_alpha * raw / opacity[i]
+                            grad_power = -grad_alpha * raw
+                            grads[buffer, i, 0] -= grad_power * (conic[i, 0] * dx + conic[i, 1] * dy)
+                            grads[buffer, i, 1] -= grad_power * (conic[i, 2] * dy + conic[i, 1] * dx)
+                            grads[buffer, i, 2] += grad_power * _HALF * dx * dx
+                            grads[buffer, i, 3] += grad_power * dx * dy
+                            grads[buffer, i, 4] += grad_power * _HALF * dy * dy
     return grads
 
 
@@ -143,27 +143,27 @@ class _Blend(torch.autograd.Function):
         pixel, conic, opacity, values = (
             tensor.detach().contiguous().numpy() for tensor in (pixel, conic, opacity, values)
         )
-        reach, near = radius.detach().numpy(), depth.detach().numpy()
+        reach, depths = radius.detach().numpy(), depth.detach().numpy()
         x, y = pixel.T
         seen = (
-            (near > NEAREST_M)
+            (depths > NEAREST_M)
             & (x + reach > 0)
             & (x - reach < width)
             & (y + reach > 0)
             & (y - reach < height)
         )
         order = np.flatnonzero(seen)
-        order = order[np.argsort(near[order], kind="stable")]
+        order = order[np.argsort(depths[order], kind="stable")]
         start, ids = _bin(pixel, reach, order, height, width)
-        image, through, last = _forward(pixel, conic, opacity, values, start, ids, height, width)
-        context.state = (pixel, conic, opacity, values, start, ids, through, last)
-        return torch.from_numpy(image), torch.from_numpy(1 - through)
+        image, final_t, last = _forward(pixel, conic, opacity, values, start, ids, height, width)
+        context.state = (pixel, conic, opacity, values, start, ids, final_t, last)
+        return torch.from_numpy(image), torch.from_numpy(1 - final_t)
 
     @staticmethod
     def backward(context, grad_image, grad_coverage):
-        pixel, conic, opacity, values, start, ids, through, last = context.state
+        pixel, conic, opacity, values, start, ids, final_t, last = context.state
         upstream = grad_image.contiguous().numpy(), grad_coverage.contiguous().numpy()
-        grads = _backward(pixel, conic, opacity, values, start, ids, through, last, upstream[0], upstream[1])
+        grads = _backward(pixel, conic, opacity, values, start, ids, final_t, last, upstream[0], upstream[1])
         total = torch.from_numpy(grads.sum(0))
         return total[:, :2], total[:, 2:5], total[:, 5], total[:, 6:], None, None, None, None
 

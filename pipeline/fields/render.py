@@ -20,19 +20,19 @@ from pipeline.geometry.meshes import Mesh, RayCaster
 
 MIN_OPACITY = 0.5
 """rendered depth is known where the fields are at least this opaque"""
-MIN_TOTAL = 1e-4
-"""opacity below which depth is not divided by it: keeps the quotient finite"""
+MIN_DIVISOR = 1e-4
+"""lower bound of the opacity that depth is divided by"""
 RAYS_AT_ONCE = 4096
 """rays rendered together, for memory"""
 NEAREST_M = 0.1
 """rendered rays begin here"""
 UNIFORM_WEIGHT = 1e-5
-"""added to the weights of importance sampling, so that rays that met nothing are sampled evenly"""
+"""added to the weights of importance sampling, so that empty rays are sampled uniformly"""
 
 
 @dataclass(frozen=True)
 class Layer:
-    """What one field gives along rays."""
+    """One field's density, color and features at samples along rays."""
 
     density: Float[Tensor, "ray sample"]
     """per metre"""
@@ -41,7 +41,7 @@ class Layer:
 
     @classmethod
     def of(cls, field: Field, values: Values, shape: tuple[int, ...], min_beta_m: float = 0.0) -> "Layer":
-        """Lay out what a field holds at samples; `Field.density` explains ``min_beta_m``."""
+        """Reshape a field's values at samples; for ``min_beta_m`` see `Field.density`."""
         density = field.density(values.signed_distance, min_beta_m).view(shape)
         return cls(density, values.color.view(*shape, 3), values.feature.view(*shape, -1))
 
@@ -58,19 +58,19 @@ class Layer:
 
 @dataclass(frozen=True)
 class Rendered:
-    """What rays see."""
+    """Composited values of rays."""
 
     color: Float[Tensor, "ray 3"]
     feature: Float[Tensor, "ray 16"]
     depth: Float[Tensor, "ray"]
-    """expected z in metres over what is hit"""
+    """expected z in metres, normalized by opacity"""
     agent: Float[Tensor, "ray"]
     """opacity of the agent, 0..1"""
     opacity: Float[Tensor, "ray"]
     weight: Float[Tensor, "ray sample"]
     """of each sample in the sums above"""
     agent_share: Float[Tensor, "ray sample"]
-    """of the agent in each sample's density"""
+    """share of the agent in each sample's density"""
 
 
 def ray_weights(
@@ -79,14 +79,14 @@ def ray_weights(
     """Return the weight of each sample in the rendering integral (paper 001, Eq. 15); arguments as
     `composite`'s.
 
-    A sample stands for its ray up to halfway to its neighbours.
+    Each sample represents the interval up to halfway to its neighbours.
     """
-    optical = density * _ends(depth_m).diff(dim=-1) * length[:, None]
-    return torch.exp(-(optical.cumsum(-1) - optical)) * (1 - torch.exp(-optical))
+    optical_depth = density * _interval_edges(depth_m).diff(dim=-1) * length[:, None]
+    return torch.exp(-(optical_depth.cumsum(-1) - optical_depth)) * (1 - torch.exp(-optical_depth))
 
 
-def _ends(depth_m: Float[Tensor, "ray sample"]) -> Float[Tensor, "ray end"]:
-    """Return where the parts of a ray that its samples stand for begin and end."""
+def _interval_edges(depth_m: Float[Tensor, "ray sample"]) -> Float[Tensor, "ray end"]:
+    """Return the boundaries of the intervals that the samples of a ray represent."""
     half = depth_m.diff(dim=-1) / 2
     middle = depth_m[:, :-1] + half
     return torch.cat([depth_m[:, :1] - half[:, :1], middle, depth_m[:, -1:] + half[:, -1:]], dim=-1)
@@ -98,14 +98,14 @@ def importance_depths(
     density: Float[Tensor, "ray sample"],
     generator: Generator | None = None,
 ) -> Float[Tensor, "ray sample"]:
-    """Draw as many further samples, z in metres, by the weights of a first pass (NeRF, Mildenhall et al.
+    """Draw as many more samples, z in metres, from the weights of a coarse pass (NeRF, Mildenhall et al.
     2020, Sec. 5.2).
 
     Stratified with a ``generator``, else at the middle of each stratum.
     """
     weight = ray_weights(depth_m, length, density) + UNIFORM_WEIGHT
     cdf = torch.nn.functional.pad((weight / weight.sum(-1, keepdim=True)).cumsum(-1), (1, 0))
-    ends, count = _ends(depth_m), depth_m.shape[1]
+    edges, count = _interval_edges(depth_m), depth_m.shape[1]
     offset = (
         torch.full(depth_m.shape, 0.5)
         if generator is None
@@ -114,8 +114,8 @@ def importance_depths(
     uniform = (torch.arange(count, device=depth_m.device) + offset.to(depth_m.device)) / count
     after = torch.searchsorted(cdf, uniform.contiguous(), right=True).clamp(1, count)
     low, high = cdf.gather(1, after - 1), cdf.gather(1, after)
-    part = ((uniform - low) / (high - low).clamp_min(UNIFORM_WEIGHT / count)).clamp(0, 1)
-    return torch.lerp(ends.gather(1, after - 1), ends.gather(1, after), part)
+    fraction = ((uniform - low) / (high - low).clamp_min(UNIFORM_WEIGHT / count)).clamp(0, 1)
+    return torch.lerp(edges.gather(1, after - 1), edges.gather(1, after), fraction)
 
 
 def composite(
@@ -140,7 +140,7 @@ def composite(
         feature = feature + share[..., None] * (agent.feature - feature)
     weight = ray_weights(depth_m, length, density)
     opacity = weight.sum(-1)
-    depth = (weight * depth_m).sum(-1) / opacity.clamp_min(MIN_TOTAL)
+    depth = (weight * depth_m).sum(-1) / opacity.clamp_min(MIN_DIVISOR)
     color, feature = ((weight[..., None] * values).sum(-2) for values in (color, feature))
     return Rendered(color, feature, depth, (weight * share).sum(-1), opacity, weight, share)
 
@@ -176,7 +176,7 @@ def render_depth(
 
     pose = tensor(world_from_camera)
     directions = tensor(cameras.ray_directions(intrinsics, height, width).reshape(-1, 3))
-    even = NEAREST_M + (farthest_m - NEAREST_M) * (torch.arange(samples // 2, device=device) + 0.5) / (
+    uniform = NEAREST_M + (farthest_m - NEAREST_M) * (torch.arange(samples // 2, device=device) + 0.5) / (
         samples // 2
     )
     agent_pose = None
@@ -186,10 +186,10 @@ def render_depth(
     depths, agents = [], []
     for direction in directions.split(RAYS_AT_ONCE):
         rays = _PosedRays(reconstruction, pose, direction, code, agent_pose)
-        length, depth = direction.norm(dim=-1), even.expand(len(direction), -1)
+        length, depth = direction.norm(dim=-1), uniform.expand(len(direction), -1)
         scene, agent = rays.layers(depth, spacing / 2)
-        both = scene.density if agent is None else scene.density + agent.density
-        fine = importance_depths(depth, length, both)
+        total = scene.density if agent is None else scene.density + agent.density
+        fine = importance_depths(depth, length, total)
         depth = torch.cat([depth, fine], dim=1).sort(dim=1).values
         rendered = composite(depth, length, *rays.layers(depth))
         depths.append(torch.where(rendered.opacity >= MIN_OPACITY, rendered.depth, 0))

@@ -1,9 +1,9 @@
-"""The motion of one animal on the body of another of the same plan, quadruped to quadruped.
+"""Retarget the motion of one animal to another with the same body plan, quadruped to quadruped.
 
-Bones are learned per animal and mean nothing to each other, so surfaces carry the motion: `corresponding`
-finds for places of one body those of the other by the extents of both, `transferred` moves them as the other
-body moves, and `fitted_bones` finds the bone poses whose linear blend comes nearest to that. `carried_root`
-takes the root along. Shapes are canonical (agent frame, +z towards the head), metres.
+Bones are learned per animal and do not correspond, so motion is transferred by surfaces:
+`find_correspondences` aligns the extents of both bodies, `transfer` moves the corresponding points with the
+source, and `fit_bones` finds the bone poses whose linear blend fits them best. `retarget_root`
+scales the path. Shapes are canonical (agent frame, +z towards the head), metres.
 """
 
 from dataclasses import dataclass
@@ -15,25 +15,25 @@ from scipy.spatial import KDTree
 from pipeline.geometry import rigid, subsampling
 
 NEIGHBOURS = 4
-"""Surface points that a corresponding place takes its weights from."""
+"""Nearest source vertices from which skinning weights are interpolated."""
 EXTENT_PERCENT = (1.0, 99.0)
-"""Between these percentiles of its vertices a body extends, along each axis."""
+"""Percentiles of the vertices that define a body's extent along each axis."""
 SURFACE_POINTS = 600
 """Vertices of the target that bones are fitted to, evenly chosen."""
 SWEEPS = 6
 """Passes over all bones; a body retargeted to itself is then within a millimetre."""
 FRAMES_AT_ONCE = 256
-PRIOR = 1e-3
-"""Weight of the transferred rotation against the fitted points: it decides where points lie on a line."""
+ROTATION_PRIOR = 1e-3
+"""Weight of the transferred rotation relative to the points: resolves fits of collinear points."""
 
 
 @dataclass(frozen=True)
 class SkinnedShape:
-    """A surface at rest and what moves it."""
+    """A surface at rest with its skinning weights and bones."""
 
     vertices: Float[np.ndarray, "vertex 3"]
     weights: Float[np.ndarray, "vertex bone"]
-    """of a linear blend"""
+    """linear blend skinning"""
     agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
 
     @property
@@ -63,23 +63,23 @@ def retarget(
     part = SkinnedShape(
         target.vertices[chosen].astype(float), target.weights[chosen], target.agent_from_bone_rest
     )
-    place, weights = corresponding(source, target, part.vertices)
+    place, weights = find_correspondences(source, target, part.vertices)
     bones, residual = [], []
     for start in range(0, len(agent_from_bone), FRAMES_AT_ONCE):
         motion = agent_from_bone[start : start + FRAMES_AT_ONCE] @ rigid.inverse(source.agent_from_bone_rest)
-        moved, turned = transferred(motion, weights, place)
-        fitted, away = fitted_bones(part, _scaled(source, target, moved), turned)
+        target_points, rotations = transfer(motion, weights, place)
+        fitted, distance = fit_bones(part, _scaled(source, target, target_points), rotations)
         bones.append(fitted @ target.agent_from_bone_rest)
-        residual.append(away)
-    root = carried_root(source, target, world_from_agent)
+        residual.append(distance)
+    root = retarget_root(source, target, world_from_agent)
     return Retargeted(root, np.concatenate(bones), np.concatenate(residual))
 
 
-def corresponding(
+def find_correspondences(
     source: SkinnedShape, target: SkinnedShape, points: Float[np.ndarray, "point 3"]
 ) -> tuple[Float[np.ndarray, "point 3"], Float[np.ndarray, "point source_bone"]]:
-    """Return where points of the target lie in the source once its extents are those of the target, and the
-    skinning weights of the source there."""
+    """Map points of the target into the source by aligning extents; also return the source's skinning weights
+    there."""
     place = _scaled(target, source, points)
     distance, nearest = KDTree(source.vertices).query(place, k=NEIGHBOURS)
     share = 1 / np.maximum(distance, 1e-6)
@@ -88,84 +88,85 @@ def corresponding(
 
 
 def shape_distance_m(source: SkinnedShape, target: SkinnedShape) -> float:
-    """Return the mean distance of the target's vertices from the source's once its extents are the target's:
-    how far the plans of both bodies differ, metres."""
+    """Return how far the body plans differ: mean distance from the target's vertices to the source's after
+    aligning extents, metres."""
     scaled = _scaled(source, target, source.vertices.astype(float))
     return float(KDTree(scaled).query(target.vertices)[0].mean())
 
 
-def transferred(
+def transfer(
     motion: Float[np.ndarray, "frame bone 4 4"],
     weights: Float[np.ndarray, "point bone"],
     place: Float[np.ndarray, "point 3"],
 ) -> tuple[Float[np.ndarray, "frame point 3"], Float[np.ndarray, "frame point 3 3"]]:
-    """Move places by the linear blend of bone motions (posed from rest); also return how each is turned."""
+    """Move points by linear blend skinning with motions (posed from rest); also return their rotations."""
     blended = np.einsum("pb,fbij->fpij", weights, motion)
     return np.einsum("fpij,pj->fpi", blended[..., :3, :3], place) + blended[..., :3, 3], blended[..., :3, :3]
 
 
-def fitted_bones(
+def fit_bones(
     body: SkinnedShape,
     points: Float[np.ndarray, "frame vertex 3"],
-    turned: Float[np.ndarray, "frame vertex 3 3"],
+    rotations: Float[np.ndarray, "frame vertex 3 3"],
 ) -> tuple[Float[np.ndarray, "frame bone 4 4"], Float[np.ndarray, "frame vertex"]]:
-    """Find bone motions (posed from rest) whose linear blend puts the vertices nearest to points, and what is
-    left.
+    """Fit bone motions (posed from rest) to posed vertices by least squares; also return residuals.
 
-    One bone after another takes what the others leave (Le and Deng, Smooth Skinning Decomposition with Rigid
-    Bones, 2012, Sec. 5.2); weights stay.
+    Block coordinate descent over bones (Le and Deng, Smooth Skinning Decomposition with Rigid Bones, 2012,
+    Sec. 5.2); weights are fixed.
     """
     frames, bones = len(points), body.weights.shape[1]
     motion = np.tile(np.eye(4), (frames, bones, 1, 1))
     for sweep in range(SWEEPS + 1):
         for bone in range(bones):
-            held = body.weights[:, bone] > 1e-3
-            weight, rest = body.weights[held, bone], body.vertices[held]
-            if not held.any():
+            influenced = body.weights[:, bone] > 1e-3
+            weight, rest = body.weights[influenced, bone], body.vertices[influenced]
+            if not influenced.any():
                 continue
-            goal = points[:, held] * weight[:, None]
+            goal = points[:, influenced] * weight[:, None]
             if sweep:  # the first pass lets every bone follow its own points
-                others = np.einsum("vb,fbij->fvij", body.weights[held], motion)
+                others = np.einsum("vb,fbij->fvij", body.weights[influenced], motion)
                 others -= weight[:, None, None] * motion[:, None, bone]
-                goal = points[:, held] - np.einsum("fvij,vj->fvi", others[..., :3, :3], rest)
+                goal = points[:, influenced] - np.einsum("fvij,vj->fvi", others[..., :3, :3], rest)
                 goal -= others[..., :3, 3]
-            motion[:, bone] = _rigid(weight, rest, goal, turned[:, held])
+            motion[:, bone] = _fit_rigid(weight, rest, goal, rotations[:, influenced])
     blended = np.einsum("vb,fbij->fvij", body.weights, motion)
-    shown = np.einsum("fvij,vj->fvi", blended[..., :3, :3], body.vertices) + blended[..., :3, 3]
-    return motion, np.linalg.norm(shown - points, axis=-1)
+    posed = np.einsum("fvij,vj->fvi", blended[..., :3, :3], body.vertices) + blended[..., :3, 3]
+    return motion, np.linalg.norm(posed - points, axis=-1)
 
 
-def _rigid(
+def _fit_rigid(
     weight: Float[np.ndarray, "vertex"],
     rest: Float[np.ndarray, "vertex 3"],
     goal: Float[np.ndarray, "frame vertex 3"],
-    turned: Float[np.ndarray, "frame vertex 3 3"],
+    rotations: Float[np.ndarray, "frame vertex 3 3"],
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Minimize the squares of ``goal - weight * (rotation rest + translation)``, frame by frame."""
+    """Minimize the squares of ``goal - weight * (rotation rest + translation)`` in each frame."""
     square = (weight**2).sum()
-    middle = weight**2 @ rest / square
-    centre = np.einsum("v,fvi->fi", weight, goal) / square
-    around = rest - middle
-    spread = (weight**2 * (around**2).sum(-1)).sum()
-    covariance = np.einsum("v,fvi,vj->fij", weight, goal - weight[:, None] * centre[:, None], around)
-    covariance += (PRIOR * spread + 1e-12) * np.einsum("v,fvij->fij", weight / weight.sum(), turned)
+    rest_centroid = weight**2 @ rest / square
+    centroid = np.einsum("v,fvi->fi", weight, goal) / square
+    centred = rest - rest_centroid
+    variance = (weight**2 * (centred**2).sum(-1)).sum()
+    covariance = np.einsum("v,fvi,vj->fij", weight, goal - weight[:, None] * centroid[:, None], centred)
+    covariance += (ROTATION_PRIOR * variance + 1e-12) * np.einsum(
+        "v,fvij->fij", weight / weight.sum(), rotations
+    )
     left, _, right = np.linalg.svd(covariance)
     left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
     rotation = left @ right
-    return rigid.make(rotation, centre - np.einsum("fij,j->fi", rotation, middle))
+    return rigid.make(rotation, centroid - np.einsum("fij,j->fi", rotation, rest_centroid))
 
 
-def carried_root(
+def retarget_root(
     source: SkinnedShape, target: SkinnedShape, world_from_agent: Float[np.ndarray, "frame 4 4"]
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Return the root of the target: steps as much longer as its root is higher above its feet, from where
-    the source begins, and as much higher above what carries it."""
-    legs, own_legs = -source.extent[0, 1], -target.extent[0, 1]
+    """Scale the root's horizontal path by the ratio of root heights above the feet, from the same start, and
+    raise it by their difference."""
+    source_height, target_height = -source.extent[0, 1], -target.extent[0, 1]
     root = world_from_agent.copy()
     place, begin = root[:, :3, 3], root[0, :3, 3].copy()
     level = [0, 2]
-    place[:, level] = begin[level] + (place[:, level] - begin[level]) * (own_legs / legs)
-    place[:, 1] += own_legs - legs
+    place[:, level] = begin[level] + (place[:, level] - begin[level]) * (target_height / source_height)
+    place[:, 1] += target_height - source_height
     return root
 
 

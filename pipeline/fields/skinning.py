@@ -1,4 +1,4 @@
-"""Skin the agent: which bone moves which point, and where the blended bones take it.
+"""Skinning of the agent: weights of Gaussian bones and dual-quaternion blending.
 
 `skinning_weights` gives the probability of each bone for each point (Gaussian bones, softmax over the
 negative squared Mahalanobis distance); `blend` mixes the bones' motions by dual quaternions; `move` applies
@@ -21,7 +21,7 @@ def squared_mahalanobis(
     agent_from_bone: Float[Tensor, "*#batch bone 4 4"],
     bone_scale_m: Float[Tensor, "bone 3"],
 ) -> Float[Tensor, "*#batch point bone"]:
-    """Measure each point from each Gaussian bone in units of the bone's scale, squared.
+    """Return the squared Mahalanobis distance of each point from each Gaussian bone.
 
     Each distance is the quadric p' Q p of the homogeneous point p: one matrix product for all points and
     bones.
@@ -54,7 +54,7 @@ def skinning_weights(
     return (logits if delta is None else logits + delta).softmax(-1)
 
 
-def multiply(
+def multiply_quaternions(
     first: Float[Tensor, "*#batch 4"], second: Float[Tensor, "*#batch 4"]
 ) -> Float[Tensor, "*#batch 4"]:
     """Multiply quaternions wxyz (Hamilton product); leading axes broadcast."""
@@ -80,7 +80,7 @@ def blend(
     """
     motion = agent_from_bone @ rigid_torch.inverse(agent_from_bone_rest)
     real = rigid_torch.quaternion_from_rotation(motion[..., :3, :3])
-    dual = 0.5 * multiply(functional.pad(motion[..., :3, 3], (1, 0)), real)
+    dual = 0.5 * multiply_quaternions(functional.pad(motion[..., :3, 3], (1, 0)), real)
     with torch.no_grad():
         opposite = real @ real.transpose(-1, -2) < 0
         strongest = weights.argmax(-1) if opposite.any() else None
@@ -95,20 +95,20 @@ def blend(
 def move(
     target_from_source: Float[Tensor, "*#batch 8 point"],
     points: Float[Tensor, "*#batch point 3"],
-    back: bool = False,
+    inverse: bool = False,
 ) -> Float[Tensor, "*#batch point 3"]:
-    """Apply one motion of `blend` a point, or its inverse with ``back``, metres.
+    """Apply one motion of `blend` a point, or its inverse with ``inverse``, metres.
 
     Component by component: PyTorch takes several times longer over axes of length 3.
     """
     w, *turn, dual_w, x, y, z = target_from_source.unbind(-2)
     dual, place = (x, y, z), list(points.unbind(-1))
     shift = [2 * (w * d - dual_w * t + c) for d, t, c in zip(dual, turn, _cross(turn, dual), strict=True)]
-    if back:
+    if inverse:
         w, place = -w, [p - s for p, s in zip(place, shift, strict=True)]
     inner = [c + w * p for c, p in zip(_cross(turn, place), place, strict=True)]
     moved = torch.stack([p + 2 * c for p, c in zip(place, _cross(turn, inner), strict=True)], dim=-1)
-    return moved if back else moved + torch.stack(shift, dim=-1)
+    return moved if inverse else moved + torch.stack(shift, dim=-1)
 
 
 def _cross(a: Sequence[Tensor], b: Sequence[Tensor]) -> list[Tensor]:

@@ -1,8 +1,8 @@
-"""Four, or eight, linear-blend weights a vertex that imitate dual-quaternion blending with many.
+"""Approximate dual-quaternion skinning by linear blend skinning with four or eight bones per vertex.
 
 `blend_dual_quaternions` poses the surface as the reconstruction does; `refit_weights` finds, per vertex, the
 best four and the best eight bones and convex weights for linear blending over a set of poses; `residual_m`
-says what is lost.
+measures the error.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ class Poses:
     posed_from_rest: Float[np.ndarray, "frame bone 4 4"]
     """motion of each bone"""
     posed: Float[np.ndarray, "frame vertex 3"]
-    """the surface that is to be met"""
+    """target surface"""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Influences:
     weights: Float32[np.ndarray, "vertex influence"]
 
 
-def different_poses(
+def farthest_poses(
     agent_from_bone: Float[np.ndarray, "frame bone 4 4"], count: int
 ) -> Int[np.ndarray, " chosen"]:
     """Choose poses by farthest-point sampling, beginning with the one furthest from the mean."""
@@ -71,19 +71,18 @@ def blend_dual_quaternions(
 def refit_weights(
     vertices: Float[np.ndarray, "vertex 3"], weights: Float[np.ndarray, "vertex bone"], poses: Poses
 ) -> tuple[Influences, Influences]:
-    """Return the four and the eight bones, with convex weights, whose linear blend is nearest, in squares, to
-    the posed surface."""
+    """Return the best four and the best eight bones per vertex with convex weights, by least squares."""
     candidates = np.argsort(-weights, axis=1, kind="stable")[:, : min(EIGHT, weights.shape[1])]
     gram = _gram(vertices, candidates, poses)
     start = np.take_along_axis(weights, candidates, 1)
     descended = _descend_on_simplex(gram, start / start.sum(1, keepdims=True))
     chosen = np.argsort(-descended, axis=1, kind="stable")[:, :FOUR]
     best = np.zeros_like(descended)
-    among = np.take_along_axis(np.take_along_axis(gram, chosen[:, :, None], 1), chosen[:, None, :], 2)
-    np.put_along_axis(best, chosen, _best_on_simplex(among), 1)
-    nearer = _cost(gram, best) < _cost(gram, descended)
+    sub_gram = np.take_along_axis(np.take_along_axis(gram, chosen[:, :, None], 1), chosen[:, None, :], 2)
+    np.put_along_axis(best, chosen, _best_on_simplex(sub_gram), 1)
+    is_better = _cost(gram, best) < _cost(gram, descended)
     return _influences(candidates, best, FOUR), _influences(
-        candidates, np.where(nearer[:, None], best, descended), EIGHT
+        candidates, np.where(is_better[:, None], best, descended), EIGHT
     )
 
 
@@ -111,12 +110,12 @@ def residual_m(
     """Return the distance between the linear blend and the posed surface."""
     distance = np.empty(poses.posed.shape[:2])
     for frame, bones in enumerate(poses.posed_from_rest):
-        each = (
+        moved = (
             np.einsum("vkij,vj->vki", bones[blend.joints][..., :3, :3], vertices)
             + bones[blend.joints][..., :3, 3]
         )
         distance[frame] = np.linalg.norm(
-            np.einsum("vk,vki->vi", blend.weights, each) - poses.posed[frame], axis=1
+            np.einsum("vk,vki->vi", blend.weights, moved) - poses.posed[frame], axis=1
         )
     return distance
 
@@ -127,8 +126,8 @@ def _gram(
     """Sum over frames the products of each bone's error: for convex w the squared error is w' G w."""
     gram = np.zeros((len(vertices), candidates.shape[1], candidates.shape[1]))
     for bones, target in zip(poses.posed_from_rest, poses.posed, strict=True):
-        each = np.einsum("bij,vj->vbi", bones[:, :3, :3], vertices) + bones[None, :, :3, 3]
-        error = np.take_along_axis(each, candidates[:, :, None], 1) - target[:, None]
+        moved = np.einsum("bij,vj->vbi", bones[:, :3, :3], vertices) + bones[None, :, :3, 3]
+        error = np.take_along_axis(moved, candidates[:, :, None], 1) - target[:, None]
         gram += error @ error.transpose(0, 2, 1)
     return gram / len(poses.posed)
 
@@ -152,7 +151,7 @@ def _project_to_simplex(values: Float[np.ndarray, "vertex k"]) -> Float[np.ndarr
 
 
 def _best_on_simplex(gram: Float[np.ndarray, "vertex k k"]) -> Float[np.ndarray, "vertex k"]:
-    """Minimise w' G w over convex weights exactly: every support is tried."""
+    """Minimise w' G w over convex weights exactly, by enumerating all supports."""
     count = gram.shape[1]
     ridge = 1e-9 * (np.trace(gram, axis1=1, axis2=2)[:, None, None] + 1e-12) * np.eye(count)
     best, best_cost = np.zeros(gram.shape[:2]), np.full(len(gram), np.inf)

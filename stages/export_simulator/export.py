@@ -77,7 +77,7 @@ def fit_weights(
     Returns both with the distance, metres, that each leaves in poses that were not fitted.
     """
     recorded = np.concatenate([motion.agent_from_bone for motion in motions])
-    chosen = weight_refit.different_poses(recorded, FITTED_POSES)
+    chosen = weight_refit.farthest_poses(recorded, FITTED_POSES)
     others = np.setdiff1d(np.arange(len(recorded)), chosen)
     judged = others[evenly(len(others), _JUDGED_POSES)] if len(others) else chosen
     vertices, rest = body.mesh.vertices.astype(np.float64), body.agent_from_bone_rest

@@ -1,8 +1,7 @@
 """Fuse the depth of all videos into the scene's fixed geometry.
 
-Each video is fused into a TSDF volume of its own. `SceneFuser` averages them to the scene that all videos
-share, and keeps for each video the blocks where it saw something else: things that were moved between the
-sessions.
+Each video is fused into its own TSDF volume. `SceneFuser` averages them into the shared scene and keeps for
+each video the blocks that differ from it: things that were moved between sessions.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,7 +15,7 @@ from jaxtyping import Float16
 
 from pipeline.core import progress, threads
 from pipeline.data import npz
-from pipeline.fields.fused_depth import CELLS, CHANNELS, NODES, NOWHERE, FusedGeometry
+from pipeline.fields.fused_depth import CELLS, CHANNELS, EMPTY_BLOCK, NODES, FusedGeometry
 from pipeline.geometry.tsdf import Volume
 from stages.reconstruct.assemble import Corner, RegisteredVideo, measured_box, scene_first
 from stages.reconstruct.config import SceneFusion
@@ -28,16 +27,16 @@ FRAME_STEP = 5
 """one frame in so many is fused"""
 TRUNCATION_VOXELS = 2.0
 """signed distances saturate at so many voxels"""
-RING_PX = 10
-"""left out around the agent's mask, color pixels"""
+MASK_MARGIN_PX = 10
+"""margin around the agent's mask that is ignored, color pixels"""
 MIN_WEIGHT = 0.1
-"""evidence below which a voxel counts as unseen: one frame from one metre is 1"""
+"""TSDF weight below which a voxel is unseen: one frame from one metre is 1"""
 MAX_WEIGHT = 6e4
-"""evidence is cut here, just below the largest half float"""
-MOVED = (0.3, 0.7)
-"""a video goes over from the shared scene to its own between these differences, in units of the truncation"""
-MOVED_VOXELS = 8
-"""from so many voxels beyond the middle of these on, a block counts as changed"""
+"""TSDF weights are clamped here, just below the largest half float"""
+CHANGE_RANGE = (0.3, 0.7)
+"""differences, in units of the truncation, between which the shared scene is blended into the video's own"""
+MIN_CHANGED_VOXELS = 8
+"""changed voxels (beyond the middle of that range) from which a block is kept per video"""
 MIN_SURFACE = 0.99
 """blocks with a signed distance below this, in units of the truncation, are stored"""
 
@@ -47,8 +46,8 @@ def fuse_depth(
 ) -> FusedGeometry:
     """Fuse the videos that have a scene, in the order of their codes, in the box of the scene's field.
 
-    So many ``workers`` fuse at once. Volumes wait in unnamed files in ``scratch`` (None: where temporary
-    files stand).
+    ``workers``: videos fused in parallel. Volumes are kept in unnamed files in ``scratch`` (None: the
+    directory of temporary files).
     """
     fuser = SceneFuser(measured_box(videos), fusion.voxel_m, scratch)
     with_scene = [video for video in scene_first(videos) if video.has_scene]
@@ -59,22 +58,22 @@ def fuse_depth(
 
 
 def _fused(volume: Volume, video: RegisteredVideo) -> Volume:
-    """Add what one video saw."""
+    """Integrate the frames of one video."""
     for frame in np.flatnonzero(video.certain_cameras)[::FRAME_STEP].tolist():
         _integrate(volume, video, frame)
     return volume
 
 
 def _integrate(volume: Volume, video: RegisteredVideo, frame: int) -> None:
-    """Add what one frame saw except the agent."""
+    """Integrate the depth of one frame, without the agent."""
     assert video.source is not None, f"{video.id} was read without its pictures"
     clip, masks = video.source.clip, video.source.masks
     depth = trusted_depth(clip, frame)[0]
     if masks is not None:
         mask = masks[frame]
-        agent = near_agent(mask, RING_PX) if masks.visible[frame] else mask == AGENT
-        left_out = ((mask == UNKNOWN) | agent).astype(np.uint8)
-        depth[cv2.resize(left_out, depth.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0] = 0
+        agent = near_agent(mask, MASK_MARGIN_PX) if masks.visible[frame] else mask == AGENT
+        ignored = ((mask == UNKNOWN) | agent).astype(np.uint8)
+        depth[cv2.resize(ignored, depth.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0] = 0
     depth_camera, color_camera = clip.depth_intrinsics[frame], clip.intrinsics[frame]
     volume.integrate(depth, depth_camera, clip.color(frame), color_camera, video.world_from_camera[frame])
 
@@ -90,7 +89,7 @@ class _PackedVolume:
 
 
 class SceneFuser:
-    """Averages the volumes of all videos, then cuts them into sparse blocks."""
+    """Averages the volumes of all videos, then splits them into sparse blocks."""
 
     def __init__(self, box: Box, voxel_m: float, scratch: Path | None = None):
         """Prepare for volumes in ``box`` (lower and upper corner, metres)."""
@@ -105,7 +104,7 @@ class SceneFuser:
         return Volume(self.low, nodes, self.voxel_m, TRUNCATION_VOXELS * self.voxel_m)
 
     def add(self, volume: Volume) -> None:
-        """Take over one video."""
+        """Add the volume of one video."""
         shared = self.shared
         for value, weight in (("distance", "weight"), ("color", "color_weight")):
             mean, total = getattr(shared, value), getattr(shared, weight)
@@ -118,7 +117,7 @@ class SceneFuser:
         self.videos.append(_PackedVolume(*(npz.Column(self.scratch).append(part).array() for part in packed)))
 
     def finish(self) -> FusedGeometry:
-        """Return the blocks of the shared scene, and of each video where it saw something else."""
+        """Return the blocks of the shared scene, and of each video where it differs."""
         shared = self.shared
         seen = shared.weight > MIN_WEIGHT
         shared.distance[~seen] = 1
@@ -126,19 +125,19 @@ class SceneFuser:
         empty = np.zeros((1, NODES, NODES, NODES, CHANNELS))
         empty[..., 0] = 1
         blocks = [empty]
-        table = np.full((len(self.videos) + 1, *self.size), NOWHERE, np.int32)
+        table = np.full((len(self.videos) + 1, *self.size), EMPTY_BLOCK, np.int32)
         table[:, occupied] = 1 + np.arange(occupied.sum())
-        blocks += list(self._cut(occupied, shared.distance, shared.color / 255, shared.color_weight > 0))
-        low, high = MOVED
+        blocks += list(self._blocks(occupied, shared.distance, shared.color / 255, shared.color_weight > 0))
+        low, high = CHANGE_RANGE
         for row, video in enumerate(self.videos):
             seen = video.weight > MIN_WEIGHT
-            other = np.clip((np.abs(video.distance - shared.distance) - low) / (high - low), 0, 1) * seen
-            changed = self._count(other > 0.5) >= MOVED_VOXELS
+            change = np.clip((np.abs(video.distance - shared.distance) - low) / (high - low), 0, 1) * seen
+            changed = self._count(change > 0.5) >= MIN_CHANGED_VOXELS
             table[row][changed] = sum(len(part) for part in blocks) + np.arange(changed.sum())
-            distance = shared.distance + other * (video.distance - shared.distance)
-            takes = (other > 0.5) & video.colored
-            color = np.where(takes[..., None], video.color, shared.color) / np.float32(255)
-            blocks += list(self._cut(changed, distance, color, takes | (shared.color_weight > 0)))
+            distance = shared.distance + change * (video.distance - shared.distance)
+            own_color = (change > 0.5) & video.colored
+            color = np.where(own_color[..., None], video.color, shared.color) / np.float32(255)
+            blocks += list(self._blocks(changed, distance, color, own_color | (shared.color_weight > 0)))
         stacked = np.concatenate(blocks).astype(np.float16)
         low, rows, stacked = (torch.from_numpy(array) for array in (self.low, table, stacked))
         return FusedGeometry(low, self.voxel_m, TRUNCATION_VOXELS * self.voxel_m, rows, stacked)
@@ -148,7 +147,7 @@ class SceneFuser:
         x, y, z = self.size
         return marked[:-1, :-1, :-1].reshape(x, CELLS, y, CELLS, z, CELLS).sum((1, 3, 5))
 
-    def _cut(self, which, distance, color, colored) -> Iterator[np.ndarray]:
+    def _blocks(self, which, distance, color, colored) -> Iterator[np.ndarray]:
         """Yield the chosen blocks, one array each."""
         for place in np.argwhere(which) * CELLS:
             part = tuple(slice(start, start + NODES) for start in place)

@@ -17,7 +17,7 @@ from torch.nn import functional
 from pipeline.core import distributed
 from pipeline.core.training import FitRecord, fit
 from pipeline.data.motion import Motion
-from pipeline.fields.footprints import REACH
+from pipeline.fields.footprints import CUTOFF
 from pipeline.fields.gaussians import Cloud, Splats, concatenate, render
 from pipeline.fields.rasterize import Backend, in_view
 from pipeline.geometry import cameras, rigid_torch
@@ -125,7 +125,7 @@ class FrameLoss:
         if not video.motion.agent_known[frame]:
             return False
         root = torch.from_numpy(video.motion.world_from_agent[frame]).float().to(self.device)
-        radius = self.splats.agent.means.detach().norm(dim=-1).amax() / REACH
+        radius = self.splats.agent.means.detach().norm(dim=-1).amax() / CUTOFF
         centre = root[None, :3, 3]
         size = radius.log().expand(1, 3)
         return len(in_view(centre, size, camera_from_world, target.intrinsics, *target.depth.shape)) > 0

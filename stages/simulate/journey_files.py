@@ -119,7 +119,7 @@ def drawn(
 def skin_of(body: SkinnedBody, agent_from_bone: Float[np.ndarray, "frame bone 4 4"]) -> glb.Skin:
     """Fit four weights a vertex to the surface in the poses that differ most."""
     rest = body.agent_from_bone_rest
-    some = agent_from_bone[weight_refit.different_poses(agent_from_bone, FITTED_POSES)]
+    some = agent_from_bone[weight_refit.farthest_poses(agent_from_bone, FITTED_POSES)]
     still = torch.eye(4).expand(len(some), 4, 4)
     posed = PosedSurface(body)(still, torch.from_numpy(some).float()).double().numpy()
     poses = weight_refit.Poses(some @ rigid.inverse(rest), posed)

@@ -19,7 +19,7 @@ def body() -> SkinnedShape:
 def posed(shape: SkinnedShape, bones: np.ndarray) -> np.ndarray:
     """Where the vertices are, [frame vertex 3]."""
     motion = bones @ rigid.inverse(shape.agent_from_bone_rest)
-    return retargeting.transferred(motion, shape.weights, shape.vertices)[0]
+    return retargeting.transfer(motion, shape.weights, shape.vertices)[0]
 
 
 def test_a_motion_on_its_own_body_stays() -> None:

@@ -53,6 +53,6 @@ def test_one_bone_a_point_is_exact() -> None:
 def test_different_poses_hold_the_extremes() -> None:
     turn = np.zeros((50, 1, 6))
     turn[:, 0, 0] = np.sort(RNG.uniform(-1, 1, 50))
-    chosen = weight_refit.different_poses(rigid.exp(turn), 5)
+    chosen = weight_refit.farthest_poses(rigid.exp(turn), 5)
     assert len(chosen) == 5 and {0, 49} <= set(chosen.tolist())
-    assert len(weight_refit.different_poses(rigid.exp(turn), 80)) == 50
+    assert len(weight_refit.farthest_poses(rigid.exp(turn), 80)) == 50
