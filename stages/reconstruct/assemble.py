@@ -1,4 +1,4 @@
-"""Set the problem up: join the videos' rays, place the fields' boxes, start the motion as registered."""
+"""Build the optimization problem: rays of all videos, fields and their boxes, initial motion."""
 
 import math
 from collections.abc import Sequence
@@ -31,19 +31,19 @@ from stages.reconstruct.rays import RaySource, RayStore, Views, join
 MIN_CONFIDENCE = 0.1
 """frames whose camera is less certain give no rays"""
 DOUBTFUL_ROOT = 0.4
-"""roots of less confidence may be given up"""
+"""roots with lower confidence may be replaced as outliers"""
 OUTLIER_ROOT_M = 0.3
-"""if they lie farther than this from the straight line between certain ones"""
+"""if they are farther than this from the interpolation between confident ones"""
 OUTLIER_GAP_S = 3.0
-"""and those are no farther apart in time: over longer gaps a straight line is no better"""
+"""and those are at most this far away in time: over longer gaps interpolation is no better"""
 OUTLIER_MASK_WEIGHT = 0.05
-"""weight of the masks of such frames: most of them show something else"""
+"""weight of the masks of outlier frames: most of them show something else"""
 WHOLE_QUANTILE = 0.8
 """quantile of the masks' areas that stands for the whole animal in view"""
 WHOLE_SHARE = 0.6
 """masks count fully from this share of that area on, as seen from one metre"""
 MIN_MASK_WEIGHT = 0.03
-"""and at least so much: where the animal hides, neighbouring frames know better"""
+"""lower bound of that weight: where the animal is occluded, neighbouring frames constrain it better"""
 GRID_CHANNELS = 4
 """channels of each grid"""
 KNOT_FRAMES = 10
@@ -53,9 +53,9 @@ SCENE_TRUNCATION_M = 0.08
 SCENE_MARGIN_M, AGENT_MARGIN_M = 0.2, 0.12
 """space around all that was measured, and around the agent template"""
 SOLID_START_M, FREE_START_M = -0.03, 0.1
-"""signed distance of untrained fields: a scene is carved free, an agent grows in free space"""
+"""initial signed distance: the scene starts solid and is carved, the agent starts as free space"""
 BOX_QUANTILE = 0.002
-"""share of the measured points that may lie outside the box on each side: stray depth"""
+"""share of the measured points outside the box on each side of each axis: stray depth"""
 
 Corner = tuple[float, float, float]
 
@@ -78,13 +78,13 @@ class RegisteredVideo:
     """False for the turnaround: its world is the agent"""
     store: RayStore
     source: RaySource | None = None
-    """its frames; None where the store holds all that is needed of them"""
+    """its frames; None if only the rays are needed"""
     agent_confidence: Float[np.ndarray, "frame"] | None = None
-    """that the agent's root is right, 0..1; None: certain"""
+    """probability that the agent's root is correct, 0..1; None: certain"""
 
     @property
     def certain_cameras(self) -> Bool[np.ndarray, "frame"]:
-        """Return the frames whose camera is known and not doubtful."""
+        """Return which frames have a known camera of sufficient confidence."""
         return np.isfinite(self.world_from_camera).all((1, 2)) & (self.confidence >= MIN_CONFIDENCE)
 
 
@@ -109,24 +109,24 @@ def build(
     floor_m: float = -math.inf,
     rendered: bool = False,
 ) -> Problem:
-    """Set the optimization problem up. Videos with a scene come first, so that codes count them.
+    """Build the optimization problem. Videos with a scene come first, in the order of their codes.
 
     Args:
         fused: the scene's fixed geometry; None: its field learns it.
         scratch: folder of unnamed files with the measurements; None: where temporary files stand.
-        floor_m: height in the world below which nothing is.
+        floor_m: height of the floor in the world.
         rendered: the scene is learned by differentiable rendering alone; see `scene_field`.
     """
     videos = scene_first(videos)
     torch.manual_seed(seed)
     height, width = (max(video.store.views.depth.shape[axis] for video in videos) for axis in (1, 2))
-    store = join((usable(video) for video in videos), scratch, (height, width))
+    store = join((usable_rays(video) for video in videos), scratch, (height, width))
     lengths = [len(video.timestamp_s) for video in videos]
     camera = [interpolated(video.timestamp_s, video.world_from_camera) for video in videos]
-    roots, inliers = zip(*(without_outliers(video) for video in videos), strict=True)
+    roots, inliers = zip(*(replace_outliers(video) for video in videos), strict=True)
     root = [interpolated(video.timestamp_s, root) for video, root in zip(videos, roots, strict=True)]
     camera, root = (torch.from_numpy(np.concatenate(poses)) for poses in (camera, root))
-    rooted = torch.from_numpy(np.isfinite(np.concatenate(roots)).all((1, 2)))
+    has_root = torch.from_numpy(np.isfinite(np.concatenate(roots)).all((1, 2)))
     trust = torch.from_numpy(np.where(np.concatenate(inliers), 1.0, OUTLIER_MASK_WEIGHT)).float()
     vertices = template.mesh.vertices
     low, high = corner(vertices.min(0) - AGENT_MARGIN_M), corner(vertices.max(0) + AGENT_MARGIN_M)
@@ -134,7 +134,7 @@ def build(
     agent_shape = FieldShape(low, high, fine, GRID_CHANNELS, sizes.width, encoding=sizes.encoding)
     rest = torch.from_numpy(template.agent_from_bone_rest).float()
     by_frame = RaysByFrame.of(store.agent.frame, sum(lengths))
-    usable_frames = torch.nonzero(rooted & store.views.agent_seen & (by_frame.count > 0))[:, 0]
+    usable_frames = torch.nonzero(has_root & store.views.agent_seen & (by_frame.count > 0))[:, 0]
     has_scene = torch.tensor([video.has_scene for video in videos])[frame_table(lengths)]
     free = [video.camera_free for video in videos]
     motion = MotionTable(camera, root, rest, lengths, free, KNOT_FRAMES)
@@ -160,7 +160,7 @@ def build(
         camera_precision=prior_precision(motion, np.concatenate([video.confidence for video in videos])),
         floor_m=floor_m,
     )
-    return problem if device == "cpu" else moved(problem, device)
+    return problem if device == "cpu" else to_device(problem, device)
 
 
 def corner(point: Float[np.ndarray, "3"]) -> Corner:
@@ -174,9 +174,9 @@ def scene_field(
 ) -> Field:
     """Return the scene's untrained field in the box of what was measured.
 
-    With ``rendered`` its signed distance starts as that inside the box, free as seen by all cameras, and
-    never saturates, so that rendering finds surfaces and the eikonal loss holds everywhere. Otherwise it
-    starts solid and saturates (`SCENE_TRUNCATION_M`), for losses at measured depth.
+    With ``rendered`` its signed distance starts as the distance to the box's walls and never saturates, so
+    that rendering finds surfaces and the eikonal loss holds everywhere. Otherwise it starts solid and
+    saturates at `SCENE_TRUNCATION_M`, for losses at measured depth.
     """
     truncation_m = fused.truncation_m if fused else None if rendered else SCENE_TRUNCATION_M
     shape = FieldShape(
@@ -203,20 +203,20 @@ def scene_ids(videos: Sequence[RegisteredVideo]) -> tuple[str, ...]:
     return tuple(video.id for video in scene_first(videos) if video.has_scene)
 
 
-def usable(video: RegisteredVideo) -> RayStore:
-    """Drop the rays of frames whose camera is unknown or doubtful."""
+def usable_rays(video: RegisteredVideo) -> RayStore:
+    """Drop the rays of frames whose camera is unknown or of low confidence."""
     good, store = torch.from_numpy(video.certain_cameras), video.store
     scene, agent = (rays.at(torch.nonzero(good[rays.frame])[:, 0]) for rays in (store.scene, store.agent))
     return RayStore(scene, agent, store.views)
 
 
-def without_outliers(
+def replace_outliers(
     video: RegisteredVideo,
 ) -> tuple[Float[np.ndarray, "frame 4 4"], Bool[np.ndarray, "frame"]]:
-    """Replace doubtful roots far from the line between the certain ones around them.
+    """Replace low-confidence roots that are far from the interpolation between confident ones.
 
     Returns:
-        The roots, world from agent (NaN where unknown), and which frames are no outliers.
+        The roots, world from agent (NaN where unknown), and which frames are inliers.
     """
     root, time = video.world_from_agent.copy(), video.timestamp_s
     known = np.all(np.isfinite(root), axis=(1, 2))
@@ -257,27 +257,28 @@ def interpolated(
     return rigid.interpolate(timestamp_s[known], a_from_b[known], timestamp_s)
 
 
-def measured_box(videos: Sequence[RegisteredVideo], most: int = 200_000) -> tuple[Corner, Corner]:
-    """Return the box, world, metres, of nearly all of about ``most`` measured points and of their cameras."""
-    step = max(7, sum(len(video.store.scene) for video in videos) // most)
-    stores = (usable(video).scene for video in videos)
+def measured_box(videos: Sequence[RegisteredVideo], max_points: int = 200_000) -> tuple[Corner, Corner]:
+    """Return the box (world, metres) of about ``max_points`` measured points, without strays, and cameras."""
+    step = max(7, sum(len(video.store.scene) for video in videos) // max_points)
+    stores = (usable_rays(video).scene for video in videos)
     rays = [store.at(torch.nonzero(store.depth > 0)[:, 0][::step]) for store in stores]
-    points, eyes = [], []
+    points, centres = [], []
     for video, some in zip(videos, rays, strict=True):
         poses, frame = video.world_from_camera, some.frame.numpy()
         points_camera = (some.direction * some.depth[:, None]).numpy()
         points.append(rigid.apply(poses[frame], points_camera[:, None])[:, 0])
-        eyes.append(poses[np.unique(frame), :3, 3])
-    points, eyes = np.concatenate(points), np.concatenate(eyes)
-    low = np.minimum(np.quantile(points, BOX_QUANTILE, axis=0), eyes.min(0)) - SCENE_MARGIN_M
-    high = np.maximum(np.quantile(points, 1 - BOX_QUANTILE, axis=0), eyes.max(0)) + SCENE_MARGIN_M
+        centres.append(poses[np.unique(frame), :3, 3])
+    points, centres = np.concatenate(points), np.concatenate(centres)
+    low = np.minimum(np.quantile(points, BOX_QUANTILE, axis=0), centres.min(0)) - SCENE_MARGIN_M
+    high = np.maximum(np.quantile(points, 1 - BOX_QUANTILE, axis=0), centres.max(0)) + SCENE_MARGIN_M
     return corner(low), corner(high)
 
 
-def moved(value: Any, device: str) -> Any:
-    """Return modules, tensors and dataclasses of them on another device; what is none of them stays."""
+def to_device(value: Any, device: str) -> Any:
+    """Move modules, tensors and dataclasses of them to a device; return other values unchanged."""
     if isinstance(value, Tensor | nn.Module):
         return value.to(device)
     if not is_dataclass(value) or isinstance(value, type):
         return value
-    return replace(value, **{part.name: moved(getattr(value, part.name), device) for part in fields(value)})
+    parts = {part.name: to_device(getattr(value, part.name), device) for part in fields(value)}
+    return replace(value, **parts)

@@ -1,7 +1,7 @@
 """The agent's losses: masked depth against its field, its posed surface against the mask, priors on motion.
 
-They serve twice: `posing` poses the template to the frames before the field learns, and the joint phase uses
-the same terms while everything learns.
+`posing` uses them to pose the template before the field is trained, and the joint phase while everything is
+optimized.
 """
 
 from dataclasses import dataclass
@@ -22,34 +22,33 @@ from stages.reconstruct.scene import Terms
 DECIMETRE = 0.1
 """unit of most losses of the posed surface, metres"""
 REACH_M = 0.05
-"""signed distances on the agent are compared up to here"""
+"""signed distances on the agent are truncated here"""
 OUTLIER_M = 0.1
-"""measured points this far from the agent count half; all pull, or the body could hide behind the scene"""
+"""measured points this far from the agent have half the weight; none is dropped, or it hides in the scene"""
 ROOT_M, ROOT_RAD = 0.05, 0.05
-"""accuracy of registered roots"""
+"""standard deviation of registered roots"""
 EDGE_M = 0.01
-"""accuracy of the masks' edges"""
+"""tolerance at the masks' edges"""
 STILL = 0.01
-"""steps of bones and root below this, radians and decimetres, count as none"""
+"""smoothing of the L1 norm of bone and root steps, radians and decimetres"""
 TOUCH_M, STRIDE_M = 0.02, 0.06
-"""soles this near to something touch it; those that move by more than this between frames are not held"""
+"""distance at which soles are in contact; motion between frames beyond which they are not held"""
 COVER_M = 0.015
 """a masked pixel is covered when a sample of the posed surface is seen this near to it"""
 MARGIN_M = 0.03
-"""the posed surface may stand this much before the measured depth"""
+"""tolerance by which the posed surface may be in front of the measured depth"""
 NEAREST_M = 0.1
 """points nearer to the camera than this are not in view"""
 OUTSIDE_WEIGHT, UNCOVERED_WEIGHT, FREE_WEIGHT, PENETRATION_WEIGHT = 2.0, 2.0, 0.5, 2.0
-"""posed surface outside the mask, masked pixels that it leaves uncovered, surface in space seen free, surface
-inside solid things; each per decimetre. Tuned on the built-in cat; all are multiplied by
-`LossWeights.posed_surface`"""
+"""weights per decimetre: posed surface outside the mask, uncovered masked pixels, surface in free space,
+penetration of the scene. Tuned on the built-in cat; all are multiplied by `LossWeights.posed_surface`"""
 RIGIDITY_WEIGHT, REST_WEIGHT, SMOOTH_WEIGHT, STILL_WEIGHT = 5.0, 0.05, 0.3, 0.1
-"""bones disagree at joints (per decimetre), twists from rest, accelerations, and steps that are not squared:
-most of the time most of an animal rests. All are multiplied by `LossWeights.motion_prior`"""
+"""weights of gaps at joints (per decimetre), twists from rest, accelerations, and the L1 norm of steps: an
+animal mostly rests. All are multiplied by `LossWeights.motion_prior`"""
 COMMON_REST = 20.0
-"""twists that all bones share weigh so many times more at rest: the root has to make them"""
+"""additional weight of the mean twist of all bones: the root has to explain it"""
 ROOT_SMOOTH, ROOT_STILL = 4.0, 0.5
-"""the same for the root, relative to bones"""
+"""the same weights for the root, relative to those of bones"""
 ROOT_WEIGHT = 0.005
 """the agent's root stays near the registered one, per `ROOT_M` and `ROOT_RAD`, squared"""
 FLOOR_EVERY = 4
@@ -58,18 +57,18 @@ FLOOR_EVERY = 4
 
 @dataclass(frozen=True)
 class Pose:
-    """Where everything is in some frames."""
+    """Poses of camera, agent and bones in some frames."""
 
     frame: Int[Tensor, "frame"]
     world_from_camera: Float[Tensor, "frame 4 4"]
     world_from_agent: Float[Tensor, "frame 4 4"]
     agent_from_bone: Float[Tensor, "frame bone 4 4"]
     world_from_initial: Float[Tensor, "frame 4 4"]
-    """where the agent's root starts, to which priors draw it: as registered, or leaning as one that sits"""
+    """initial root, the mean of its prior: as registered, or with the lean of a sitting animal"""
 
     @property
     def agent_from_camera(self) -> Float[Tensor, "frame 4 4"]:
-        """Take points of the camera to the agent's root."""
+        """Pose of the camera in the agent's frame."""
         return rigid_torch.inverse(self.world_from_agent) @ self.world_from_camera
 
     @classmethod
@@ -87,7 +86,7 @@ class Pose:
 def measured_terms(
     problem: Problem, pose: Pose, rays: Rays, weights: LossWeights, generator: Generator, near: int = 2
 ) -> Terms:
-    """Fit the agent where the sensor measured it: masked rays ``[frame * ray]`` mapped back to rest."""
+    """Return the losses at measured depth of rays ``[frame * ray]``, warped back to the rest shape."""
     frames, number = len(pose.frame), len(rays) // len(pose.frame)
     offset = (torch.rand(len(rays), near, generator=generator).to(problem.device) * 2 - 1) * REACH_M
     depth = torch.cat([rays.depth[:, None], rays.depth[:, None] + offset], dim=1)
@@ -109,8 +108,8 @@ def measured_terms(
         feature_loss = trust * losses.feature(feature, rays.feature / 127)
         terms["agent feature"] = weights.feature, feature_loss[good]
     if weights.cycle:
-        at_depth, back_to = (each.view(frames, number, 1 + near, 3)[:, :, 0] for each in (points, rest))
-        back = problem.body.pose(back_to, pose.agent_from_bone)
+        at_depth, at_rest = (each.view(frames, number, 1 + near, 3)[:, :, 0] for each in (points, rest))
+        back = problem.body.pose(at_rest, pose.agent_from_bone)
         terms["cycle"] = (weights.cycle, ((back - at_depth).square().sum(-1).view(-1) / DECIMETRE**2)[good])
     return terms
 
@@ -123,16 +122,16 @@ def surface_terms(
     generator: Generator,
     masked: Rays | None = None,
 ) -> Terms:
-    """Keep the posed surface inside the mask unless occluded, out of free space and out of solid things.
+    """Penalize posed surface outside the mask unless occluded, in free space, and inside the scene.
 
-    Rays ``masked`` ``[frame * ray]`` on the mask, with or without depth, must be covered too.
+    Rays ``masked`` ``[frame * ray]`` on the mask, with or without depth, must be covered by the surface.
     """
     views, chosen = problem.store.views, pick(len(problem.surface.points), number, generator, problem.device)
     posed = problem.body.pose(problem.surface.points[chosen], pose.agent_from_bone)
     points = rigid_torch.apply(rigid_torch.inverse(pose.agent_from_camera), posed)
     pixel, depth = cameras.project(points, views.intrinsics[pose.frame][:, None])
     size_px = views.size_px[pose.frame]
-    # Outside the picture its border holds, not the padding.
+    # Outside the picture, read its border, not the padding.
     last = (size_px // THUMBNAIL - 0.5)[:, None] * THUMBNAIL
     within = torch.minimum(pixel.clamp_min(0.5 * THUMBNAIL), last)
     outside_px = _sampled(views.outside_px[pose.frame], within, "bilinear", "border")
@@ -145,10 +144,10 @@ def surface_terms(
         occluded = (nearest > 0) & (nearest < depth - MARGIN_M)
     focal_px = views.intrinsics[pose.frame, 0, 0][:, None]
     outside_m = functional.relu(outside_px * depth.detach() / focal_px - EDGE_M)
-    before_m = functional.relu(measured - MARGIN_M - depth).clamp_max(2 * DECIMETRE)
+    in_front_m = functional.relu(measured - MARGIN_M - depth).clamp_max(2 * DECIMETRE)
     trust = problem.trust[pose.frame, None]
     on_mask = outside_px.detach() < THUMBNAIL
-    in_front = (trust * before_m / DECIMETRE)[in_view & on_mask & (measured > 0)]
+    in_front = (trust * in_front_m / DECIMETRE)[in_view & on_mask & (measured > 0)]
     terms = {
         "outside": (OUTSIDE_WEIGHT, (trust * outside_m / DECIMETRE)[in_view & ~occluded]),
         "in front": (FREE_WEIGHT, in_front),
@@ -165,16 +164,16 @@ def surface_terms(
 def penetration_depth_m(
     problem: Problem, pose: Pose, points_agent: Float[Tensor, "frame point 3"]
 ) -> Float[Tensor, "frame point"]:
-    """Return how deep points lie below the scene's surface, metres."""
+    """Return the penetration depth of points into the scene, metres."""
     return functional.relu(-height_m(problem, pose, rigid_torch.apply(pose.world_from_agent, points_agent)))
 
 
 def height_m(
     problem: Problem, pose: Pose, world: Float[Tensor, "frame point 3"]
 ) -> Float[Tensor, "frame point"]:
-    """Return the signed distance of world points from the scene as each frame's video saw it, metres.
+    """Return the signed distance of world points to the scene of each frame's video, metres.
 
-    Fused geometry knows it near surfaces alone and takes unseen space as free; the floor is below everything.
+    Fused geometry is truncated and treats unseen space as free, so the floor plane is added.
     """
     video = problem.video[pose.frame][:, None].expand(world.shape[:2])
     video = torch.where(problem.has_scene[pose.frame, None], video, -1)
@@ -185,7 +184,7 @@ def height_m(
 def silhouette_residual_m(
     points_camera: Float[Tensor, "frame point 3"], masked: Rays
 ) -> Float[Tensor, "frame ray"]:
-    """Return how far from each masked ray the nearest surface point is seen, metres beyond `COVER_M`."""
+    """Return the distance of each masked ray to the nearest projected point, metres beyond `COVER_M`."""
     target = masked.direction[:, :2].view(len(points_camera), -1, 2)
     depth = points_camera[..., 2:].clamp_min(NEAREST_M)
     image_point = points_camera[..., :2] / depth
@@ -200,14 +199,14 @@ def silhouette_residual_m(
 def prior_terms(
     problem: Problem, pose: Pose, twist: Float[Tensor, "frame bone 6"], run: int, weights: LossWeights
 ) -> Terms:
-    """Keep joints together, bones near rest, motion smooth and sparse in runs of frames, soles planted."""
+    """Return the priors: joints closed, bones near rest, motion smooth and sparse in time, soles planted."""
     rest, joints = problem.body.agent_from_bone_rest, problem.joints
     motion = pose.agent_from_bone @ rigid_torch.inverse(rest)
 
-    def carried(bone: Int[Tensor, "joint"]) -> Float[Tensor, "frame joint 3"]:
+    def moved(bone: Int[Tensor, "joint"]) -> Float[Tensor, "frame joint 3"]:
         return (motion[:, bone, :3, :3] @ joints.place[..., None])[..., 0] + motion[:, bone, :3, 3]
 
-    joint_gap = (carried(joints.first) - carried(joints.second)) / DECIMETRE
+    joint_gap = (moved(joints.first) - moved(joints.second)) / DECIMETRE
     root = rigid_torch.inverse(pose.world_from_initial) @ pose.world_from_agent
     root_error = (root[:, :3, 3] / ROOT_M).square().sum(-1) + _squared_angle(root) / ROOT_RAD**2
     common = twist.mean(1, keepdim=True).square().sum(-1)
@@ -233,9 +232,9 @@ def prior_terms(
 
 
 def foot_skate(problem: Problem, pose: Pose, run: int) -> Float[Tensor, "run step sole"]:
-    """Return how far soles move between frames in which they touch something: 0 at rest, 1 beyond `STRIDE_M`.
+    """Return the skate of soles in contact between frames: 0 at rest, saturating at 1 beyond `STRIDE_M`.
 
-    Occluded legs would otherwise follow the body. Soles in the air give 0.
+    Without it, occluded legs would follow the body. Soles in the air give 0.
     """
     posed = problem.body.pose(problem.surface.sole, pose.agent_from_bone)
     world = rigid_torch.apply(pose.world_from_agent, posed)
@@ -253,7 +252,7 @@ def _squared_angle(motion: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch
 
 
 def _smooth_length(squared: Float[Tensor, "*step"]) -> Float[Tensor, "*step"]:
-    """Return lengths from their squares, smooth at 0: a prior for motion that is sparse in time."""
+    """Return the Charbonnier norm of squared lengths: a prior for motion that is sparse in time."""
     return (squared.clamp_min(0) + STILL**2).sqrt() - STILL
 
 
@@ -263,7 +262,7 @@ def _sampled(
     mode: Literal["bilinear", "nearest"],
     padding: Literal["border", "zeros"],
 ) -> Float[Tensor, "frame point"]:
-    """Read thumbnails at colour pixels, with gradients towards the pixel where bilinear."""
+    """Sample thumbnails at colour pixels; bilinear sampling is differentiable in the pixel."""
     size = torch.tensor(images.shape[:0:-1], device=pixel.device, dtype=torch.float32) * THUMBNAIL
     place = (pixel / size * 2 - 1).clamp(-4, 4)[:, :, None]
     read = functional.grid_sample(

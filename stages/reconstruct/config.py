@@ -19,9 +19,9 @@ class FieldSizes:
     """Sizes of the fields."""
 
     scene_voxel_m: tuple[float, ...] = (0.32, 0.16, 0.08)
-    """edges of the cells of the scene's grids, metres; `mlp` has waves down to twice the finest"""
+    """cell sizes of the scene's grids, metres; `mlp` encodes wavelengths down to twice the finest"""
     agent_voxel_m: tuple[float, ...] = (0.06, 0.03, 0.015)
-    """edges of the cells of the agent's grids, metres"""
+    """cell sizes of the agent's grids, metres"""
     encoding: Literal["grid", "mlp"] = "grid"
     """multi-resolution dense grids, or the paper's MLP with positional encoding"""
     width: int = 64
@@ -59,19 +59,19 @@ class LossWeights:
     silhouette: float = 0.2
     """the agent's rendered opacity against its mask"""
     flow: float = 0.1
-    """where rendered points are seen some frames later"""
+    """optical flow of rendered points"""
     eikonal: float = 0.05
     """gradients of signed distance have length 1"""
     cycle: float = 1.0
-    """backward then forward warp returns, per decimetre"""
+    """cycle consistency of backward and forward warp, per decimetre"""
     template: float = 10.0
-    """the agent's field stays near its template, in shape and color"""
+    """distance of the agent's field from its template, in shape and color"""
     posed_surface: float = 1.0
     """factor of the posed surface's losses against mask, free space and solid things (weights in `body`)"""
     motion_prior: float = 1.0
     """factor of the priors on joints, rest pose and smooth motion (weights in `body`)"""
     planted: float = 0.3
-    """soles that touch something stay where they are"""
+    """foot skate of soles in contact"""
 
 
 @dataclass(frozen=True)
@@ -79,13 +79,13 @@ class PhaseSteps:
     """Optimization steps of each phase."""
 
     template: int = 200
-    """steps that copy the agent template into the agent's field"""
+    """steps that fit the agent's field to the agent template"""
     scene: int = 1000
     """steps of the first phase: scene and cameras"""
     body: int = 60
     """steps per segment that pose the template to the masked depth"""
     stance: int = 20
-    """steps per segment and stance that decide before posing whether the agent sits; 0 = all start level"""
+    """steps per segment and stance that decide before posing if the agent sits; 0 = all start level"""
     joint: int = 1000
     """steps of the second phase: everything"""
     save_every: int = 200
@@ -94,7 +94,7 @@ class PhaseSteps:
 
 @dataclass(frozen=True)
 class RayBatches:
-    """What a step looks at."""
+    """Batch sizes of a step."""
 
     scene_rays: int = 1024
     """rays a step in the first phase"""
@@ -112,7 +112,7 @@ class RayBatches:
     """and as it ends"""
 
     def share(self, size: int) -> "RayBatches":
-        """Return what one of ``size`` processes looks at."""
+        """Return the batch sizes of one of ``size`` processes."""
         counts = ("scene_rays", "joint_scene_rays", "rendered_rays", "runs")
         return replace(self, **{name: -(-getattr(self, name) // size) for name in counts})
 
@@ -141,11 +141,11 @@ class Config:
     scene_geometry: Literal["fused", "learned"] = "fused"
     """the scene's signed distance: fused depth, which stays fixed, or learned by its field"""
     supervision: Literal["measured", "rendered"] = "measured"
-    """losses at and before measured depth besides rendered ones, or differentiable rendering alone, at even
-    and importance samples along each ray (the paper's)"""
+    """losses at and before measured depth besides rendered ones, or differentiable rendering alone, with
+    uniform and importance samples along each ray (as in the paper)"""
     certain_gap_s: float = 0.75
-    """the agent's pose is interpolated wherever no frame shows it; in gaps longer than this, seconds, with a
-    confidence of at most 0.05"""
+    """the agent's pose is interpolated over gaps without observation; in gaps longer than this, seconds, its
+    confidence is at most 0.05"""
     sampling: PixelSampling = PixelSampling()
     """pixels kept of each frame"""
     fields: FieldSizes = FieldSizes()
@@ -155,8 +155,8 @@ class Config:
     steps: PhaseSteps = PhaseSteps()
     """length of each phase"""
     batches: RayBatches = RayBatches()
-    """what a step looks at"""
+    """batch sizes"""
     weights: LossWeights = LossWeights()
-    """of the losses"""
+    """weights of the losses"""
     rates: LearningRates = LearningRates()
-    """of learning"""
+    """learning rates"""

@@ -1,7 +1,7 @@
-"""Start from a former reconstruction of the same home: its fields, body, and the motion of its recordings.
+"""Warm start from a former reconstruction of the same home: its fields, body and motion.
 
-A recording that was added is posed from its registration, as ever; the others keep their poses, and all are
-optimized together for `SHARE` of the usual steps.
+New recordings are posed from their registration as usual; the others keep their poses. All are then optimized
+together for `SHARE` of the usual steps.
 """
 
 from collections.abc import Sequence
@@ -25,14 +25,14 @@ from stages.reconstruct.config import PhaseSteps
 from stages.reconstruct.problem import Problem
 
 SHARE = 0.3
-"""Of the steps of the phases in which everything is optimized: the fields are nearly right."""
-OWN = ("grid.levels.", "codes.", "fused.")
-"""Parts of the scene's field whose size depends on the recordings: box, codes, fused depth."""
+"""share of the usual steps of the scene and joint phases: the fields have nearly converged"""
+REBUILT = ("grid.levels.", "codes.", "fused.")
+"""prefixes of the scene field's parameters whose shapes depend on the recordings; not loaded as they are"""
 
 
 @dataclass(frozen=True)
 class KnownMotion:
-    """The agent's motion in frames of recordings that the former reconstruction had."""
+    """The agent's motion in the recordings of the former reconstruction."""
 
     frame: Int[Tensor, "known"]
     root: Float[Tensor, "known 6"]
@@ -47,16 +47,16 @@ class KnownMotion:
 
 
 def begin(problem: Problem, videos: Sequence[RegisteredVideo], folder: Path) -> KnownMotion:
-    """Let the problem's fields, body and cameras start as they ended in the reconstruction at ``folder``.
+    """Initialize the problem's fields, body and cameras from the reconstruction at ``folder``.
 
-    Returns the motion of the recordings that it had. Raises InputError RCN-003 where its fields have other
-    sizes, ART-007 where another version wrote it.
+    Returns the motion of the recordings it contains. Raises InputError RCN-003 if its fields have other
+    sizes, ART-007 if another version wrote it.
     """
     with other_versions_refused("reconstruction", str(folder)):
-        made = fields.load(folder)
-    former = {video.id: found for video in videos if (found := _motion_of(folder, video)) is not None}
+        loaded = fields.load(folder)
+    former = {video.id: found for video in videos if (found := _former_motion(folder, video)) is not None}
     try:
-        _begin_fields(problem, made, scene_ids(videos))
+        _load_fields(problem, loaded, scene_ids(videos))
     except (RuntimeError, AssertionError) as error:
         what = "its fields have other sizes than this recipe's"
         raise InputError("RCN-003", what, str(folder), "take it away to start from nothing") from error
@@ -64,7 +64,7 @@ def begin(problem: Problem, videos: Sequence[RegisteredVideo], folder: Path) -> 
     for index, video in enumerate(scene_first(videos)):
         if video.id in former:
             frame = torch.nonzero(problem.video.cpu() == index)[:, 0]
-            _begin_cameras(problem, frame, former[video.id])
+            _load_cameras(problem, frame, former[video.id])
             frames.append(frame)
             roots.append(_twists(problem.motion.initial_agent[frame], former[video.id].world_from_agent))
             rest = problem.motion.agent_from_bone_rest.expand(len(frame), -1, -1, -1)
@@ -80,8 +80,8 @@ def shorter(steps: PhaseSteps) -> PhaseSteps:
     return replace(steps, template=0, scene=round(SHARE * steps.scene), joint=round(SHARE * steps.joint))
 
 
-def _motion_of(folder: Path, video: RegisteredVideo) -> Motion | None:
-    """Return a recording's former motion; None where the recording is another one, or was not there."""
+def _former_motion(folder: Path, video: RegisteredVideo) -> Motion | None:
+    """Return a recording's former motion; None if it was not part of the reconstruction or has changed."""
     for path in (folder / video.id / "motion.npz", folder / "templates" / f"{video.id}.npz"):
         if path.is_file():
             found = motion.load(path)
@@ -91,43 +91,45 @@ def _motion_of(folder: Path, video: RegisteredVideo) -> Motion | None:
 
 
 @torch.no_grad()
-def _begin_fields(problem: Problem, made: Reconstruction, ids: Sequence[str]) -> None:
-    problem.agent.load_state_dict(made.agent.state_dict())
-    problem.body.load_state_dict(made.body.state_dict())
-    scene, former = problem.scene, made.scene
-    own, before = (
-        {name: value for name, value in field.state_dict().items() if name.startswith(OWN) == is_own}
+def _load_fields(problem: Problem, loaded: Reconstruction, ids: Sequence[str]) -> None:
+    problem.agent.load_state_dict(loaded.agent.state_dict())
+    problem.body.load_state_dict(loaded.body.state_dict())
+    scene, former = problem.scene, loaded.scene
+    kept, before = (
+        {name: value for name, value in field.state_dict().items() if name.startswith(REBUILT) == is_own}
         for field, is_own in ((scene, True), (former, False))
     )
-    scene.load_state_dict(before | own)
-    _begin_grid(scene, former)
+    scene.load_state_dict(before | kept)
+    _resample_grid(scene, former)
     if scene.codes is not None and former.codes is not None:
         scene.codes.weight[:] = former.codes.weight.mean(0)
         for index, id in enumerate(ids):
-            if id in made.videos:
-                scene.codes.weight[index] = former.codes.weight[made.video_code(id)]
+            if id in loaded.videos:
+                scene.codes.weight[index] = former.codes.weight[loaded.video_code(id)]
 
 
-def _begin_grid(scene: Field, former: Field) -> None:
-    """Interpolate the former grids at the nodes of the present ones, whose box may be another."""
+def _resample_grid(scene: Field, former: Field) -> None:
+    """Resample the former grids at the nodes of the current ones, whose bounding box may differ."""
     grid, before = scene.grid, former.grid
     if not (isinstance(grid, DenseGrid) and isinstance(before, DenseGrid)):
         raise AssertionError("an MLP is tied to its box")
     assert scene.shape.voxel_m == former.shape.voxel_m, (scene.shape, former.shape)
-    for level, extent, then, its_extent in zip(
+    for level, extent, source, source_extent in zip(
         grid.levels, grid.extents, before.levels, before.extents, strict=True
     ):
         z, y, x = (torch.linspace(0, 1, count) for count in level.shape[2:])
         nodes = torch.stack(torch.meshgrid(z, y, x, indexing="ij")[::-1], dim=-1).to(level)
-        place = (grid.low + nodes * extent - before.low.to(level)) / its_extent.to(level) * 2 - 1
+        place = (grid.low + nodes * extent - before.low.to(level)) / source_extent.to(level) * 2 - 1
         level.copy_(
-            nn.functional.grid_sample(then.to(level), place[None], padding_mode="border", align_corners=True)
+            nn.functional.grid_sample(
+                source.to(level), place[None], padding_mode="border", align_corners=True
+            )
         )
 
 
 @torch.no_grad()
-def _begin_cameras(problem: Problem, frame: Int[Tensor, "frame"], former: Motion) -> None:
-    """Set the knots of one recording's cameras, where they are known at both ends of a knot's frames."""
+def _load_cameras(problem: Problem, frame: Int[Tensor, "frame"], former: Motion) -> None:
+    """Set one recording's camera knots, each from the nearest frame with a known camera."""
     table = problem.motion
     known = np.flatnonzero(np.isfinite(former.world_from_camera).all((1, 2)))
     if not len(known):
@@ -141,7 +143,7 @@ def _begin_cameras(problem: Problem, frame: Int[Tensor, "frame"], former: Motion
 
 def _twists(a_from_b: Float[Tensor, "*batch 4 4"], a_from_c: Float[np.ndarray, "*batch 4 4"]) -> Tensor:
     """Return the twists of ``b_from_c``; 0 where it is unknown."""
-    made = rigid.inverse(a_from_b.double().cpu().numpy()) @ a_from_c
-    known = np.isfinite(made).all((-1, -2))
-    made[~known] = np.eye(4)
-    return torch.from_numpy(rigid.log(made)).float()
+    b_from_c = rigid.inverse(a_from_b.double().cpu().numpy()) @ a_from_c
+    known = np.isfinite(b_from_c).all((-1, -2))
+    b_from_c[~known] = np.eye(4)
+    return torch.from_numpy(rigid.log(b_from_c)).float()

@@ -15,17 +15,17 @@ from stages.reconstruct.scene import (
     SceneLoss,
     Terms,
     camera_prior,
-    even_depths,
     render_depths,
     scene_density,
     scene_layer,
     surface_depths,
-    swap,
+    swap_codes,
     swap_probability,
+    uniform_depths,
 )
 
 RUN_FRAMES = 4
-"""frames of each run: enough for accelerations"""
+"""frames of each run, at least 3 for accelerations"""
 AGENT_RAYS, SURFACE_POINTS = 32, 96
 """measured rays and surface points of the agent per frame and step"""
 FIELD_POINTS, TEMPLATE_POINTS = 512, 4096
@@ -44,7 +44,7 @@ class JointLoss:
     def __init__(
         self, problem: Problem, weights: LossWeights, batches: RayBatches, steps: int, rendered: bool = False
     ):
-        """``rendered``: rays sampled evenly and by importance, not around measured depth (001, A.1)."""
+        """``rendered``: uniform and importance samples, not samples around measured depth (001, A.1)."""
         self.problem, self.weights, self.batches, self.steps = problem, weights, batches, steps
         self.scene_loss = SceneLoss(problem, weights, batches, steps, rendered)
         self.run_frames = RUN_FRAMES if len(problem.runs(RUN_FRAMES)) else 1
@@ -67,13 +67,13 @@ class JointLoss:
         return losses.weighted(terms, shared=True)
 
     def _rendered(self, pose: Pose, number: int, probability: float, generator: Generator) -> Terms:
-        """Render ``number`` rays per frame on and around the agent through both fields; compare with all."""
+        """Return the losses of ``number`` rendered rays per frame on and around the agent."""
         problem, samples = self.problem, self.batches.rendered_samples
         rays = problem.store.agent.at(problem.agent_rays.pick(pose.frame, number, generator).flatten())
         has_scene = problem.has_scene[rays.frame]
         video = torch.where(has_scene, problem.video[rays.frame], 0)
         farthest_m = problem.store.farthest_m
-        code_of = swap(video, problem.scene.shape.videos, probability, generator)
+        code_of = swap_codes(video, problem.scene.shape.videos, probability, generator)
         frame = torch.arange(len(pose.frame), device=problem.device).repeat_interleave(number)
 
         def density_of(index: Tensor, depth: Tensor, min_beta_m: float = 0.0) -> Tensor:
@@ -84,7 +84,7 @@ class JointLoss:
             return scene * has_scene[index, None] + agent
 
         if self.scene_loss.rendered:
-            coarse, half_m = even_depths(rays, farthest_m, samples // 2, generator), farthest_m / samples
+            coarse, half_m = uniform_depths(rays, farthest_m, samples // 2, generator), farthest_m / samples
             with torch.no_grad():
                 both = density_of(torch.arange(len(rays), device=problem.device), coarse, half_m)
                 fine = importance_depths(coarse, rays.direction.norm(dim=-1), both, generator)
@@ -97,7 +97,7 @@ class JointLoss:
         scene = Layer(scene.density * has_scene[:, None], scene.color, scene.feature)
         agent, rest = agent_layer(problem, pose, points_agent, depth.shape)
         rendered = composite(depth, rays.direction.norm(dim=-1), scene, agent)
-        return compare(problem, pose, rays, rendered, world, rest, has_scene, self.weights)
+        return rendering_terms(problem, pose, rays, rendered, world, rest, has_scene, self.weights)
 
 
 def sample_points(
@@ -122,7 +122,7 @@ def agent_layer(
     return Layer.of_agent(problem.agent, rest, shape, min_beta_m), rest
 
 
-def compare(
+def rendering_terms(
     problem: Problem,
     pose: Pose,
     rays: Rays,
@@ -135,7 +135,7 @@ def compare(
     """Return the rendering losses, each over the rays that have its observation."""
     on_agent, known = rays.label == AGENT, rays.label != UNKNOWN
     whole = known & (has_scene | on_agent)
-    flow_px, flow_good = later_pixels(problem, pose, rays, rendered, world, rest)
+    flow_px, flow_good = predict_flow_pixels(problem, pose, rays, rendered, world, rest)
     flow_good = flow_good & whole
     trust = (rays.flow_confidence / 255)[flow_good]
     return {
@@ -156,7 +156,7 @@ def compare(
     }
 
 
-def later_pixels(
+def predict_flow_pixels(
     problem: Problem,
     pose: Pose,
     rays: Rays,
@@ -166,7 +166,7 @@ def later_pixels(
 ) -> tuple[Float[Tensor, "ray 2"], Bool[Tensor, "ray"]]:
     """Return the pixels of rendered points in the flow's later frame, and for which rays they are valid.
 
-    A sample's later place mixes the scene's (it stays) and the agent's (it follows the bones), by density.
+    The later position of a sample blends those of the static scene and of the moving agent by density.
     """
     frames, number = len(pose.frame), len(rays) // len(pose.frame)
     later = (rays.frame + rays.flow_gap).view(frames, number)[:, 0].clamp_max(len(problem.video) - 1)
@@ -185,7 +185,7 @@ def later_pixels(
 
 
 def field_terms(problem: Problem, weights: LossWeights, generator: Generator) -> Terms:
-    """Keep the agent's field a distance field, and near its template in shape and colour."""
+    """Return the agent's eikonal loss and the losses that keep its field near the template."""
     field, surface = problem.agent, problem.surface
     index = pick(len(surface.around), FIELD_POINTS, generator, problem.device)
     points = surface.around[index]
@@ -205,7 +205,7 @@ def field_terms(problem: Problem, weights: LossWeights, generator: Generator) ->
 
 
 class TemplateLoss:
-    """Copies the agent template into the agent's field."""
+    """The loss of the agent's field against its template."""
 
     def __init__(self, problem: Problem):
         self.problem = problem

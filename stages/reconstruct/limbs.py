@@ -1,6 +1,6 @@
-"""The kinematic tree of the bones: a thigh's rotation carries the leg, and one parameter lifts a tail.
+"""The kinematic tree of the bones, so that the rotation of a thigh moves the whole leg.
 
-Gaussian bones come without parents: the minimum spanning tree over shared skin gives them.
+Gaussian bones have no parents; the maximum spanning tree over shared skinning weights defines them.
 """
 
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ from torch import Tensor, nn
 from pipeline.geometry import rigid_torch
 
 MIN_SHARE = 1e-9
-"""shared skin below this counts as none; keeps logarithms finite"""
+"""lower bound of shared skinning weight; keeps logarithms finite"""
 MAX_SHARE = 0.999
-"""bones share no more skin than this: an edge of length 0 is none to the spanning tree"""
+"""upper bound: a sparse graph drops edges of length 0"""
 LOW, GROUND = 0.45, 0.15
-"""legs are below this share of the animal's height, and reach below this"""
+"""legs lie below the first share of the animal's height and reach below the second"""
 
 
 def shared_skin(weights: Float[Tensor, "point bone"]) -> Float[Tensor, "bone bone"]:
-    """Return how much skin bones share, 0..1; none with themselves."""
+    """Return the cosine similarity of the skinning weights of each pair of bones, 0..1; 0 on the diagonal."""
     share = weights.T @ weights
     size = share.diagonal().sqrt().clamp_min(1e-6)
     return (share / size[:, None] / size).fill_diagonal_(0)
@@ -46,7 +46,7 @@ class KinematicTree:
         weights: Float[Tensor, "point bone"],
         agent_from_bone_rest: Float[Tensor, "bone 4 4"],
     ) -> "KinematicTree":
-        """Make the tree of most shared skin, rooted at the bone nearest to the agent's origin."""
+        """Build the maximum spanning tree of shared skin from the bone nearest to the agent's origin."""
         cost = -np.log(shared_skin(weights).double().numpy().clip(MIN_SHARE, MAX_SHARE))
         tree = minimum_spanning_tree(cost)
         centre = agent_from_bone_rest[:, :3, 3]
@@ -58,9 +58,9 @@ class KinematicTree:
         return cls(order, order.argsort()[parent], both.T @ points / both.sum(0)[:, None])
 
     def motion(self, turn: Float[Tensor, "frame bone 3"]) -> Float[Tensor, "frame bone 4 4"]:
-        """Return each bone's motion in the agent frame: its rotation about its joint, after its ancestors'.
+        """Return each bone's motion in the agent frame by forward kinematics: rotations about joints.
 
-        The root bone stays: it moves with the agent's root.
+        The root bone is fixed: it moves with the agent's root.
         """
         rotation = rigid_torch.so3_exp(turn[:, self.order])
         local = rigid_torch.make(rotation, self.joint - (rotation @ self.joint[..., None])[..., 0])
@@ -73,7 +73,7 @@ class KinematicTree:
 def legs(
     limbs: KinematicTree, points: Float[Tensor, "point 3"], weights: Float[Tensor, "point bone"]
 ) -> Bool[Tensor, "bone"]:
-    """Return the uppermost bones of legs: they and their descendants are low, and one reaches the ground."""
+    """Return the top bone of each leg: it and its descendants are low, and one of them reaches the ground."""
     height = (points[:, 1] - points[:, 1].min()) / (points[:, 1].max() - points[:, 1].min())
     low, bones = weights.T @ height < LOW * weights.sum(0), range(weights.shape[1])
     stands = torch.stack([(height[weights.argmax(1) == bone] < GROUND).any() for bone in bones])
@@ -84,10 +84,10 @@ def legs(
     return (low & stands & ~low[limbs.parent])[limbs.order.argsort()]
 
 
-class MultiscaleTurns(nn.Module):
-    """Rotations over consecutive frames, coarse to fine: sums of linear splines on several time scales.
+class MultiscaleRotations(nn.Module):
+    """Rotation vectors over consecutive frames: sums of linear splines on several time scales.
 
-    Slow motion is found by few coarse parameters; frame by frame it would take many steps.
+    Coarse knots make slow motion converge in fewer steps than per-frame parameters would.
     """
 
     def __init__(self, frames: int, bones: int, knot_frames: tuple[int, ...]):

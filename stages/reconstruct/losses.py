@@ -1,6 +1,6 @@
-"""The losses of the reconstruction: pure, per element, unweighted (paper 001, Eq. 6 and the terms after it).
+"""Losses of the reconstruction, per element and unweighted (paper 001, Eq. 6 and the terms after it).
 
-Weights stand in the stage's configuration; `weighted` is the one place where losses are averaged and summed.
+Weights are in the stage's configuration; `weighted` averages and weights the losses.
 """
 
 from collections.abc import Mapping
@@ -12,8 +12,8 @@ from torch.nn import functional
 
 from pipeline.core import distributed
 
-DISTANCE_KNEE, COLOR_KNEE, FLOW_KNEE, DEPTH_KNEE = 0.3, 0.2, 0.5, 1.0
-"""where Huber losses go over from squares to lines, in the units of each loss"""
+DISTANCE_DELTA, COLOR_DELTA, FLOW_DELTA, DEPTH_DELTA = 0.3, 0.2, 0.5, 1.0
+"""thresholds of the Huber losses, in the units of each loss"""
 FLOW_UNIT_PX, DEPTH_UNIT_M = 10.0, 0.1
 """units of flow and of rendered depth"""
 MIN_PROBABILITY = 1e-3
@@ -25,20 +25,20 @@ def distance(
 ) -> Float[Tensor, "*point"]:
     """Compare signed distances in units of ``unit_m``, robustly."""
     return functional.huber_loss(
-        distance_m / unit_m, target_m / unit_m, reduction="none", delta=DISTANCE_KNEE
+        distance_m / unit_m, target_m / unit_m, reduction="none", delta=DISTANCE_DELTA
     )
 
 
 def truncated_distance(
     distance_m: Float[Tensor, "*point"], target_m: Float[Tensor, "*point"], limit_m: float
 ) -> Float[Tensor, "*point"]:
-    """Compare signed distances, which saturate at ``limit_m``, with ones that do not, as `distance`."""
+    """Compare signed distances truncated at ``limit_m`` with untruncated targets, as `distance` does."""
     return distance(distance_m, target_m.clamp(-limit_m, limit_m), limit_m)
 
 
 def color(predicted: Float[Tensor, "*point 3"], target: Float[Tensor, "*point 3"]) -> Float[Tensor, "*point"]:
     """Compare colors in 0..1, robustly."""
-    return functional.huber_loss(predicted, target, reduction="none", delta=COLOR_KNEE).mean(-1)
+    return functional.huber_loss(predicted, target, reduction="none", delta=COLOR_DELTA).mean(-1)
 
 
 def feature(
@@ -55,30 +55,30 @@ def silhouette(predicted: Float[Tensor, "*ray"], agent: Float[Tensor, "*ray"]) -
 
 
 def flow(pixel_px: Float[Tensor, "*ray 2"], target_px: Float[Tensor, "*ray 2"]) -> Float[Tensor, "*ray"]:
-    """Compare where points are seen later, in units of `FLOW_UNIT_PX`, robustly."""
+    """Compare pixel positions in the later frame, in units of `FLOW_UNIT_PX`, robustly."""
     pixel, target = pixel_px / FLOW_UNIT_PX, target_px / FLOW_UNIT_PX
-    return functional.huber_loss(pixel, target, reduction="none", delta=FLOW_KNEE).sum(-1)
+    return functional.huber_loss(pixel, target, reduction="none", delta=FLOW_DELTA).sum(-1)
 
 
 def depth(depth_m: Float[Tensor, "*ray"], target_m: Float[Tensor, "*ray"]) -> Float[Tensor, "*ray"]:
     """Compare rendered and measured depth in units of `DEPTH_UNIT_M`, robustly."""
     depth, target = depth_m / DEPTH_UNIT_M, target_m / DEPTH_UNIT_M
-    return functional.huber_loss(depth, target, reduction="none", delta=DEPTH_KNEE)
+    return functional.huber_loss(depth, target, reduction="none", delta=DEPTH_DELTA)
 
 
 def eikonal(
     distance: Float[Tensor, "point"], shifted: Float[Tensor, "3 point"], step_m: float
 ) -> Float[Tensor, "point"]:
-    """Penalize gradients whose length is not 1, by differences along three axes (Gropp et al. 2020)."""
+    """Penalize gradient norms other than 1, by finite differences (Gropp et al. 2020)."""
     return (((shifted - distance) / step_m).square().sum(0).clamp_min(1e-8).sqrt() - 1).square()
 
 
 def weighted(
     terms: Mapping[str, tuple[float, Float[Tensor, "..."]]], shared: bool = False
 ) -> dict[str, Float[Tensor, ""]]:
-    """Average each term over its elements and weigh it; terms without elements vanish.
+    """Average each term over its elements and multiply by its weight; empty terms are 0.
 
-    With ``shared``, the elements of all processes count, whose gradients will be averaged.
+    With ``shared``, average over the elements of all processes, whose gradients are averaged later.
     """
     counts = torch.tensor([float(values.numel()) for _, values in terms.values()])
     counts = distributed.total(counts).clamp_min(1) / distributed.size() if shared else counts.clamp_min(1)

@@ -20,7 +20,7 @@ from stages.reconstruct import posing
 from stages.reconstruct.config import LearningRates, LossWeights, PhaseSteps, RayBatches
 from stages.reconstruct.former import KnownMotion
 from stages.reconstruct.joint import JointLoss, TemplateLoss
-from stages.reconstruct.posing import Chunk, ChunkLoss
+from stages.reconstruct.posing import PosedSegment, SegmentLoss
 from stages.reconstruct.problem import Problem
 from stages.reconstruct.scene import SceneLoss
 
@@ -39,14 +39,14 @@ MOTION_RATE, SKIN_RATE = 5e-4, 2e-3
 JOINT_SCENE, JOINT_AGENT, JOINT_CAMERA = 0.25, 0.2, 0.3
 """shares of the first phase's learning rates in the second: fields and cameras are nearly right"""
 STANCE_SHARE = 0.5
-"""share of the rays and points of posing that decide the stance"""
+"""share of the rays and points of posing that is used to decide the stance"""
 
 Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
 class OptimizationPlan:
-    """How to optimise."""
+    """Settings of the optimization."""
 
     steps: PhaseSteps
     weights: LossWeights
@@ -58,7 +58,7 @@ class OptimizationPlan:
     workers: int = 1
     """segments that are posed at once, each by one thread"""
     known: KnownMotion | None = None
-    """of the agent, after a warm start; its frames are not posed again"""
+    """known motion of the agent after a warm start; its frames are not posed again"""
     rendered: bool = False
     """losses of scene and agent by differentiable rendering alone (`Config.supervision`)"""
 
@@ -86,7 +86,7 @@ def optimise(problem: Problem, plan: OptimizationPlan) -> dict[str, FitRecord]:
     loss = SceneLoss(problem, plan.weights, plan.batches, steps.scene, plan.rendered)
     records["scene"] = _run(problem, plan, "scene", loss, steps.scene, scene)
     if len(everything.agent_frames):
-        segments = list(chunks(everything, SEGMENT_FRAMES))
+        segments = list(split_segments(everything, SEGMENT_FRAMES))
         if plan.known:
             known = plan.known.frame.to(problem.device)
             segments = [frame for frame in segments if not torch.isin(frame, known).any()]
@@ -103,7 +103,7 @@ def optimise(problem: Problem, plan: OptimizationPlan) -> dict[str, FitRecord]:
     return records
 
 
-def chunks(problem: Problem, length: int) -> Iterable[Int[Tensor, "frame"]]:
+def split_segments(problem: Problem, length: int) -> Iterable[Int[Tensor, "frame"]]:
     """Cut each video's frames into segments of up to ``length`` that hold at least one usable frame."""
     for video in range(int(problem.video.max()) + 1):
         frames = torch.nonzero(problem.video == video)[:, 0]
@@ -133,44 +133,44 @@ def _run(
 def _pose(problem: Problem, plan: OptimizationPlan, segments: Sequence[torch.Tensor]) -> None:
     """Pose the template in all segments with usable frames; write roots and bones into the motion table."""
 
-    def pose(index: int, frame: torch.Tensor, asked_to_stop: Callable[[], bool]) -> Chunk:
-        chunk = Chunk(problem, frame)
-        _fit_chunk(problem, plan, f"body_{index:04d}", chunk, plan.steps.body, asked_to_stop)
-        return chunk
+    def pose(index: int, frame: torch.Tensor, asked_to_stop: Callable[[], bool]) -> PosedSegment:
+        posed = PosedSegment(problem, frame)
+        _fit_segment(problem, plan, f"body_{index:04d}", posed, plan.steps.body, asked_to_stop)
+        return posed
 
-    for chunk in _in_each(problem, plan, segments, pose, "posing"):
-        chunk.write(problem)
+    for posed in _for_segments(problem, plan, segments, pose, "posing"):
+        posed.write(problem)
 
 
 def _choose_stances(problem: Problem, plan: OptimizationPlan, segments: Sequence[torch.Tensor]) -> None:
-    """Find the stance in all segments with usable frames, from which roots and bones start."""
-    choices, chosen = posing.candidates(problem), torch.zeros_like(problem.video)
+    """Choose the stances of all segments with usable frames and initialize roots and bones with them."""
+    stances, chosen = posing.candidate_stances(problem), torch.zeros_like(problem.video)
 
     def losses_of(index: int, frame: Tensor, asked_to_stop: Callable[[], bool]) -> tuple[Tensor, np.ndarray]:
         losses = []
-        for number, stance in enumerate(choices):
-            chunk, name = Chunk(problem, frame, stance), f"stance_{index:04d}_{number}"
-            loss = _fit_chunk(problem, plan, name, chunk, plan.steps.stance, asked_to_stop, STANCE_SHARE)
-            losses.append(loss.of_parts(posing.PART, generator_for(plan.seed, index)))
+        for number, stance in enumerate(stances):
+            posed, name = PosedSegment(problem, frame, stance), f"stance_{index:04d}_{number}"
+            loss = _fit_segment(problem, plan, name, posed, plan.steps.stance, asked_to_stop, STANCE_SHARE)
+            losses.append(loss.of_parts(posing.STANCE_FRAMES, generator_for(plan.seed, index)))
         return frame, torch.stack(losses, dim=-1).cpu().numpy()
 
-    losses = list(_in_each(problem, plan, segments, losses_of, "stances"))
+    losses = list(_for_segments(problem, plan, segments, losses_of, "stances"))
     level = [loss[:, 0] for _, loss in losses]  # none where other processes have all new recordings
-    usual = float(np.nanmedian(np.concatenate(level))) if level else np.nan
+    typical = float(np.nanmedian(np.concatenate(level))) if level else np.nan
     for frame, loss in losses:
-        chosen[frame] = posing.by_frame(posing.most_likely(loss, usual), len(frame)).to(chosen)
-    lean, bone = (torch.stack([getattr(stance, name) for stance in choices]) for name in ("lean", "bone"))
+        chosen[frame] = posing.by_frame(posing.decode_stances(loss, typical), len(frame)).to(chosen)
+    lean, bone = (torch.stack([getattr(stance, name) for stance in stances]) for name in ("lean", "bone"))
     problem.motion.start(lean[distributed.total(chosen)], bone[chosen])
 
 
-def _in_each(
+def _for_segments(
     problem: Problem,
     plan: OptimizationPlan,
     segments: Sequence[torch.Tensor],
     work: Callable[..., Result],
     label: str,
 ) -> Iterator[Result]:
-    """Yield the result of ``work`` for each segment with usable frames; only its poses learn."""
+    """Yield the result of ``work`` for each segment with usable frames; fields and body are frozen."""
     held = nn.ModuleList([problem.agent, problem.body, problem.scene]).requires_grad_(False)
     numbered = enumerate(segments)
     own = [(index, frame) for index, frame in numbered if torch.isin(frame, problem.agent_frames).any()]
@@ -180,20 +180,20 @@ def _in_each(
     held.requires_grad_(True)
 
 
-def _fit_chunk(
+def _fit_segment(
     problem: Problem,
     plan: OptimizationPlan,
     name: str,
-    chunk: Chunk,
+    posed: PosedSegment,
     steps: int,
     asked_to_stop: Callable[[], bool],
     share: float = 1.0,
-) -> ChunkLoss:
+) -> SegmentLoss:
     """Pose the template in one segment of frames, with a ``share`` of the usual rays; returns the loss."""
-    loss = ChunkLoss(problem, chunk, plan.weights, share)
+    loss = SegmentLoss(problem, posed, plan.weights, share)
     fit(
-        modules={"chunk": chunk},
-        optimizer=torch.optim.AdamW(chunk.groups()),
+        modules={"chunk": posed},
+        optimizer=torch.optim.AdamW(posed.groups()),
         loss=lambda step, generator: loss(step / steps, generator),
         steps=steps,
         seed=_seed(plan.seed, name),
@@ -207,7 +207,7 @@ def _fit_chunk(
 
 
 def field_groups(field: nn.Module, rates: LearningRates) -> list[dict]:
-    """Return a field's parameter groups: grids learn fast, networks slowly."""
+    """Return a field's parameter groups: grids have a high learning rate, networks a low one."""
     heads, grid = (
         [value for name, value in field.named_parameters() if name.startswith("grid.levels.") == is_grid]
         for is_grid in (False, True)
@@ -219,7 +219,7 @@ def field_groups(field: nn.Module, rates: LearningRates) -> list[dict]:
 
 
 def _motion_group(parameters: list[nn.Parameter], rate: float, momentum: float = 0.0) -> dict:
-    """Return a parameter group, by default without momentum: frames outside the batch must not move."""
+    """Return a parameter group; no momentum by default, so that frames outside the batch do not move."""
     return {"params": parameters, "lr": rate, "weight_decay": 0.0, "betas": (momentum, BETA2)}
 
 

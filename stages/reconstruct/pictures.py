@@ -18,11 +18,11 @@ from pipeline.geometry import cameras, rigid, subsampling
 LONG_SIDE_PX = 320
 """of each drawn picture"""
 ACROSS_M, ABOVE_M = 0.8, 0.6
-"""how far beyond the agent, and above it at most, the camera of the opposite view stands: no wall between"""
+"""distance beyond the agent, and maximum height above it, of the camera of the opposite view"""
 AXIS_M = 0.03
 """length of a bone's drawn axes"""
 FARTHEST_PX = 1 << 20
-"""drawn points are clamped here, in sixteenths of a pixel: OpenCV's integers end"""
+"""drawn points are clamped here, in sixteenths of a pixel, to avoid integer overflow in OpenCV"""
 SESSIONS, FRAMES = 4, 4
 """sessions that are compared, and frames of each"""
 

@@ -1,4 +1,4 @@
-"""What is being reconstructed: measurements, fields, body, motion, and which frame belongs to which video."""
+"""State of the reconstruction: measurements, fields, body, motion, and the video of each frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,25 +17,25 @@ from stages.reconstruct.limbs import KinematicTree, shared_skin
 from stages.reconstruct.rays import RayStore
 
 TRUSTED = 0.1
-"""frames whose mask weighs less are left out of runs of consecutive frames"""
+"""frames with a lower mask weight are left out of runs of consecutive frames"""
 MAX_PRECISE = 100.0
-"""prior precision of a camera that registration is certain of, relative to one at even odds; losses alone err
-by a millimetre and 0.05 degrees"""
+"""prior precision of a camera registered with certainty, relative to one at even odds; losses alone err by a
+millimetre and 0.05 degrees"""
 MAX_JOINTS, MIN_SKIN = 4, 0.02
-"""joints of a bone, and the share of skin that two bones must have in common to be tied"""
+"""maximum number of joints per bone; shared skin from which two bones are joined"""
 SOLE, SOLES = 0.07, 32
-"""soles are below this share of the animal's height; so many points of them are looked at"""
+"""soles lie below this share of the animal's height; number of sole points"""
 ON_SURFACE, AROUND = 4000, 40000
 """samples of the template's surface and of the space around it"""
 AROUND_MARGIN_M = 0.25
-"""the space around the template reaches this far"""
+"""margin around the template within which space is sampled"""
 NOISE_M = (0.01, 0.04)
 """half of the samples around the template lie this far from its surface, standard deviations"""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """All that the phases read and change; tensors and modules live on one device."""
+    """State shared by all phases; tensors and modules are on one device."""
 
     store: RayStore
     scene: Field
@@ -57,15 +57,15 @@ class Problem:
     camera_precision: Float[Tensor, "knot"]
     """prior precision of each knot's camera correction, relative to that of a camera at even odds"""
     floor_m: float
-    """nothing is below this height of the world"""
+    """height of the floor in the world"""
 
     @property
     def device(self) -> torch.device:
-        """Where everything lives."""
+        """Device of the tensors and modules."""
         return self.scene.log_beta.device
 
     def modules(self) -> dict[str, nn.Module]:
-        """Return everything that learns, by name."""
+        """Return the trainable modules by name."""
         return {"scene": self.scene, "agent": self.agent, "body": self.body, "motion": self.motion}
 
     def share(self, rank: int, size: int) -> "Problem":
@@ -105,7 +105,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class RaysByFrame:
-    """Where each frame's rays on the agent stand in the store."""
+    """Index ranges of each frame's rays on the agent."""
 
     start: Int[Tensor, "frame"]
     count: Int[Tensor, "frame"]
@@ -126,7 +126,7 @@ class RaysByFrame:
 
 @dataclass(frozen=True)
 class Joints:
-    """Joints between bones that share skin: pairs of bones, and the points on which both must agree."""
+    """Joints between bones that share skin: pairs of bones and the point that both must move alike."""
 
     first: Int[Tensor, "joint"]
     second: Int[Tensor, "joint"]
@@ -135,12 +135,12 @@ class Joints:
 
     @classmethod
     def of(cls, points: Float[Tensor, "point 3"], weights: Float[Tensor, "point bone"]) -> "Joints":
-        """Tie each bone to at most `MAX_JOINTS` with which it shares most skin, but always to one."""
+        """Join each bone with at least one and at most `MAX_JOINTS` bones with which it shares most skin."""
         share = shared_skin(weights)
         ranked = share.argsort(dim=1, descending=True)
-        tied = torch.zeros_like(share, dtype=torch.bool).scatter_(1, ranked[:, :MAX_JOINTS], True)
-        tied = (tied & (share > MIN_SKIN)).scatter_(1, ranked[:, :1], True)
-        first, second = torch.nonzero((tied | tied.T).triu(1), as_tuple=True)
+        joined = torch.zeros_like(share, dtype=torch.bool).scatter_(1, ranked[:, :MAX_JOINTS], True)
+        joined = (joined & (share > MIN_SKIN)).scatter_(1, ranked[:, :1], True)
+        first, second = torch.nonzero((joined | joined.T).triu(1), as_tuple=True)
         both = weights[:, first] * weights[:, second]
         return cls(first, second, both.T @ points / both.sum(0).clamp_min(1e-9)[:, None])
 
@@ -169,21 +169,21 @@ class TemplateSurface:
         corner = mesh.vertices[mesh.faces].astype(np.float64)
         area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=-1)
         face = rng.choice(len(mesh.faces), 8 * ON_SURFACE, p=area / area.sum())
-        bary = rng.dirichlet(np.ones(3), len(face))
-        points = np.einsum("pk,pkd->pd", bary, corner[face])
+        barycentric = rng.dirichlet(np.ones(3), len(face))
+        points = np.einsum("pk,pkd->pd", barycentric, corner[face])
         normal = mesh.face_normals()[face]
         low, high = mesh.vertices.min(0) - AROUND_MARGIN_M, mesh.vertices.max(0) + AROUND_MARGIN_M
         half = AROUND // 2
         noise = rng.choice(NOISE_M, half)[:, None]
         near = points[rng.integers(len(points), size=half)] + rng.normal(size=(half, 3)) * noise
         around = np.concatenate([near, rng.uniform(low, high, (half, 3))])
-        near_m, near = map(np.asarray, KDTree(points).query(around, 8))
-        side = ((around[:, None] - points[near]) * normal[near]).sum(-1).mean(-1)
-        distance = near_m[:, 0] * np.where(side < 0, -1, 1)
-        vertex, mix = mesh.faces[face[near[:, 0]]], bary[near[:, 0]]
-        shade = mesh.color if mesh.color is not None else np.full_like(mesh.vertices, 128)
-        color = np.einsum("pk,pkc->pc", mix, shade[vertex] / 255)
-        features = np.einsum("pk,pkc->pc", mix, feature[vertex].astype(np.float64))
+        distances, near = map(np.asarray, KDTree(points).query(around, 8))
+        offset = ((around[:, None] - points[near]) * normal[near]).sum(-1).mean(-1)
+        distance = distances[:, 0] * np.where(offset < 0, -1, 1)
+        vertex, weights = mesh.faces[face[near[:, 0]]], barycentric[near[:, 0]]
+        vertex_color = mesh.color if mesh.color is not None else np.full_like(mesh.vertices, 128)
+        color = np.einsum("pk,pkc->pc", weights, vertex_color[vertex] / 255)
+        features = np.einsum("pk,pkc->pc", weights, feature[vertex].astype(np.float64))
         features /= np.maximum(np.linalg.norm(features, axis=-1, keepdims=True), 1e-6)
         points, normal = points[:ON_SURFACE], normal[:ON_SURFACE]
         height = points[:, 1] - points[:, 1].min()

@@ -1,4 +1,4 @@
-"""Turn recordings into a compact store of rays, so that optimization never opens a picture again.
+"""Convert recordings into a compact store of rays, so that optimization need not read pictures.
 
 `collect` reads each frame of one video once and keeps a few pixels of it: some anywhere, some on and around
 the agent. `Views` keeps thumbnails of each frame (depth, distance from the agent's mask, occluders) for the
@@ -32,23 +32,22 @@ AGENT, UNKNOWN, NOT_AGENT = 255, 128, 0
 RING_PX, RING_SHARE = 10, 0.25
 """width of the ring around the mask, color pixels, and its share of the pixels kept for the agent"""
 MIN_SLOPE = 0.15
-"""surfaces are taken as no more oblique than this: normals of noisy depth err"""
+"""lower bound of the slope: normals of noisy depth are unreliable on oblique surfaces"""
 EDGE_M, EDGE_SHARE = 0.1, 0.05
 """depth that changes by more than this within 3 pixels, plus this share of itself, is an edge"""
 THUMBNAIL = 4
-"""colour pixels along the edge of a thumbnail's pixel"""
+"""downsampling factor of thumbnails from colour pixels"""
 FAR_PX = 255.0
-"""distances from the mask saturate here"""
+"""distances from the mask are clamped here"""
 NEAREST_M = 0.15
 """nearer depth is not trusted"""
-CONFIRMED = 2
-"""confidence of depth that is the map's or that several views confirmed, of a recording without a depth
-sensor: what was inferred is not fitted to"""
+MIN_CONFIDENCE = 2
+"""least confidence of depth used from a recording without a depth sensor: from the map or several views"""
 
 
 @dataclass(frozen=True)
 class Rays:
-    """Pixels and what was measured there."""
+    """Pixels and their measurements."""
 
     frame: Int[Tensor, "ray"]
     direction: Float[Tensor, "ray 3"]
@@ -88,7 +87,7 @@ class Views:
     outside_px: Float[Tensor, "frame height width"]
     """colour pixels outside the mask, negative inside, half precision; `FAR_PX` = farther or no mask"""
     occluder: Float[Tensor, "frame height width"]
-    """depth of what may occlude the agent (`occluder_depth`)"""
+    """depth of possible occluders of the agent (`occluder_depth`)"""
     agent_seen: Bool[Tensor, "frame"]
     """the mask of this frame can be trusted"""
 
@@ -134,10 +133,10 @@ def collect(source: RaySource, sampling: PixelSampling, rng: Generator) -> RaySt
             place = _choose(mask == NOT_AGENT, sampling.scene_per_frame, rng)
             scene.append(_read(source, frame, mask, depth, slope, place, rng))
         if visible[frame]:
-            place = choose_on_agent(mask, near_agent(mask, RING_PX), sampling.agent_per_frame, rng)
+            place = choose_agent_pixels(mask, near_agent(mask, RING_PX), sampling.agent_per_frame, rng)
             agent.append(_read(source, frame, mask, thin_depth(clip, frame), slope, place, rng))
         small = (mask.shape[0] // THUMBNAIL, mask.shape[1] // THUMBNAIL)
-        outside_px = distance_outside(mask, small) if visible[frame] else np.full(small, FAR_PX, np.float16)
+        outside_px = mask_distance_px(mask, small) if visible[frame] else np.full(small, FAR_PX, np.float16)
         depth = cv2.resize(depth, small[::-1], interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float16)
         thumbnails.append((depth, outside_px, occluder_depth(depth, outside_px)))
     depths, outsides, occluders = (torch.from_numpy(np.stack(part)) for part in zip(*thumbnails, strict=True))
@@ -174,7 +173,7 @@ def join(stores: Iterable[RayStore], folder: Path | None, size: tuple[int, int] 
 
 
 def _padded(views: Views, height: int, width: int) -> Views:
-    """Widen thumbnails to the right and below with unknown depth and no mask: some are upright, some wide."""
+    """Pad thumbnails at the right and bottom with unknown depth and no mask, to one size."""
     edge = (0, width - views.depth.shape[2], 0, height - views.depth.shape[1])
     depth, occluder = functional.pad(views.depth, edge), functional.pad(views.occluder, edge)
     outside_px = functional.pad(views.outside_px, edge, value=FAR_PX)
@@ -184,7 +183,7 @@ def _padded(views: Views, height: int, width: int) -> Views:
 def occluder_depth(
     depth: Float[np.ndarray, "height width"], outside_px: Float[np.ndarray, "height width"]
 ) -> Float[np.ndarray, "height width"]:
-    """Fill unknown depth of a thumbnail, as at edges, with the nearest depth of neighbours off the agent."""
+    """Fill unknown depth of a thumbnail with the smallest depth of neighbours off the agent."""
     off_agent = np.where((depth > 0) & (outside_px > 0), depth, np.inf)
     nearest = minimum_filter(off_agent.astype(np.float32), 3, mode="constant", cval=np.inf)
     return np.where((depth > 0) | np.isinf(nearest), depth, nearest).astype(depth.dtype)
@@ -196,7 +195,7 @@ def trusted_depth(
     """Return depth, metres (0 where its confidence is 0 or at edges), and each pixel's slope."""
     depth = usable_depth(clip, frame, nearest_m=NEAREST_M)
     if clip.mapped:
-        depth[clip.confidence(frame) < CONFIRMED] = 0
+        depth[clip.confidence(frame) < MIN_CONFIDENCE] = 0
     directions = cameras.ray_directions(clip.depth_intrinsics[frame], *depth.shape).astype(np.float32)
     known = cv2.blur((depth > 0).astype(np.float32), (3, 3))
     smooth = cv2.blur(depth * 1.0, (3, 3)) / np.maximum(known, 1e-6)
@@ -211,10 +210,10 @@ def trusted_depth(
 
 
 def thin_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
-    """Return depth, metres (0 = unknown), that neighbours support, even doubtful: thin limbs are all edge."""
+    """Return depth, metres (0 = unknown), supported by neighbours; keeps edges: thin limbs are edges."""
     depth = clip.depth(frame).astype(np.float32)
     if clip.mapped:
-        depth[clip.confidence(frame) < CONFIRMED] = 0
+        depth[clip.confidence(frame) < MIN_CONFIDENCE] = 0
     return np.where(supported(depth) & (depth >= NEAREST_M), depth, 0)
 
 
@@ -224,12 +223,12 @@ def near_agent(mask: UInt8[np.ndarray, "height width"], ring_px: int) -> Bool[np
     return cv2.dilate((mask == AGENT).astype(np.uint8), kernel) > 0
 
 
-def distance_outside(
+def mask_distance_px(
     mask: UInt8[np.ndarray, "height width"], small: tuple[int, int]
 ) -> Float[np.ndarray, "small_height small_width"]:
-    """Return how many colour pixels a thumbnail's pixels lie outside the mask's edge, negative inside.
+    """Return the signed distance of a thumbnail's pixels to the mask's edge, colour pixels, negative inside.
 
-    The edge runs between pixels of the full resolution; the thumbnail averages a distance, not labels.
+    It is computed at full resolution and then averaged.
     """
     outside = (mask == NOT_AGENT).astype(np.uint8)
     if outside.all():
@@ -252,7 +251,7 @@ def _choose(
     return np.stack(np.unravel_index(picked, allowed.shape), axis=-1)
 
 
-def choose_on_agent(
+def choose_agent_pixels(
     mask: UInt8[np.ndarray, "height width"],
     near: Bool[np.ndarray, "height width"],
     count: int,
@@ -270,7 +269,7 @@ def choose_on_agent(
 
 
 def _read(source: RaySource, frame: int, mask, depth, slope, place, rng: Generator) -> Rays:
-    """Collect what is known at pixels (row, column) ``place`` of one frame."""
+    """Read the measurements at pixels (row, column) ``place`` of one frame."""
     clip, features, (row, column) = source.clip, source.features, place.T
     pixel = np.stack([column, row], axis=-1) + 0.5
     direction = cameras.unproject(pixel, clip.intrinsics[frame])

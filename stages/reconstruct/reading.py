@@ -1,4 +1,4 @@
-"""Open what the stage reads: the recordings with their poses, and the agent template."""
+"""Read the inputs of the stage: recordings with their poses, and the agent template."""
 
 import json
 from collections.abc import Collection, Mapping
@@ -106,10 +106,9 @@ def read_videos(
     """Read the walk-through, the turnaround and every registered session once into rays with their poses.
 
     Args:
-        only: the first registered one of these sessions (of all where it is empty) stands alone, with the
-            turnaround.
-        scratch: folder of unnamed files with the rays; None: where temporary files stand.
-        workers: sessions read at once.
+        only: read only the first registered one of these sessions (of all if empty) and the turnaround.
+        scratch: folder of unnamed files with the rays; None: the directory of temporary files.
+        workers: sessions read in parallel.
 
     Raises:
         InputError: RCN-001 when no session was registered.

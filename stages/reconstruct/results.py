@@ -1,4 +1,4 @@
-"""Read the results off a solved problem and write them: motion, surfaces, skin, features, track points."""
+"""Extract and write the results: motion, surfaces, skin, features, track points."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,11 +28,11 @@ VOXEL_M = 0.1
 FREE, SURFACE, UNSEEN = 0, 1, 2
 """values of its occupancy"""
 AGENT_STEP_M = 0.01
-"""resolution of the extracted agent: at 0.02 a tail is lost"""
+"""resolution of the extracted agent: at 0.02 a tail disappears"""
 SEEN_WITHIN_M = 0.045
-"""the scene's surface is cut where nothing was measured this near: backs of thin shells, rims"""
+"""the scene's surface is removed where no measured point is this near: backs of thin shells, rims"""
 MAX_POINTS, MAX_FRAMES = 3_000_000, 300
-"""measured points, and frames that show free space, are thinned to about so many"""
+"""approximate limits of measured points, and of frames tested for free space, after subsampling"""
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,11 @@ def motions(problem: Problem, videos: Sequence[RegisteredVideo], certain_gap_s: 
         frame = torch.nonzero(problem.video == index)[:, 0]
         root = table.world_from_agent(frame).double().cpu().numpy()
         bones = table.agent_from_bone(frame).double().cpu().numpy()
-        good = known[frame.cpu()].numpy()
-        root, bones = bridged(video.timestamp_s, root, bones, good)
+        observed = known[frame.cpu()].numpy()
+        root, bones = interpolate_gaps(video.timestamp_s, root, bones, observed)
         camera = table.world_from_camera(frame).double().cpu().numpy()
         camera[~np.isfinite(video.world_from_camera).all((1, 2))] = np.nan
-        visible, confidence = video.agent_visible & good, video.confidence
+        visible, confidence = video.agent_visible & observed, video.confidence
         if visible.any():
             uncertain = gaps_s(video.timestamp_s, visible) > certain_gap_s
             confidence = np.where(uncertain, np.minimum(confidence, INTERPOLATED), confidence)
@@ -73,26 +73,26 @@ def motions(problem: Problem, videos: Sequence[RegisteredVideo], certain_gap_s: 
     return result
 
 
-def bridged(
+def interpolate_gaps(
     timestamp_s: Float[np.ndarray, "frame"],
     root: Float[np.ndarray, "frame 4 4"],
     bones: Float[np.ndarray, "frame bone 4 4"],
-    good: Bool[np.ndarray, "frame"],
+    observed: Bool[np.ndarray, "frame"],
 ) -> tuple[Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame bone 4 4"]]:
-    """Interpolate poses between good frames, held beyond the first and last; roots are NaN without any."""
+    """Interpolate poses between observed frames, constant beyond them; roots are NaN without any."""
     root, bones = root.copy(), bones.copy()
-    if not good.any():
+    if not observed.any():
         root[:] = np.nan
         return root, bones
-    when = timestamp_s[good]
-    root[~good] = rigid.interpolate(when, root[good], timestamp_s[~good])
+    observed_s = timestamp_s[observed]
+    root[~observed] = rigid.interpolate(observed_s, root[observed], timestamp_s[~observed])
     for bone in range(bones.shape[1]):
-        bones[~good, bone] = rigid.interpolate(when, bones[good, bone], timestamp_s[~good])
+        bones[~observed, bone] = rigid.interpolate(observed_s, bones[observed, bone], timestamp_s[~observed])
     return root, bones
 
 
 def scene_surface(problem: Problem) -> Mesh:
-    """Return the shared scene's surface in the world, metres, cut where nothing was measured near."""
+    """Return the shared scene's surface in the world, metres, where measured points are near."""
     mesh = marching_cubes.extract_scene(problem.scene, -1, problem.scene.lattice_m)
     near, _ = KDTree(measured_points(problem)).query(mesh.vertices, distance_upper_bound=SEEN_WITHIN_M)
     return marching_cubes.keep_vertices(mesh, np.isfinite(near))
@@ -105,7 +105,7 @@ def agent_surface(problem: Problem, step_m: float = AGENT_STEP_M) -> Mesh:
 
 @torch.no_grad()
 def measured_points(problem: Problem) -> Float[np.ndarray, "point 3"]:
-    """Return measured points of the scene in the world, thinned."""
+    """Return a subsample of the measured points of the scene, world, metres."""
     rays = problem.store.scene
     index = torch.nonzero(rays.depth > 0)[:, 0]
     rays = rays.at(index[:: max(1, len(index) // MAX_POINTS)])
@@ -136,11 +136,11 @@ def feature_volume(problem: Problem) -> SceneFeatures:
 
 @torch.no_grad()
 def seen_free(problem: Problem, points_world: Float[Tensor, "point 3"]) -> Bool[Tensor, "point"]:
-    """Return which points some trusted camera saw through: depth at their pixel lies clearly behind them."""
+    """Return which points some camera saw through: the depth at their pixel is clearly behind them."""
     views, frames = problem.store.views, torch.unique(problem.store.scene.frame).long()
     frames = frames[:: max(1, len(frames) // MAX_FRAMES)]
     camera_from_world = torch.linalg.inv(problem.motion.world_from_camera(frames).double()).float()
-    through = torch.zeros(len(points_world), dtype=torch.bool, device=points_world.device)
+    seen_through = torch.zeros(len(points_world), dtype=torch.bool, device=points_world.device)
     height, width = views.depth.shape[1:]
     for frame, matrix in zip(frames, camera_from_world, strict=True):
         camera = points_world @ matrix[:3, :3].T + matrix[:3, 3]
@@ -149,8 +149,8 @@ def seen_free(problem: Problem, points_world: Float[Tensor, "point 3"]) -> Bool[
         inside = cameras.in_picture(cell, camera[:, 2], (height, width), NEAREST_M)
         column, row = cell.floor().long().unbind(-1)
         depth = views.depth[frame][row.clamp(0, height - 1), column.clamp(0, width - 1)].float()
-        through |= inside & (depth > camera[:, 2] + 0.5 * VOXEL_M)
-    return through
+        seen_through |= inside & (depth > camera[:, 2] + 0.5 * VOXEL_M)
+    return seen_through
 
 
 @torch.no_grad()

@@ -16,24 +16,24 @@ from stages.reconstruct.rays import Rays
 
 Terms = dict[str, tuple[float, Tensor]]
 """weight and values per element of each loss"""
-FREE_FROM_M = 0.1
-"""rays begin here"""
+RAY_START_M = 0.1
+"""z at which ray samples begin"""
 NEAR, FREE = 4, 3
 """samples of a ray near its measured depth, and in the free space before it"""
 BEHIND_M = 0.06
-"""samples behind a measured surface; deeper ones would fill thin things and what lies behind edges"""
+"""samples reach this far behind measured depth; deeper ones would thicken thin objects and fill occlusions"""
 MIN_SLOPE = 0.3
-"""reach of the samples near depth grows on oblique surfaces, but no further than at this slope"""
+"""lower bound of the slope by which the range of samples near depth grows on oblique surfaces"""
 REACH_M = 0.15
 """half of the samples of rendered rays lie this near to measured depth"""
 SEARCH_SAMPLES = 64
-"""even samples that find the surface where no depth is: a fused one is as thick as their spacing"""
+"""uniform samples that locate the surface where depth is unknown"""
 EIKONAL_STEP_M = 0.04
 """step of finite differences, half a cell of the finest grid"""
 EIKONAL_SHARE = 8
-"""the eikonal loss looks at one ray in so many"""
+"""one ray in so many is used for the eikonal loss"""
 DRIFT_WEIGHT, ANCHOR_WEIGHT, CAMERA_M = 0.1, 0.05, 0.01
-"""corrections of neighbouring camera knots agree, and are small, per centimetre (0.6 degrees) squared"""
+"""weights of differences between neighbouring camera knots and of their size; unit of both, 0.6 degrees"""
 
 
 def swap_probability(progress: float, batches: RayBatches) -> float:
@@ -41,7 +41,7 @@ def swap_probability(progress: float, batches: RayBatches) -> float:
     return batches.swap_first + (batches.swap_last - batches.swap_first) * progress
 
 
-def swap(
+def swap_codes(
     video: Int[Tensor, "ray"], videos: int, probability: float, generator: Generator
 ) -> Int[Tensor, "ray"]:
     """Replace each code's index by a random one with some probability (paper 001, scene annealing).
@@ -63,11 +63,11 @@ def world_rays(motion: MotionTable, rays: Rays) -> tuple[Float[Tensor, "ray 3"],
 
 
 def sample_depths(rays: Rays, reach_m: float, generator: Generator) -> Float[Tensor, "ray sample"]:
-    """Return the depth, `NEAR` samples from ``reach_m`` before to just behind it, `FREE` before; metres."""
+    """Return depth samples in metres: the measured one, `NEAR` around it, `FREE` in the free space before."""
     depth = rays.depth[:, None]
     place = torch.rand(len(rays), NEAR, generator=generator).to(depth.device)
     around = place * (reach_m / rays.slope[:, None].clamp_min(MIN_SLOPE) + BEHIND_M) - BEHIND_M
-    before = FREE_FROM_M + (depth - reach_m - FREE_FROM_M).clamp_min(0) * strata(rays, FREE, generator)
+    before = RAY_START_M + (depth - reach_m - RAY_START_M).clamp_min(0) * strata(rays, FREE, generator)
     return torch.cat([depth, depth - around, before], dim=1)
 
 
@@ -81,9 +81,9 @@ def strata(rays: Rays, count: int, generator: Generator) -> Float[Tensor, "ray s
 def measured_terms(
     problem: Problem, rays: Rays, code_of: Int[Tensor, "ray"], weights: LossWeights, generator: Generator
 ) -> Terms:
-    """Fit the scene where the sensor measured: rays of known depth."""
+    """Return the scene's losses at and before measured depth."""
     field, limit = problem.scene, problem.scene.shape.truncation_m
-    assert limit is not None, "a scene that never saturates is learned by rendering"
+    assert limit is not None, "untruncated scenes are learned by rendering"
     origin, direction = world_rays(problem.motion, rays)
     depth = sample_depths(rays, limit, generator)
     points = origin[:, None] + direction[:, None] * depth[..., None]
@@ -125,7 +125,7 @@ def rendered_terms(
     weights: LossWeights,
     depth: Float[Tensor, "ray sample"],
 ) -> Terms:
-    """Fit the scene by volume rendering at samples ``depth``, metres, of rays with and without depth."""
+    """Return the volume rendering losses of rays with samples at ``depth``, metres."""
     origin, direction = world_rays(problem.motion, rays)
     points = origin[:, None] + direction[:, None] * depth[..., None]
     scene = scene_layer(problem, points, problem.video[rays.frame], code_of)
@@ -144,7 +144,7 @@ def scene_layer(
     video: Int[Tensor, "ray"],
     code_of: Int[Tensor, "ray"],
 ) -> Layer:
-    """Evaluate the scene's field along rays, each with its video's geometry and some video's code."""
+    """Evaluate the scene's field along rays with the geometry of ``video`` and the code ``code_of``."""
     field, (rays, samples) = problem.scene, points.shape[:2]
     values = field(
         points.reshape(-1, 3), video.repeat_interleave(samples), code_of.repeat_interleave(samples)
@@ -173,8 +173,8 @@ def render_depths(
     """Place samples of rendered rays, z in metres: half around a surface, half before it."""
     end = surface_m[:, None]
     near = end + (strata(rays, samples // 2, generator) * 2 - 1) * REACH_M
-    before = (end - REACH_M - FREE_FROM_M).clamp_min(0.01) * strata(rays, samples - samples // 2, generator)
-    return torch.cat([FREE_FROM_M + before, near], dim=1).sort(dim=1).values
+    before = (end - REACH_M - RAY_START_M).clamp_min(0.01) * strata(rays, samples - samples // 2, generator)
+    return torch.cat([RAY_START_M + before, near], dim=1).sort(dim=1).values
 
 
 @torch.no_grad()
@@ -184,19 +184,19 @@ def surface_depths(
     density_of: Callable[[Int[Tensor, "ray"], Float[Tensor, "ray sample"]], Float[Tensor, "ray sample"]],
     generator: Generator,
 ) -> Float[Tensor, "ray"]:
-    """Return measured depth, and where it is unknown the z at which half of a ray has ended, metres.
+    """Return measured depth, and where it is unknown the z at which accumulated opacity reaches 0.5, metres.
 
     Args:
-        rays: any.
-        farthest_m: end of the `SEARCH_SAMPLES` even samples, and the answer of rays that meet nothing.
+        rays: with or without measured depth.
+        farthest_m: end of the `SEARCH_SAMPLES` uniform samples; returned for rays that hit nothing.
         density_of: density per metre of some of the rays, given by their indices, at z in metres.
-        generator: of the places of samples.
+        generator: random numbers of the stratified samples.
     """
     surface, unknown = rays.depth.clone(), torch.nonzero(rays.depth <= 0)[:, 0]
     if not len(unknown):
         return surface
     some = rays.at(unknown)
-    depth = even_depths(some, farthest_m, SEARCH_SAMPLES, generator)
+    depth = uniform_depths(some, farthest_m, SEARCH_SAMPLES, generator)
     weight = ray_weights(depth, some.direction.norm(dim=-1), density_of(unknown, depth))
     ended = weight.cumsum(-1) >= 0.5
     first = depth.gather(1, ended.int().argmax(-1, keepdim=True))[:, 0]
@@ -204,15 +204,15 @@ def surface_depths(
     return surface
 
 
-def even_depths(
+def uniform_depths(
     rays: Rays, farthest_m: float, samples: int, generator: Generator
 ) -> Float[Tensor, "ray sample"]:
-    """Place samples evenly up to ``farthest_m``, z in metres, wherever the surface is."""
-    return FREE_FROM_M + (farthest_m - FREE_FROM_M) * strata(rays, samples, generator)
+    """Return stratified samples up to ``farthest_m``, z in metres."""
+    return RAY_START_M + (farthest_m - RAY_START_M) * strata(rays, samples, generator)
 
 
 def camera_prior(problem: Problem) -> Terms:
-    """Keep corrections of cameras small where registration is certain, and alike at a video's next knots."""
+    """Return the priors on camera corrections: small where registration is certain, smooth across knots."""
     correction, knot = problem.motion.camera / CAMERA_M, torch.unique(problem.motion.knot)
     return {
         "drift": (DRIFT_WEIGHT, (correction[knot + 1] - correction[knot]).square()),
@@ -226,7 +226,7 @@ class SceneLoss:
     def __init__(
         self, problem: Problem, weights: LossWeights, batches: RayBatches, steps: int, rendered: bool = False
     ):
-        """``rendered``: differentiable rendering alone, at even and importance samples (paper 001, A.1)."""
+        """``rendered``: differentiable rendering alone, with uniform and importance samples (001, A.1)."""
         self.problem, self.weights, self.batches, self.steps = problem, weights, batches, steps
         self.rendered = rendered
         self.measured = torch.nonzero(problem.store.scene.depth > 0)[:, 0].int()
@@ -245,7 +245,7 @@ class SceneLoss:
         others = store.scene.at(pick(len(store.scene), batches.rendered_rays // 2, generator, problem.device))
         videos = problem.scene.shape.videos
         code_of, other_code = (
-            swap(problem.video[some.frame], videos, probability, generator) for some in (rays, others)
+            swap_codes(problem.video[some.frame], videos, probability, generator) for some in (rays, others)
         )
         terms = measured_terms(problem, rays, code_of, self.weights, generator)
 
@@ -262,9 +262,9 @@ class SceneLoss:
         problem, field = self.problem, self.problem.scene
         rays = problem.store.scene.at(pick(len(problem.store.scene), number, generator, problem.device))
         video = problem.video[rays.frame]
-        code_of = swap(video, field.shape.videos, probability, generator)
+        code_of = swap_codes(video, field.shape.videos, probability, generator)
         half = self.batches.rendered_samples // 2
-        coarse = even_depths(rays, problem.store.farthest_m, half, generator)
+        coarse = uniform_depths(rays, problem.store.farthest_m, half, generator)
         spacing_m = problem.store.farthest_m / half
         origin, direction = world_rays(problem.motion, rays)
         with torch.no_grad():

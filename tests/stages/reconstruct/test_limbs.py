@@ -3,7 +3,7 @@
 import torch
 
 from pipeline.geometry import rigid_torch
-from stages.reconstruct.limbs import KinematicTree, MultiscaleTurns, legs
+from stages.reconstruct.limbs import KinematicTree, MultiscaleRotations, legs
 
 LENGTH_M = 0.1
 """between bones"""
@@ -52,7 +52,7 @@ def test_a_turn_at_the_root_of_a_tail_lifts_the_whole_tail():
 
 
 def test_waves_add_knots_of_each_scale():
-    waves = MultiscaleTurns(frames=20, bones=1, knot_frames=(8,))
+    waves = MultiscaleRotations(frames=20, bones=1, knot_frames=(8,))
     assert waves().shape == (20, 1, 3) and not waves().any()
     with torch.no_grad():
         waves.knots[0][1] = 1.0

@@ -19,7 +19,7 @@ from stages.reconstruct.assemble import AgentTemplate, FieldSizes, RegisteredVid
 from stages.reconstruct.body import Pose
 from stages.reconstruct.config import LearningRates, LossWeights, PhaseSteps, RayBatches
 from stages.reconstruct.problem import Joints, RaysByFrame
-from stages.reconstruct.rays import AGENT, NOT_AGENT, Rays, RayStore, Views, distance_outside, occluder_depth
+from stages.reconstruct.rays import AGENT, NOT_AGENT, Rays, RayStore, Views, mask_distance_px, occluder_depth
 
 WIDE, UPRIGHT = (24, 32), (32, 24)
 """height and width of thumbnails; pictures are four times larger"""
@@ -71,7 +71,7 @@ def film_animal(
         rays.append((frame, directions[chosen], depth[chosen], hit[chosen]))
         depths.append(depth.reshape(height, width)[2::4, 2::4])
         outside.append(
-            distance_outside(np.where(hit, AGENT, NOT_AGENT).astype(np.uint8).reshape(height, width), size)
+            mask_distance_px(np.where(hit, AGENT, NOT_AGENT).astype(np.uint8).reshape(height, width), size)
         )
     store = pack(rays, depths, outside, intrinsics, has_scene)
     ones = np.ones(frames, bool)
@@ -204,7 +204,7 @@ def test_long_gaps_are_interpolated_with_low_confidence(solved):
 def test_posing_is_the_same_however_many_are_posed_at_once():
     def posed(workers: int) -> torch.Tensor:
         found, _ = problem()
-        optimise._pose(found, replace(plan(body=3), workers=workers), list(optimise.chunks(found, 5)))
+        optimise._pose(found, replace(plan(body=3), workers=workers), list(optimise.split_segments(found, 5)))
         return torch.cat([found.motion.root.flatten(), found.motion.bone.flatten()]).detach()
 
     one = posed(1)

@@ -9,8 +9,8 @@ from stages.reconstruct.rays import (
     NOT_AGENT,
     THUMBNAIL,
     UNKNOWN,
-    choose_on_agent,
-    distance_outside,
+    choose_agent_pixels,
+    mask_distance_px,
     near_agent,
 )
 
@@ -20,7 +20,7 @@ def test_distance_from_the_mask_is_that_of_the_thumbnail_pixels_middle(radius_px
     height, width, centre = 80, 120, np.array([53.0, 37.0])
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     mask = np.where(np.hypot(x - centre[0], y - centre[1]) < radius_px, label, NOT_AGENT).astype(np.uint8)
-    found = distance_outside(mask, (height // THUMBNAIL, width // THUMBNAIL)).astype(float)
+    found = mask_distance_px(mask, (height // THUMBNAIL, width // THUMBNAIL)).astype(float)
     middle = np.stack(
         np.meshgrid(*((np.arange(size // THUMBNAIL) + 0.5) * THUMBNAIL for size in (width, height))), axis=-1
     )
@@ -32,7 +32,7 @@ def test_distance_from_the_mask_is_that_of_the_thumbnail_pixels_middle(radius_px
 
 
 def test_without_a_mask_everything_is_far():
-    assert (distance_outside(np.zeros((8, 8), np.uint8), (2, 2)) == FAR_PX).all()
+    assert (mask_distance_px(np.zeros((8, 8), np.uint8), (2, 2)) == FAR_PX).all()
 
 
 @pytest.mark.parametrize("count", [150, 4000])
@@ -40,7 +40,7 @@ def test_thin_limbs_are_looked_at_as_much_as_the_trunk(count):
     mask = np.zeros((100, 100), np.uint8)
     mask[20:60, 20:60] = mask[60:90, 38:42] = AGENT  # a leg four pixels wide
     near = near_agent(mask, 5)
-    row, column = choose_on_agent(mask, near, count, np.random.default_rng(0)).T
+    row, column = choose_agent_pixels(mask, near, count, np.random.default_rng(0)).T
     assert len(set(zip(row, column, strict=True))) == len(row) == min(count, near.sum()), (
         "none twice, as many as there are"
     )

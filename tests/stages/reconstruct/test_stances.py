@@ -17,23 +17,23 @@ HALF_M = np.array([0.1, 0.1, 0.3])
 def test_a_stance_must_be_sure_and_lasts():
     level, raised = np.full(6, 0.2), np.full(6, 0.2)
     raised[[1, 3, 4]] -= [0.05, 0.08, 0.08]
-    assert posing.most_likely(np.stack([level, raised], -1), 0.2).tolist() == [0, 0, 0, 1, 1, 0]
-    assert posing.most_likely(np.stack([level, level - posing.SURE], -1), 0.2).tolist() == [0] * 6
+    assert posing.decode_stances(np.stack([level, raised], -1), 0.2).tolist() == [0, 0, 0, 1, 1, 0]
+    assert posing.decode_stances(np.stack([level, level - posing.STANCE_COST], -1), 0.2).tolist() == [0] * 6
 
 
 def test_the_better_of_two_misfits_tells_nothing():
     loss = np.tile([0.8, 0.5], (6, 1))
-    assert posing.most_likely(loss, 0.39).tolist() == [0] * 6
-    assert posing.most_likely(loss, 0.5).tolist() == [1] * 6
+    assert posing.decode_stances(loss, 0.39).tolist() == [0] * 6
+    assert posing.decode_stances(loss, 0.5).tolist() == [1] * 6
     loss[2] = np.nan
-    assert posing.most_likely(loss, 0.5).tolist() == [1] * 6, "unseen, it is thought to sit on"
+    assert posing.decode_stances(loss, 0.5).tolist() == [1] * 6, "unseen, it is thought to sit on"
 
 
 def test_a_process_chooses_none_where_others_have_all_that_is_new():
     found, _ = problem()
     without = replace(found, agent_frames=found.agent_frames[:0])
     before = found.motion.initial_agent.clone()
-    optimise._choose_stances(without, plan(stance=1), list(optimise.chunks(found, 100)))
+    optimise._choose_stances(without, plan(stance=1), list(optimise.split_segments(found, 100)))
     assert torch.equal(found.motion.initial_agent, before)
 
 

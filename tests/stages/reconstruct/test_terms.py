@@ -86,8 +86,8 @@ def test_codes_are_swapped_as_often_as_asked():
         and abs(scene.swap_probability(1.0, RayBatches()) - 0.05) < 1e-9
     )
     assert scene.swap_probability(0.5, RayBatches(swap_first=0.0, swap_last=0.0)) == 0, "no annealing"
-    assert (scene.swap(video, 4, 0.0, generator) == 0).all()
-    changed = (scene.swap(video, 4, 0.4, generator) != 0).float().mean()
+    assert (scene.swap_codes(video, 4, 0.0, generator) == 0).all()
+    changed = (scene.swap_codes(video, 4, 0.4, generator) != 0).float().mean()
     assert abs(changed - 0.4 * 3 / 4) < 0.02, "a swap may draw the same video again"
 
 
@@ -119,10 +119,10 @@ def test_gaps_are_bridged_by_straight_lines():
     good = np.ones(40, bool)
     good[5:9] = good[20:36] = False
     garbled = np.where(good[:, None, None], root, 7.0 * np.eye(4))
-    result, bones = results.bridged(time, garbled, garbled[:, None], good)
+    result, bones = results.interpolate_gaps(time, garbled, garbled[:, None], good)
     np.testing.assert_allclose(result, root, atol=1e-9)
     np.testing.assert_allclose(bones[:, 0], root, atol=1e-9)
-    assert np.isnan(results.bridged(time, garbled, garbled[:, None], np.zeros(40, bool))[0]).all()
+    assert np.isnan(results.interpolate_gaps(time, garbled, garbled[:, None], np.zeros(40, bool))[0]).all()
     gap_s = gaps_s(time, good)
     np.testing.assert_allclose(gap_s[5:9], 0.5)
     np.testing.assert_allclose(gap_s[20:36], 1.7)
