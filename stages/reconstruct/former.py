@@ -95,11 +95,11 @@ def _load_fields(problem: Problem, loaded: Reconstruction, ids: Sequence[str]) -
     problem.agent.load_state_dict(loaded.agent.state_dict())
     problem.body.load_state_dict(loaded.body.state_dict())
     scene, former = problem.scene, loaded.scene
-    kept, before = (
+    rebuilt, before = (
         {name: value for name, value in field.state_dict().items() if name.startswith(REBUILT) == is_own}
         for field, is_own in ((scene, True), (former, False))
     )
-    scene.load_state_dict(before | kept)
+    scene.load_state_dict(before | rebuilt)
     _resample_grid(scene, former)
     if scene.codes is not None and former.codes is not None:
         scene.codes.weight[:] = former.codes.weight.mean(0)
