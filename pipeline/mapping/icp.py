@@ -17,7 +17,7 @@ MIN_DEPTH_M = 0.05
 MIN_COSINE = 0.7
 """Least cosine between the normals of a correspondence (45 degrees)."""
 POINTS_PER_MEASUREMENT = 20
-"""Errors of neighbouring pixels are correlated: so many points count as one independent measurement."""
+"""Points per independent measurement, since errors of neighbouring pixels are correlated."""
 NOISE_FLOOR_M = 0.005
 """Least noise assumed in the information matrix, metres: phone depth is no better."""
 DAMPING = 1e-3
@@ -25,7 +25,7 @@ DAMPING = 1e-3
 CONVERGED = 1e-5
 """Steps below this (radians, metres) end the iteration."""
 NORMAL_JUMP, NORMAL_JUMP_DEPTH_M = 0.06, 0.5
-"""Depth edge: neighbours differ by more than this share of the depth, taken as at least so many metres."""
+"""Depth edge: neighbours differ by more than this share of the depth, or of this depth (metres) if larger."""
 
 
 @dataclass(frozen=True)

@@ -198,11 +198,11 @@ def agreement(
     points_camera = cameras.back_project(depth, view.intrinsics).reshape(-1, 3)
     points_world = rigid.apply(view.world_from_camera, points_camera)
     count = np.zeros(depth.size, np.uint8)
-    for theirs, other in others:
+    for other_depth, other in others:
         points_other = rigid.apply(rigid.inverse(other.world_from_camera), points_world)
         pixel, z = cameras.project(points_other, other.intrinsics)
-        inside = np.flatnonzero((depth.ravel() > 0) & cameras.in_picture(pixel, z, theirs.shape))
+        inside = np.flatnonzero((depth.ravel() > 0) & cameras.in_picture(pixel, z, other_depth.shape))
         column, row = np.floor(pixel[inside]).astype(int).T
-        met = theirs[row, column]
-        count[inside] += (met > 0) & (np.abs(met - z[inside]) < MAX_RELATIVE_ERROR * z[inside])
+        measured = other_depth[row, column]
+        count[inside] += (measured > 0) & (np.abs(measured - z[inside]) < MAX_RELATIVE_ERROR * z[inside])
     return count.reshape(depth.shape)

@@ -34,7 +34,7 @@ MIN_COSINE = 0.7
 FIRST_ROUNDS, FIRST_INFLATION = 6, 3.0
 """Initial steps that rely on points and odometry, and factor on the depth noise in them."""
 SHARED_POINTS, MIN_PAIRS = 30, 10
-"""Depth variance is estimated from pairs that share so many points, if there are enough such pairs."""
+"""Minimum tracked points of a pair that estimates depth variance, and minimum number of such pairs."""
 MIN_VARIANCE = 0.25
 """Least factor on the assumed depth variance, since correlated errors are underestimated."""
 OVERLAP_STEP, MIN_OVERLAP = 7, 0.3

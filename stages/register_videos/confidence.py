@@ -23,7 +23,7 @@ TOL_RAD, TOL_M = np.deg2rad(2.0), 0.05
 DECOY_RANGE = (1.5, 10.0)
 """Range of the decoys' errors, in multiples of `TOL_RAD` and `TOL_M`."""
 ATTEMPTS = 3
-"""Frames are compared with the best of so many decoys, since alignment chose the best pose in reach."""
+"""Decoys per frame whose best score counts, since alignment also chose the best pose in reach."""
 AVERAGING_S = 1.0
 """Standard deviation of the Gaussian that averages scores, seconds: neighbouring errors are correlated."""
 UNANCHORED_FACTOR = 0.2

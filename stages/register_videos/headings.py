@@ -24,7 +24,7 @@ REVERSED_SHARE = 0.6
 """The template's head and tail are swapped if that saves this share of the cost of always walking tail first,
 and more than `FLIP_COST`."""
 TURN_DEG, TURN_S, FLIP_COST = 30.0, 0.1, 40.0
-"""Turning by so many degrees in so many seconds costs one unit; largest cost of a turn."""
+"""Turn (degrees) within a time (seconds) that costs one unit, and the largest cost of a turn."""
 STILL_WEIGHT, NEW_VIEW_M_S, CAMERA_SHARE = 0.06, 0.4, 0.5
 """Weight of a frame in which neither animal nor phone moves, speed of full weight (m/s), and weight of the
 phone's speed in it."""

@@ -13,23 +13,23 @@ EDGE_PX = 240
 """Longer side of a shown view."""
 
 
-def report(held: HeldOutErrors, target: Target) -> dict[str, float | int]:
+def report(held_out: HeldOutErrors, target: Target) -> dict[str, float | int]:
     """Return the held-out figures for ``localizer.json``; views without a pose count as failures."""
-    rotation = np.nan_to_num(held.rotation_deg, nan=180.0)
-    translation = np.nan_to_num(held.translation_m, nan=10.0)
+    rotation = np.nan_to_num(held_out.rotation_deg, nan=180.0)
+    translation = np.nan_to_num(held_out.translation_m, nan=10.0)
     return {
-        "views": len(held.views),
+        "views": len(held_out.views),
         "rotation_deg_median": float(np.median(rotation)),
         "translation_m_median": float(np.median(translation)),
-        "good_share": float(held.good.mean()),
+        "good_share": float(held_out.good.mean()),
         "good_rotation_deg": POSE_TOLERANCE[target][0],
         "good_translation_m": POSE_TOLERANCE[target][1],
     }
 
 
-def checks(held: HeldOutErrors, target: Target) -> list[Check]:
+def checks(held_out: HeldOutErrors, target: Target) -> list[Check]:
     """Return the quality checks of the held-out errors."""
-    figures = report(held, target)
+    figures = report(held_out, target)
     rotation, translation = (2.0, 0.05) if target == "scene" else (20.0, 0.08)
     right = "right answers (within {:g} deg, {:g} m)".format(*POSE_TOLERANCE[target])
     angle, distance = figures["rotation_deg_median"], figures["translation_m_median"]
@@ -40,13 +40,13 @@ def checks(held: HeldOutErrors, target: Target) -> list[Check]:
     ]
 
 
-def pictures(held: HeldOutErrors, localizer: Localizer, target: Target) -> list[Picture]:
+def pictures(held_out: HeldOutErrors, localizer: Localizer, target: Target) -> list[Picture]:
     """Draw the error histogram and the eight worst views."""
-    rotation = np.nan_to_num(held.rotation_deg, nan=180.0)
+    rotation = np.nan_to_num(held_out.rotation_deg, nan=180.0)
     worst = np.argsort(-rotation, kind="stable")[:8]
-    probability = localizer.calibration.probability(held.inlier_ratio)
+    probability = localizer.calibration.probability(held_out.inlier_ratio)
     tiles = [
-        _tile(held.views[index].color, f"{rotation[index]:.1f} deg, p {probability[index]:.2f}")
+        _tile(held_out.views[index].color, f"{rotation[index]:.1f} deg, p {probability[index]:.2f}")
         for index in worst
     ]
     series = {"rotation error [deg]": np.clip(rotation, 0.1, 180)}

@@ -53,16 +53,16 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") ->
         case "agent":
             mesh = ply.read_ply(_required(inputs.agent_template, "agent_template") / "agent.ply")
             views = training.agent_views(mesh, config.agent, rng)
-    localizer, held = training.train(views, config, describer, device, rng)
+    localizer, held_out = training.train(views, config, describer, device, rng)
     if not distributed.leave():
         return None
-    localizers.save(out, localizer, pictures.report(held, config.target))
+    localizers.save(out, localizer, pictures.report(held_out, config.target))
     qa.write(
         out,
         good="held-out renders are localized within a degree or two, wrong poses get low probabilities",
         bad="the histogram has its weight on the right, or confident poses are wrong",
-        checks=pictures.checks(held, config.target),
-        pictures=pictures.pictures(held, localizer, config.target),
+        checks=pictures.checks(held_out, config.target),
+        pictures=pictures.pictures(held_out, localizer, config.target),
     )  # fmt: skip
     return localizer
 
