@@ -30,14 +30,15 @@ MIN_DIRECTION = 0.01
 class BodyDenoiser(nn.Module):
     """Denoise what a body does along a path: its departure from the posture that it holds now.
 
-    The last numbers of the condition are the posture, scaled as the body is, or zeros where nothing is
-    remembered. With x_t = sqrt(alpha_bar) clean + sqrt(1 - alpha_bar) noise the same noise is in x_t -
-    sqrt(alpha_bar) posture.
+    The last numbers of the condition are the posture, scaled as the body is but for its root rotation, or
+    zeros where nothing is remembered. With x_t = sqrt(alpha_bar) clean + sqrt(1 - alpha_bar) noise the same
+    noise is in x_t - sqrt(alpha_bar) posture.
     """
 
     path_std: Tensor
     root_mean: Tensor
     root_std: Tensor
+    rotation_std: Tensor
     share: Tensor
     past: Tensor
 
@@ -54,6 +55,7 @@ class BodyDenoiser(nn.Module):
         self.register_buffer("path_std", torch.ones(3, frames))
         self.register_buffer("root_mean", torch.zeros(ROOT_CHANNELS))
         self.register_buffer("root_std", torch.ones(ROOT_CHANNELS))
+        self.register_buffer("rotation_std", torch.ones(ROOT_CHANNELS))
         self.register_buffer("share", torch.from_numpy(schedule.alpha_bar).float().sqrt(), persistent=False)
         self.register_buffer("past", torch.ones(frames, frames).tril(), persistent=False)
 
@@ -69,7 +71,7 @@ class BodyDenoiser(nn.Module):
         root = held[:, :ROOT_CHANNELS] * self.root_std[:, None] + self.root_mean[:, None]
         step = self.steps(x, t, control)
         heading = self.headings(step, root)
-        root = (rotated_to_heading(root, heading) - self.root_mean[:, None]) / self.root_std[:, None]
+        root = (rotated_to_heading(root, heading) - self.root_mean[:, None]) / self.rotation_std[:, None]
         held = torch.cat([root, held[:, ROOT_CHANNELS:]], dim=1)
         held = nn.functional.pad(held, (0, 0, x.shape[1] - self.posture, 0))
         unet_control = torch.cat([control, step * self.rate_hz, heading], dim=1)

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pipeline.behavior.diffusion import STANDARD
 from pipeline.behavior.encoders import beings
 from pipeline.behavior.model import Architecture, Scaling, channels_from_bones
 from pipeline.behavior.path_encoding import (
@@ -190,7 +191,7 @@ def statistics_from_windows(windows: TrainingWindows, turn_rad: float) -> Window
     windows.
 
     The root's rotation is scaled for ego frames that are turned by up to ``turn_rad`` either way. What is
-    remembered of a body is scaled as the body is.
+    remembered of a body is scaled as the body is, but for its heading.
     """
     some = torch.arange(0, len(windows), -(-len(windows) // MAX_STATISTICS_WINDOWS))
     tracks, rows, known = windows.tracks(some), windows.frame[some], windows.bones_known[some]
@@ -199,13 +200,17 @@ def statistics_from_windows(windows: TrainingWindows, turn_rad: float) -> Window
     level = np.sqrt((future[..., ::2] ** 2).mean((0, 2))).clip(MIN_PATH_STD_M)
     height = np.sqrt((future[..., 1] ** 2).mean(0)).clip(MIN_PATH_STD_M)
     path_std = np.stack([level, height, level])
-    whole = body_statistics(tracks.rotation[:, past:], windows.bones[rows[known, past:].unique()], turn_rad)
+    bones = windows.bones[rows[known, past:].unique()]
+    mean, std = body_statistics(tracks.rotation[:, past:], bones, turn_rad)
+    # The smallest scale with which no heading is clipped: what sampling leaves of the noise shakes a body.
+    heading_std = (1 + np.abs(mean[:3]).max()) / STANDARD.clip
+    body_std = np.concatenate([np.full(3, heading_std), std[3:]])
     strides = velocity_channels_from_path(tracks.root[:, past:], tracks.root[:, past - 1], rate_hz)
     velocity_std = np.array([[*_spread(strides[..., :3].double().numpy().reshape(-1, 3)), 1.0]])
     goal_std = _spread(with_powered_length(future[:, -1], GOAL_LENGTH_POWER))
-    scaling = Scaling(goal_std, velocity_std, path_std, *whole, rate_hz)
-    mean, std = (torch.from_numpy(numbers).float() for numbers in whole)
+    scaling = Scaling(goal_std, velocity_std, path_std, mean, body_std, rate_hz)
     position = tracks.root[:, :past].std().clip(MIN_WAY_STD).expand(3)
+    mean, std = (torch.from_numpy(numbers).float() for numbers in (mean, std))
     return WindowStatistics(scaling, torch.cat([torch.zeros(3), mean]), torch.cat([position, std]))
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable
+from functools import partial
 from typing import Literal, assert_never
 
 import torch
@@ -17,6 +18,7 @@ from stages.train_behavior.config import ObjectiveConfig, Weighting
 
 Denoise = Callable[[Tensor, Tensor], Tensor]
 """From noisy samples and their steps to the noise"""
+SequenceError = Callable[[Denoise, Float[Tensor, "row ..."]], Float[Tensor, "row ..."]]
 CONDITION_DROPOUT = 0.1
 """Probability that a condition is replaced by its null, each on its own, for classifier-free guidance"""
 EARLIEST_GOAL = 0.2
@@ -42,10 +44,11 @@ def losses(
     def goal(code: Tensor) -> Tensor:
         return goal_error(nets, batch, code, schedule, objective, generator)
 
-    def error(denoise: Denoise, clean: Tensor) -> Tensor:
-        return squared_error(denoise, clean, schedule, objective.weighting, generator)
+    def error(denoise: Denoise, clean: Tensor, motion_weight: float = 0.0) -> Tensor:
+        return squared_error(denoise, clean, schedule, objective.weighting, generator, motion_weight)
 
-    return level_losses(nets, batch, objective, generator, phase, goal, error)
+    of_body = partial(error, motion_weight=objective.motion_weight)
+    return level_losses(nets, batch, objective, generator, phase, goal, error, of_body)
 
 
 def level_losses(
@@ -55,7 +58,8 @@ def level_losses(
     generator: torch.Generator,
     phase: TrainingPhase,
     goal: Callable[[Float[Tensor, "batch condition"]], Float[Tensor, "draw 3"]],
-    error: Callable[[Denoise, Float[Tensor, "row ..."]], Float[Tensor, "row ..."]],
+    path_error: SequenceError,
+    body_error: SequenceError,
 ) -> dict[str, Float[Tensor, ""]]:
     """Return the mean error of goal, path and body, each given the level above it; ``goal`` takes the
     perception code. Without a share of the windows a body learns nothing.
@@ -69,12 +73,12 @@ def level_losses(
     path_rows, body_rows, known = sequence_rows(batch, objective)
     steered = keep_mask(len(code), 1, generator).to(code.device) * joint
     towards, along = batch.goal[path_rows], batch.places[body_rows]
-    path = error(
+    path = path_error(
         lambda x, t: nets.path(x, t, code[path_rows], towards, steered[path_rows]), batch.path[path_rows]
     )
     if not len(body_rows):
         return goal_loss | {"path": path.mean()}
-    body = error(
+    body = body_error(
         lambda x, t: nets.body(x, t, code[body_rows], along, steered[body_rows]), batch.body[body_rows]
     )
     return goal_loss | {"path": path.mean(), "body": mean_of_known(body, known)}
@@ -184,17 +188,24 @@ def squared_error(
     schedule: Schedule,
     weighting: Weighting,
     generator: torch.Generator,
+    motion_weight: float | Float[Tensor, "channel 1"] = 0.0,
 ) -> Float[Tensor, "batch ..."]:
     """Noise ``clean`` to a random step and compare the noise, the velocity or noise less clean sample with
     its prediction.
 
-    All three are the error of the noise, for the noisy sample is given, by a factor of the step.
+    All three are the error of the noise, for the noisy sample is given, by a factor of the step. Beside the
+    error of a sequence counts its change from frame to frame, by ``motion_weight``; errors that do not depend
+    on the frame's neighbours have the same mean with any weight.
     """
     t = torch.randint(schedule.steps, (len(clean),), generator=generator)
     alpha_bar = torch.from_numpy(schedule.alpha_bar).float()
     share = alpha_bar[t].reshape(-1, *[1] * (clean.ndim - 1)).to(clean.device)
     noise = torch.randn(clean.shape, generator=generator).to(clean.device)
-    error = (denoise(noised(clean, noise, share), t.float().to(clean.device)) - noise) ** 2
+    residual = denoise(noised(clean, noise, share), t.float().to(clean.device)) - noise
+    error = residual**2
+    if clean.ndim > 2:
+        change = nn.functional.pad(residual.diff(dim=-1), (1, 0)) ** 2
+        error = (error + motion_weight * change) / (1 + 2 * motion_weight)
     match weighting:
         case "noise":
             return error

@@ -38,7 +38,8 @@ def gaussian_losses(
     def goal(code: Tensor) -> Tensor:
         return negative_log_likelihood(lambda x, t: nets.goal(x, t, code), batch.goal)
 
-    return level_losses(nets, batch, objective, generator, phase, goal, negative_log_likelihood)
+    each = negative_log_likelihood
+    return level_losses(nets, batch, objective, generator, phase, goal, each, each)
 
 
 def negative_log_likelihood(
@@ -70,9 +71,10 @@ def one_stage_losses(
     seen = torch.where(known[:, None, None], batch.body, torch.zeros_like(batch.body))
     whole = torch.cat([batch.path, seen], dim=1)
     nothing = torch.zeros_like(batch.places), torch.zeros(len(code), 1, device=code.device)
-    error = squared_error(
-        lambda x, t: nets.body(x, t, code, *nothing), whole, schedule, objective.weighting, generator
-    )
+    motion = torch.full((whole.shape[1], 1), objective.motion_weight, device=code.device)
+    motion[:PATH_CHANNELS] = 0
+    weights = objective.weighting, generator, motion
+    error = squared_error(lambda x, t: nets.body(x, t, code, *nothing), whole, schedule, *weights)
     body = error[:, PATH_CHANNELS:] * known[:, None, None]
     rows = distributed.mean(known.sum().float()).clamp_min(1 / distributed.size())
     return {"path": error[:, :PATH_CHANNELS].mean(), "body": body.sum() / (rows * body[0].numel())}

@@ -10,6 +10,7 @@ import torch
 from pipeline.behavior.body_denoiser import OneStageDenoiser
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import ROOT_CHANNELS, Architecture, BehaviorNets, Scaling
+from pipeline.behavior.perception import POSITION
 from pipeline.behavior.pointwise import WaypointUNet
 from pipeline.core import distributed
 from pipeline.core.training import FitRecord, fit
@@ -149,7 +150,8 @@ def initial_nets(
     scaling, body = statistics.scaling, nets.body
     body.path_std[:] = torch.from_numpy(scaling.path_std)
     body.root_mean[:] = torch.from_numpy(scaling.body_mean[:ROOT_CHANNELS])
-    body.root_std[:] = torch.from_numpy(scaling.body_std[:ROOT_CHANNELS])
+    body.root_std[:] = statistics.past_std[POSITION : POSITION + ROOT_CHANNELS]
+    body.rotation_std[:] = torch.from_numpy(scaling.body_std[:ROOT_CHANNELS])
     if nets.goal.map is not None:
         nets.goal.map.goal_std[:] = torch.from_numpy(scaling.goal_std)
     for net in (nets.path, nets.body):

@@ -84,6 +84,15 @@ def test_targets_have_unit_scale(windows):
     np.testing.assert_allclose(np.sqrt((path[:, [0, 2]] ** 2).mean((0, 1)))[5:], 1, atol=1e-3)
 
 
+@pytest.mark.parametrize("turn_rad", [0.0, np.pi])
+def test_no_heading_is_clipped(windows, turn_rad):
+    scaling = statistics_from_windows(windows, turn_rad).scaling
+    for entry in (-1, 1):
+        scaled = (entry - scaling.body_mean[:3]) / scaling.body_std[:3]
+        assert np.abs(scaled).max() <= Schedule().clip + 1e-9
+    assert scaling.body_std[0] < 0.45
+
+
 def test_windows_begin_at_the_origin_facing_forward(windows):
     tracks = windows.tracks(torch.arange(len(windows)))
     assert tracks.root[:, 7].abs().max() < 1e-5
@@ -228,6 +237,22 @@ def test_the_error_of_rectified_flow_is_that_of_noise_less_clean_sample():
     true = (way - (1 - moment) * clean) / moment - clean
     predicted = told["x"].sin() - (way - moment * told["x"].sin()) / (1 - moment)
     torch.testing.assert_close(error, (predicted - true) ** 2, atol=1e-4, rtol=1e-3)
+
+
+def test_an_error_that_changes_from_frame_to_frame_counts_more_than_one_that_stays():
+    """Of noise errors of size 1 that stay, alternate, or are drawn for each frame alone."""
+    share, clean = torch.from_numpy(Schedule().alpha_bar).float(), torch.zeros(32, 3, 40)
+    alone = torch.randn(clean.shape, generator=torch.Generator().manual_seed(1))
+    alternating = 1 - 2.0 * (torch.arange(40) % 2)
+    found = []
+    for off in (torch.ones(40), alternating, alone):
+
+        def denoise(x, t, off=off):
+            return x / (1 - share[t.long()])[:, None, None].sqrt() + off
+
+        generator = torch.Generator().manual_seed(0)
+        found.append(float(squared_error(denoise, clean, Schedule(), "noise", generator, 4.0).mean()))
+    assert found == pytest.approx([1 / 9, (1 + 16 * 39 / 40) / 9, 1.0], rel=0.03)
 
 
 def test_half_precision_learns_nearly_the_same_and_keeps_its_weights(data):
