@@ -1,9 +1,8 @@
-"""What the animal of one recording looks like: a small network learns it from the recording's first masks.
+"""A small segmentation network that learns the animal's appearance from a recording's first masks.
 
-First masks rest on geometry and miss an animal that never leaves its place, or leak where depth is poor; such
-errors differ from frame to frame while the animal's appearance stays, so the network, too small to learn the
-errors by heart, keeps the appearance. `learn` trains one on examples; `Appearance.log_odds` judges a picture
-of any size.
+First masks come from geometry: they miss an animal that never moves, and leak where depth is poor. These
+errors vary from frame to frame while the appearance stays, so a network too small to memorize the errors
+learns the appearance. `learn` trains it; `Appearance.log_odds` segments a picture of any size.
 """
 
 import math
@@ -22,41 +21,41 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from stages.segment_agent.config import LearningConfig
 
 ALIGNED_PX = 16
-"""pictures are widened to a multiple of it"""
-GAIN = 4.0
-"""of the last layer, so that a short training reaches sure answers"""
-SURROUNDINGS_PX = 32
-"""pixels around a rectangle that are looked at to judge it"""
-LIMIT = 8.0
-"""largest log-odds of a pixel"""
+"""pictures are padded to a multiple of this"""
+LOGIT_SCALE = 4.0
+"""scale of the logits, so that a short training reaches confident answers"""
+CONTEXT_PX = 32
+"""context around a rectangle, pixels"""
+MAX_LOG_ODDS = 8.0
+"""log-odds of a pixel are clamped to this"""
 RATE, WEIGHT_DECAY = 5e-3, 1e-3
-"""highest learning rate, and decay of weights, of AdamW"""
-TRUSTING = 0.5
-"""share of the steps in which every label counts"""
-CONTRADICTION = 4.0
-"""log-odds by which the network must contradict a label to ignore it later"""
-AT_ANIMAL = 0.7
-"""share of the other crops that show the animal"""
-MINED = 0.2
-"""share of crops around what was taken for the animal by mistake, once a third of the steps is done"""
-SCALED, SCALES = 0.5, (0.5, 1.5)
-"""share of crops that show the animal smaller or larger than it was seen, and how much"""
+"""peak learning rate and weight decay of AdamW"""
+LABEL_TRUST_SHARE = 0.5
+"""share of the steps after which contradicted labels are ignored"""
+CONTRADICTION_LOG_ODDS = 4.0
+"""log-odds against a label from which on it is ignored"""
+ANIMAL_CROP_SHARE = 0.7
+"""share of the other crops that are centred near the animal"""
+HARD_NEGATIVE_SHARE = 0.2
+"""share of crops around false positives, after a third of the steps"""
+RESCALED_SHARE, SCALE_RANGE = 0.5, (0.5, 1.5)
+"""share of rescaled crops, and the range of scales"""
 MIN_PX = 60
-"""animal pixels that an example needs"""
+"""minimum animal pixels of an example"""
 CONTRAST, BRIGHTNESS = 0.2, 0.15
-"""standard deviations of changed contrast (share) and exposure (of -1..1) of crops"""
+"""standard deviations of the augmentation of contrast (share) and brightness (of -1..1)"""
 
 
 @dataclass(frozen=True)
 class Example:
-    """A picture at working resolution, its colours first, and its labels: 255 animal, 0 not, 128 unknown."""
+    """A picture at working resolution (RGB first) and its labels: 255 animal, 0 not, 128 unknown."""
 
     color: UInt8[np.ndarray, "height width channel"]
     labels: UInt8[np.ndarray, "height width"]
 
 
 class Appearance(nn.Module):
-    """A U-shaped convolutional network of 80,000 weights from colours to log-odds of showing the animal."""
+    """A U-Net of 80,000 weights from colours to the log-odds that a pixel shows the animal."""
 
     def __init__(self, widths: tuple[int, int, int, int] = (16, 24, 32, 48), channels: int = 3) -> None:
         super().__init__()
@@ -72,12 +71,12 @@ class Appearance(nn.Module):
         self, color: Float[Tensor, "batch channel height width"]
     ) -> Float[Tensor, "batch height width"]:
         """Return log-odds of pictures whose colours are -1..1 and whose sides are multiples of 16."""
-        return GAIN * self.out(self.trunk(color))[:, 0]
+        return LOGIT_SCALE * self.out(self.trunk(color))[:, 0]
 
     def trunk(
         self, color: Float[Tensor, "batch channel height width"]
     ) -> Float[Tensor, "batch channel row column"]:
-        """Return what the last layer sees, at half the resolution."""
+        """Return the features before the last layer, at half the resolution."""
         levels = [color]
         for down in self.down:
             levels.append(down(levels[-1]))
@@ -91,17 +90,17 @@ class Appearance(nn.Module):
     def log_odds_within(
         self, color: UInt8[np.ndarray, "height width 3"], rows: slice, columns: slice
     ) -> Float[np.ndarray, "rows columns"]:
-        """Judge a rectangle of a picture as `log_odds` of the whole would, but by its surroundings alone."""
-        top, left = max(rows.start - SURROUNDINGS_PX, 0), max(columns.start - SURROUNDINGS_PX, 0)
+        """Return `log_odds` in a rectangle of a picture, evaluated with some context only."""
+        top, left = max(rows.start - CONTEXT_PX, 0), max(columns.start - CONTEXT_PX, 0)
         top, left = top - top % ALIGNED_PX, left - left % ALIGNED_PX
-        found = self.log_odds(color[top : rows.stop + SURROUNDINGS_PX, left : columns.stop + SURROUNDINGS_PX])
+        found = self.log_odds(color[top : rows.stop + CONTEXT_PX, left : columns.stop + CONTEXT_PX])
         return found[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
 
     @torch.no_grad()
     def log_odds(self, color: UInt8[np.ndarray, "height width channel"]) -> Float[np.ndarray, "height width"]:
-        """Judge every pixel of a picture at working resolution, within +-8."""
+        """Return the log-odds of every pixel of a picture at working resolution, within +-8."""
         height, width = color.shape[:2]
-        return self.eval()(aligned(color))[0, :height, :width].clamp(-LIMIT, LIMIT).numpy()
+        return self.eval()(to_batch(color))[0, :height, :width].clamp(-MAX_LOG_ODDS, MAX_LOG_ODDS).numpy()
 
 
 def learn(
@@ -111,48 +110,46 @@ def learn(
     *,
     room: Sequence[Example] = (),
     min_px: int = MIN_PX,
-    scaled: float = SCALED,
+    scaled: float = RESCALED_SHARE,
 ) -> Appearance | None:
-    """Train a network on examples, and on others that show the ``room`` alone; None when none shows the
-    animal.
+    """Train a network on examples, and on others that show only the ``room``; None if none shows the animal.
 
-    Stripes of a carpet may look like a tabby, so twice it looks at half of the examples and learns more from
-    its mistakes.
+    Twice, hard negatives are mined from half of the examples: a striped carpet may look like a tabby.
     """
-    showing = [example for example in examples if (example.labels == 255).sum() >= min_px]
-    if not showing:
+    pool = [example for example in examples if (example.labels == 255).sum() >= min_px]
+    if not pool:
         return None
-    showing += room
+    pool += room
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**31)))
-        network = Appearance(channels=showing[0].color.shape[-1])
+        network = Appearance(channels=pool[0].color.shape[-1])
     optimizer = torch.optim.AdamW(network.parameters(), RATE, weight_decay=WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=options.steps)
-    mistakes = None
+    hard_negatives = None
     for step in range(options.steps):
         if step in (options.steps // 3, 2 * options.steps // 3):
-            mistakes = [_mistake(network, example) for example in showing[::2]]
+            hard_negatives = [_hard_negatives(network, example) for example in pool[::2]]
         network.train()
         crops = []
         for _ in range(options.batch):
-            example, middle = _chosen(showing, mistakes, options.crop_px, rng)
-            example, middle = _scaled(example, middle, options.crop_px, scaled, rng)
+            example, middle = _choose_crop(pool, hard_negatives, options.crop_px, rng)
+            example, middle = _rescaled(example, middle, options.crop_px, scaled, rng)
             crops.append(_crop(example, middle, options.crop_px, rng))
         color, labels = (torch.stack(parts) for parts in zip(*crops, strict=True))
         found = network(color)
         loss = F.binary_cross_entropy_with_logits(found, (labels == 255).float(), reduction="none")
-        contradicted = torch.where(labels == 255, -found, found) > CONTRADICTION
-        counted = (labels != 128) & ~(contradicted & (step > TRUSTING * options.steps))
+        contradicted = torch.where(labels == 255, -found, found) > CONTRADICTION_LOG_ODDS
+        counted = (labels != 128) & ~(contradicted & (step > LABEL_TRUST_SHARE * options.steps))
         weight = counted.float()
         optimizer.zero_grad()
         ((loss * weight).sum() / weight.sum().clamp(min=1)).backward()
         optimizer.step()
         schedule.step()
-    return folded(network.eval())
+    return fold_batch_norms(network.eval())
 
 
-def folded(network: Appearance) -> Appearance:
-    """Fold batch norms into convolutions, and keep channels last: the same answers in 0.4 of the time."""
+def fold_batch_norms(network: Appearance) -> Appearance:
+    """Fold batch norms into convolutions, channels last: the same output in 0.4 of the time."""
     for block in [each for each in network.modules() if isinstance(each, nn.Sequential)]:
         convolution, norm = block[0], block[1]
         if isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
@@ -162,35 +159,35 @@ def folded(network: Appearance) -> Appearance:
     return network
 
 
-def _mistake(network: Appearance, example: Example) -> UInt8[np.ndarray, "height width"]:
-    """Return how much the room looks like the animal, log-odds from -2 up; what surely does may be it.
+def _hard_negatives(network: Appearance, example: Example) -> UInt8[np.ndarray, "height width"]:
+    """Return sampling weights of background pixels that look like the animal: 10 x (log-odds + 2), 0..255.
 
-    Nothing where the labelled animal does not look like one: then the label may be the mistake.
+    Confident detections may be the animal, so they get 0; so does all where the labelled animal is not found.
     """
-    like = network.log_odds(example.color)
-    if (example.labels == 255).any() and (like[example.labels == 255] > 0).mean() < 0.5:
-        return np.zeros(like.shape, np.uint8)
-    mistaken = (example.labels == 0) & (like < CONTRADICTION)
-    return np.where(mistaken, np.clip(10 * (like + 2), 0, 255), 0).astype(np.uint8)
+    log_odds = network.log_odds(example.color)
+    if (example.labels == 255).any() and (log_odds[example.labels == 255] > 0).mean() < 0.5:
+        return np.zeros(log_odds.shape, np.uint8)
+    mistaken = (example.labels == 0) & (log_odds < CONTRADICTION_LOG_ODDS)
+    return np.where(mistaken, np.clip(10 * (log_odds + 2), 0, 255), 0).astype(np.uint8)
 
 
-def _chosen(
+def _choose_crop(
     examples: Sequence[Example],
-    mistakes: list[UInt8[np.ndarray, "height width"]] | None,
+    hard_negatives: list[UInt8[np.ndarray, "height width"]] | None,
     crop_px: int,
     rng: np.random.Generator,
 ) -> tuple[Example, tuple[int, int]]:
-    """Choose an example and the middle (row, column) of a crop: a mistake, near the animal, or any."""
-    if mistakes is not None and rng.random() < MINED:
-        total = np.array([weight.sum(dtype=np.int64) for weight in mistakes])
+    """Choose an example and a crop centre (row, column): a hard negative, near the animal, or anywhere."""
+    if hard_negatives is not None and rng.random() < HARD_NEGATIVE_SHARE:
+        total = np.array([weight.sum(dtype=np.int64) for weight in hard_negatives])
         if total.any():
-            index = int(rng.choice(len(mistakes), p=total / total.sum()))
-            heaped = np.cumsum(mistakes[index], dtype=np.int64)
-            place = int(np.searchsorted(heaped, rng.integers(heaped[-1]), side="right"))
-            return examples[2 * index], divmod(place, mistakes[index].shape[1])
+            index = int(rng.choice(len(hard_negatives), p=total / total.sum()))
+            cumulative = np.cumsum(hard_negatives[index], dtype=np.int64)
+            place = int(np.searchsorted(cumulative, rng.integers(cumulative[-1]), side="right"))
+            return examples[2 * index], divmod(place, hard_negatives[index].shape[1])
     example = examples[int(rng.integers(len(examples)))]
     height, width = example.labels.shape
-    if rng.random() >= AT_ANIMAL or not (example.labels == 255).any():
+    if rng.random() >= ANIMAL_CROP_SHARE or not (example.labels == 255).any():
         return example, (int(rng.integers(height)), int(rng.integers(width)))
     inside = np.flatnonzero(example.labels == 255)
     row, column = divmod(int(inside[rng.integers(len(inside))]), width)
@@ -198,13 +195,13 @@ def _chosen(
     return example, (row + int(rng.integers(-reach, reach)), column + int(rng.integers(-reach, reach)))
 
 
-def _scaled(
+def _rescaled(
     example: Example, middle: tuple[int, int], crop_px: int, scaled: float, rng: np.random.Generator
 ) -> tuple[Example, tuple[int, int]]:
-    """Show an example and the middle of a crop as from nearer or farther, now and then."""
+    """Rescale an example and its crop centre with probability ``scaled``."""
     if scaled == 0 or rng.random() >= scaled:
         return example, middle
-    scale = float(np.exp(rng.uniform(*np.log(SCALES))))
+    scale = float(np.exp(rng.uniform(*np.log(SCALE_RANGE))))
     reach = math.ceil(crop_px / scale)
     top, left = (
         int(np.clip(at - reach // 2 - 1, 0, max(side - reach - 2, 0)))
@@ -221,7 +218,7 @@ def _scaled(
 def _crop(
     example: Example, middle: tuple[int, int], side: int, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Cut a square; flip it, change its exposure and contrast."""
+    """Cut a square crop, padded where needed, and augment it: flip, contrast, brightness."""
     height, width = example.labels.shape
     top, left = middle[0] - side // 2, middle[1] - side // 2
     top, left = int(np.clip(top, 0, max(height - side, 0))), int(np.clip(left, 0, max(width - side, 0)))
@@ -236,15 +233,15 @@ def _crop(
     return shown, torch.from_numpy(labels.copy())
 
 
-def aligned(color: UInt8[np.ndarray, "height width channel"]) -> Float[Tensor, "1 channel row column"]:
-    """Return a picture as the networks take it: colours -1..1, widened to sides that are multiples of 16."""
+def to_batch(color: UInt8[np.ndarray, "height width channel"]) -> Float[Tensor, "1 channel row column"]:
+    """Return a picture as network input: colours -1..1, padded to sides that are multiples of 16."""
     height, width = color.shape[:2]
     padded = np.pad(color, [(0, -height % ALIGNED_PX), (0, -width % ALIGNED_PX), (0, 0)], mode="edge")
     return normalized(padded)[None]
 
 
 def normalized(color: UInt8[np.ndarray, "height width channel"]) -> Float[Tensor, "channel height width"]:
-    """Return colours as -1..1, channels first."""
+    """Scale colours to -1..1, channels first."""
     return torch.from_numpy(np.ascontiguousarray(color.transpose(2, 0, 1))).float() / 127.5 - 1
 
 

@@ -1,4 +1,4 @@
-"""Settings of segmentation; what nobody should turn stands beside the code that uses it."""
+"""Settings of segmentation; constants that need no tuning stand beside the code that uses them."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -6,24 +6,24 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class FoundationConfig:
-    """Which models find and follow the animal, and what they look for."""
+    """Checkpoints that detect and track the animal, and the text prompt."""
 
     detector: str = ""
     """Folder of a Grounding DINO checkpoint; not needed where a prompt points at the animal."""
     tracker: str = ""
     """Folder of a SAM 2 checkpoint."""
     description: str = "a cat."
-    """What the animal is called."""
+    """Text prompt for the detector."""
     threshold: float = 0.3
-    """Score from which a detection counts, 0..1."""
+    """Minimum detection score, 0..1."""
 
 
 @dataclass(frozen=True)
 class LearningConfig:
-    """How the animal's appearance is learned from first masks of the same recording."""
+    """Training of the appearance network on the first masks of the same recording."""
 
     examples: int = 150
-    """Frames with the animal to learn from."""
+    """Number of training frames that show the animal."""
     steps: int = 300
     """Training steps."""
     batch: int = 6
@@ -34,12 +34,12 @@ class LearningConfig:
 
 @dataclass(frozen=True)
 class AnimalConfig:
-    """What an animal may be like."""
+    """Limits on the animal's size and speed."""
 
     largest_m: float = 1.3
-    """Largest extent of an animal, metres; groups that are larger, up to twice that, count half."""
+    """Largest extent of an animal, metres; groups up to twice as large get half the score."""
     speed_m_s: float = 2.5
-    """Fastest motion that costs nothing much, metres per second."""
+    """Speed up to which tracking charges no cost, metres per second."""
 
 
 @dataclass(frozen=True)
@@ -47,17 +47,17 @@ class Config:
     """How the animal is found in one recording."""
 
     backend: Literal["weightless", "foundation"] = "weightless"
-    """By motion, free space and appearance, or by Grounding DINO and SAM 2 (`make extras`, weights)."""
+    """Motion, free space and appearance, or Grounding DINO and SAM 2 (`make extras`, and checkpoints)."""
     foundation: FoundationConfig = field(default_factory=FoundationConfig)
-    """Settings of the latter."""
+    """Settings of the backend `foundation`."""
     learning: LearningConfig = field(default_factory=LearningConfig)
-    """How appearance is learned."""
+    """Training of the appearance network."""
     animal: AnimalConfig = field(default_factory=AnimalConfig)
     """Size and speed of the animal."""
     references: int = 90
-    """Depth pictures, spread evenly over the recording, that decide which space is free at other times."""
+    """Number of depth pictures, evenly spaced in time, that vote on which space is free at other times."""
     height_px: int = 320
-    """Working height, pixels; larger pictures are worked on at this size."""
+    """Working height, pixels; larger pictures are downsampled to it."""
     role: Literal["turnaround", "session"] = "session"
     """Role of the recording where the list of recordings does not give it."""
     seed: int = 0

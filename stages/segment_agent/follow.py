@@ -1,7 +1,7 @@
-"""Masks of a recording without depth, from one box: color and flow only.
+"""Masks of a recording without depth, from one box: colour and flow only.
 
-GrabCut cuts the animal out of the hinted frame, beginning with what moves there against the background if
-much does. `propagation` carries this mask through the recording.
+GrabCut segments the hinted frame, initialized with what moves against the background if enough does.
+`propagation` then propagates this mask through the recording.
 """
 
 from collections.abc import Iterator
@@ -12,35 +12,37 @@ from jaxtyping import Bool, Float, UInt8
 
 from stages.segment_agent.config import LearningConfig
 from stages.segment_agent.footage import MOVING, STILL, Footage
-from stages.segment_agent.painting import Mask
 from stages.segment_agent.prompt import Prompt
-from stages.segment_agent.propagation import CERTAIN, SURE, propagate
+from stages.segment_agent.propagation import CERTAIN, MAX_LOG_ODDS, propagate
+from stages.segment_agent.segmenter import Mask
 
 HEIGHT_PX = 240
-"""of the pictures that the mask is carried through: flow is no finer"""
-ROUNDS, MODEL_NUMBERS = 8, 65
-"""of GrabCut; its models are five Gaussians of a weight, a mean and a covariance each"""
+"""picture height for propagation: flow is no finer"""
+ITERATIONS, MODEL_SIZE = 8, 65
+"""iterations of GrabCut; size of its models: five Gaussians with weight, mean and covariance"""
 CLICK_REACH = 0.2
-"""of the box around a click, as a share of the picture's height"""
+"""half size of the box around a click, as a share of the picture's height"""
 MOTION_GAPS, MIN_MOVING = (4, 8), 0.15
-"""frames over which motion is measured in the hinted frame, and share of the box that must move for motion to
-separate the animal from the rest of the box"""
+"""frame gaps over which motion is measured in the hinted frame, and share of the box that must move for it
+to be used"""
 
 
 def follow(
     footage: Footage, hint: Prompt, learning: LearningConfig, rng: np.random.Generator
 ) -> Iterator[Mask]:
-    """Return one mask per frame at color resolution."""
+    """Yield one mask per frame at colour resolution."""
     coarse = Footage(footage.clip, footage.flow, min(HEIGHT_PX, footage.height_px))
-    first = cut_out(footage, hint, rng)
+    first = segment_hint(footage, hint, rng)
     first = cv2.resize(first, coarse.size[::-1], interpolation=cv2.INTER_AREA)
     for log_odds in propagate(coarse, hint.frame, first, learning, rng):
         inside = cv2.resize(log_odds, footage.clip.color_size[::-1], interpolation=cv2.INTER_LINEAR) > 0
         yield Mask(np.where(inside, 255, 0).astype(np.uint8), bool(inside.any()), np.nan)
 
 
-def cut_out(footage: Footage, hint: Prompt, rng: np.random.Generator) -> Float[np.ndarray, "height width"]:
-    """Cut the animal out of the hinted frame, or of a box around a click: log-odds, -`SURE` outside."""
+def segment_hint(
+    footage: Footage, hint: Prompt, rng: np.random.Generator
+) -> Float[np.ndarray, "height width"]:
+    """Segment the animal in the hinted box, or in one around a click: log-odds, -`MAX_LOG_ODDS` outside."""
     color = footage.color(hint.frame)
     height, width = color.shape[:2]
     x0, y0, x1, y1 = np.array(hint.box_px) * height / footage.clip.color_size[0]
@@ -48,23 +50,24 @@ def cut_out(footage: Footage, hint: Prompt, rng: np.random.Generator) -> Float[n
         x0, y0, x1, y1 = np.array([x0, y0, x1, y1]) + CLICK_REACH * height * np.array([-1, -1, 1, 1])
     low = np.clip(np.floor([x0, y0]), 1, [width - 8, height - 8]).astype(int)
     high = np.minimum(np.ceil([x1, y1]).astype(int), [width - 1, height - 1])
-    boxed = np.zeros((height, width), bool)
-    boxed[low[1] : high[1], low[0] : high[0]] = True
+    in_box = np.zeros((height, width), bool)
+    in_box[low[1] : high[1], low[0] : high[0]] = True
     residual = footage.residual(hint.frame, *MOTION_GAPS)
-    still = (residual < STILL) & ((residual[boxed] > MOVING).mean() > MIN_MOVING)
-    marks = np.where(boxed, np.where(still, cv2.GC_PR_BGD, cv2.GC_PR_FGD), cv2.GC_BGD).astype(np.uint8)
-    inside = grab(color, marks, rng)
-    inside = inside if inside.any() else boxed
-    return np.where(inside, SURE, np.where(boxed, -(CERTAIN + SURE) / 2, -SURE)).astype(np.float32)
+    still = (residual < STILL) & ((residual[in_box] > MOVING).mean() > MIN_MOVING)
+    trimap = np.where(in_box, np.where(still, cv2.GC_PR_BGD, cv2.GC_PR_FGD), cv2.GC_BGD).astype(np.uint8)
+    inside = grabcut(color, trimap, rng)
+    inside = inside if inside.any() else in_box
+    log_odds = np.where(in_box, -(CERTAIN + MAX_LOG_ODDS) / 2, -MAX_LOG_ODDS)
+    return np.where(inside, MAX_LOG_ODDS, log_odds).astype(np.float32)
 
 
-def grab(
+def grabcut(
     color: UInt8[np.ndarray, "height width 3"],
-    marks: UInt8[np.ndarray, "height width"],
+    trimap: UInt8[np.ndarray, "height width"],
     rng: np.random.Generator,
 ) -> Bool[np.ndarray, "height width"]:
-    """Cut something out of a picture by GrabCut (Rother et al. 2004); ``marks`` are OpenCV's four."""
+    """Segment a picture by GrabCut (Rother et al. 2004); ``trimap`` has OpenCV's four labels."""
     cv2.setRNGSeed(int(rng.integers(2**31 - 1)))
-    models, by_mask = np.zeros((2, 1, MODEL_NUMBERS)), cv2.GC_INIT_WITH_MASK
-    found = cv2.grabCut(color, marks.copy(), (0, 0, 0, 0), models[0], models[1], ROUNDS, by_mask)[0]
+    models, by_mask = np.zeros((2, 1, MODEL_SIZE)), cv2.GC_INIT_WITH_MASK
+    found = cv2.grabCut(color, trimap.copy(), (0, 0, 0, 0), models[0], models[1], ITERATIONS, by_mask)[0]
     return (found == cv2.GC_FGD) | (found == cv2.GC_PR_FGD)

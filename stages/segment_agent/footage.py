@@ -11,23 +11,23 @@ from pipeline.data.clips import Clip
 from pipeline.data.flow import GAPS, open_confidence, open_flow
 from stages.segment_agent.windows import working_picture, working_size
 
-SPARSE_PX, INLIER_PX, AGREED = 8, 2.0, 0.3
-"""the background's homography: spacing of its pixels, their largest error, the flow's least confidence"""
+SPARSE_PX, INLIER_PX, MIN_CONFIDENCE = 8, 2.0, 0.3
+"""background homography: pixel spacing, inlier threshold, minimum flow confidence"""
 MOVING, STILL = 4.0, 2.5
-"""typical residuals from which on a point moves against the background, and up to which it does not"""
-REACH_PX, OUTLINE_PX = 16, 3
-"""how far from where it is presumed an animal is looked for, and flow blurs its outline; working pixels"""
+"""normalized residual above which a point moves against the background, and below which it is static"""
+SEARCH_PX, OUTLINE_PX = 16, 3
+"""search radius around the propagated mask, and how far flow blurs outlines; working pixels"""
 MIN_MOVING = 0.3
-"""share of a region that must move for motion to separate the animal from the rest"""
+"""share of a region that must move for motion to be used"""
 MIN_TYPICAL_PX = 0.5
-"""typical residual that counts as noise of the flow"""
+"""least median residual used for normalization: noise of the flow"""
 SHOWN_GAPS, SHOWN_LOG = (1, 4), 60.0
-"""gaps over which a network is shown motion; 8-bit levels of log(1 + residual), for up to 70 residuals"""
+"""frame gaps of the motion channels; 8-bit levels per log(1 + residual), saturating at a residual of 70"""
 
 
 @dataclass(frozen=True)
 class Footage:
-    """Working pictures and flow at their size."""
+    """Pictures at working size and flow at the same size."""
 
     clip: Clip
     flow: Path
@@ -43,7 +43,7 @@ class Footage:
         """Read a working picture."""
         return working_picture(self.clip, frame, self.height_px)
 
-    def to(self, frame: int, other: int) -> Float[np.ndarray, "height width 2"] | None:
+    def flow_between(self, frame: int, other: int) -> Float[np.ndarray, "height width 2"] | None:
         """Read the flow from a frame to another, working pixels; None where none is stored."""
         first, gap = min(frame, other), abs(other - frame)
         table = open_flow(self.flow, gap, backward=other < frame)
@@ -53,25 +53,24 @@ class Footage:
         return scale * self._resized(table[first].astype(np.float32))
 
     def confidence(self, frame: int, other: int) -> Float[np.ndarray, "height width"]:
-        """Read how far both directions of a stored flow agree, 0..1."""
+        """Read the forward-backward consistency of a stored flow, 0..1."""
         table = open_confidence(self.flow, abs(other - frame), backward=other < frame)
         return self._resized(table[min(frame, other)]).astype(np.float32) / 255
 
     def residual(self, frame: int, *gaps: int) -> Float[np.ndarray, "height width"]:
-        """Return how far a point moves against the background over so many frames, in typical residuals; mean
-        over both directions of time.
+        """Return the flow residual against the background over frame gaps, in units of its median.
 
-        The background moves as most of the picture does, by a homography.
+        The background moves by a homography fitted to most of the picture. Mean over both time directions.
         """
-        pixel, parts = pixels(self.size), []
-        for other in (frame + way * gap for gap in gaps for way in (-1, 1)):
-            moved = self.to(frame, other)
+        pixel, parts = pixel_indices(self.size), []
+        for other in (frame + sign * gap for gap in gaps for sign in (-1, 1)):
+            moved = self.flow_between(frame, other)
             if moved is None:
                 continue
-            agreed = self.confidence(frame, other)[::SPARSE_PX, ::SPARSE_PX] > AGREED
-            sparse, apart = (part[::SPARSE_PX, ::SPARSE_PX][agreed] for part in (pixel, moved))
+            agreed = self.confidence(frame, other)[::SPARSE_PX, ::SPARSE_PX] > MIN_CONFIDENCE
+            sparse, sparse_flow = (part[::SPARSE_PX, ::SPARSE_PX][agreed] for part in (pixel, moved))
             few = len(sparse) < 4
-            matrix = None if few else cv2.findHomography(sparse, sparse + apart, cv2.RHO, INLIER_PX)[0]
+            matrix = None if few else cv2.findHomography(sparse, sparse + sparse_flow, cv2.RHO, INLIER_PX)[0]
             if matrix is not None:
                 expected = cv2.perspectiveTransform(pixel.reshape(1, -1, 2), matrix).reshape(pixel.shape)
                 error = np.linalg.norm(expected - pixel - moved, axis=-1)
@@ -81,24 +80,24 @@ class Footage:
     def moving(
         self, frame: int, inside: Bool[np.ndarray, "height width"]
     ) -> Float[np.ndarray, "height width"]:
-        """Return 1 near ``inside`` where a point moves against the background about as the mover in it does,
-        -1 where it does not; 0 between, and everywhere if little of it moves or much of the rest, as water.
+        """Return 1 near ``inside`` where pixels move against the background like it, -1 where they do not.
 
-        Flow blurs outlines, the more, the longer the gap: the shortest counts over which enough moves.
+        0 between, and everywhere if little of ``inside`` moves or much of the rest does, like water. The
+        shortest gap with enough motion is used, since flow blurs outlines more over longer ones.
         """
-        far = ~grown(inside, REACH_PX)
+        far = ~dilated(inside, SEARCH_PX)
         for gap in GAPS:
             residual = self._residual_over(frame, gap)
             moves = residual[inside & (residual > MOVING)]
             if len(moves) > MIN_MOVING * inside.sum():
                 level = float(np.median(moves))
-                moving = ~grown(residual < max(MOVING, level / 2), OUTLINE_PX)
+                moving = ~dilated(residual < max(MOVING, level / 2), OUTLINE_PX)
                 alone = moving[far].sum() < MIN_MOVING / 2 * far.sum()
                 return (moving.astype(np.float32) - (residual < max(STILL, level / 4))) * (alone & ~far)
         return np.zeros(self.size, np.float32)
 
     def with_motion(self, frame: int) -> UInt8[np.ndarray, "height width 5"]:
-        """Return a working picture and how far points move against the background as two more channels."""
+        """Return a working picture with two motion channels: log residuals against the background."""
         residual = np.stack([self._residual_over(frame, gap) for gap in SHOWN_GAPS], -1)
         shown = np.minimum(SHOWN_LOG * np.log1p(residual.astype(np.float32)), 255)
         return np.concatenate([self.color(frame), shown.astype(np.uint8)], -1)
@@ -113,12 +112,12 @@ class Footage:
         return cv2.resize(image, self.size[::-1], interpolation=cv2.INTER_LINEAR)
 
 
-def pixels(size: tuple[int, int]) -> Float[np.ndarray, "height width 2"]:
+def pixel_indices(size: tuple[int, int]) -> Float[np.ndarray, "height width 2"]:
     """Return the index (x, y) of each pixel of a picture of (height, width)."""
     return np.stack(np.meshgrid(*(np.arange(side, dtype=np.float32) for side in size[::-1])), -1)
 
 
-def grown(mask: Bool[np.ndarray, "height width"], by_px: int) -> Bool[np.ndarray, "height width"]:
+def dilated(mask: Bool[np.ndarray, "height width"], by_px: int) -> Bool[np.ndarray, "height width"]:
     """Dilate a mask by a disc."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by_px + 1, 2 * by_px + 1))
     return cv2.dilate(mask.astype(np.uint8), disc) > 0

@@ -1,8 +1,7 @@
-"""Free space: a point that other frames saw through is not part of the still room.
+"""Free space: a point that other frames saw through is not part of the static room.
 
 `References` keeps a fixed number of depth pictures spread over the recording, before and after any frame, so
-that an animal that rests for a while is recognised by the times when its place was empty. Votes cost
-O(references) a frame.
+that a resting animal is recognised by the times when its place was empty. Voting costs O(references) a frame.
 """
 
 import math
@@ -19,34 +18,33 @@ from pipeline.data.clips import Clip, usable_depth
 from pipeline.geometry import cameras, rigid, subsampling
 
 MARGIN_M = 0.03
-"""a surface this far, and four standard deviations of depth noise, behind a point proves it free"""
-ACROSS_M = 0.015
-"""pose error that is tolerated across the line of sight"""
-NEARLY = 0.6
-"""points up to this share of a picture from its middle are looked for in it"""
-SIGNIFICANT = 4.0
-"""standard deviations of depth noise that are no chance"""
+"""a surface this far plus four standard deviations of depth noise behind a point proves free space"""
+LATERAL_ERROR_M = 0.015
+"""tolerated pose error across the line of sight"""
+VIEW_MARGIN = 0.6
+"""a reference votes if a probe projects within this share of the picture from its middle"""
+SIGMAS = 4.0
+"""standard deviations of depth noise that are significant"""
 NEAREST_M = 0.1
-"""nothing is measured nearer to a depth camera"""
-NOISE_REACH_M = 0.15
-"""largest difference that may be noise of a surface seen twice, and not another surface"""
+"""minimum depth of a projected point"""
+MAX_NOISE_M = 0.15
+"""larger depth differences are other surfaces, not noise"""
 MIN_PAIRS, MAD_TO_SIGMA, MIN_NOISE_M = 200, 1.48, 0.002
-"""differences that measure a range's noise, MAD to sigma, and the least deviation of any sensor"""
-SOFTNESS_PX = 1.2
-"""deviation of the blur before colours are compared"""
+"""differences required per range bin, MAD to sigma, and the least deviation of any sensor"""
+BLUR_PX = 1.2
+"""standard deviation of the blur before colours are compared"""
 INNER_WIDTH_PX = 320
-"""width of a picture of which one pixel around each is looked at, in wider ones more; narrower ones are
-phones', whose confidence marks steps"""
+"""picture width per pixel of window radius for `inner_depth`; narrower pictures are phones', whose confidence
+marks steps"""
 INNER_STEP_SHARE = 0.12
-"""share of the distance from which a difference within that window is a step between surfaces"""
+"""depth range within that window, as a share of the depth, that is a step between surfaces"""
 
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """How depth pictures of one recording disagree about the same surface: sensor and poses together.
+    """Depth noise of one recording, sensor and poses together.
 
-    Standard deviation in metres = constant_m + quadratic * z^2, z in metres: triangulation errs with the
-    square of z.
+    Standard deviation in metres = constant_m + quadratic * z^2, z in metres, as for triangulation.
     """
 
     constant_m: float = 0.005
@@ -59,7 +57,7 @@ class DepthNoise:
 
 @dataclass(frozen=True)
 class References:
-    """Depth pictures that vote; ``nearest``, the least depth of a neighbourhood, tolerates drift at edges."""
+    """Depth pictures that vote; ``nearest``, the local minimum of depth, tolerates drift at edges."""
 
     camera_from_world: Float[np.ndarray, "reference 4 4"]
     intrinsics: Float[np.ndarray, "reference 3 3"]
@@ -69,7 +67,7 @@ class References:
     frame: Int[np.ndarray, "reference"]
     noise: DepthNoise
     ignored: Callable[[int, Float[np.ndarray, "*shape 3"]], Bool[np.ndarray, "*shape"]] | None = None
-    """which points (world, metres) of a frame are people's, whose motion is no animal's"""
+    """which points (world, metres) of a frame belong to people and never count as moving"""
 
 
 @dataclass(frozen=True)
@@ -79,32 +77,32 @@ class Votes:
     free: Int[np.ndarray, "*shape"]
     occupied: Int[np.ndarray, "*shape"]
     gap_m: Float[np.ndarray, "*shape"]
-    """how far the references' surfaces lie behind the point, mean over those that agree within the margin"""
+    """mean distance from the point back to the agreeing references' surfaces"""
     color: Float[np.ndarray, "*shape 3"]
     """mean colour (0..255) of those surfaces"""
 
 
-def steady_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
+def clean_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
     """Read usable depth without flying pixels at depth steps (metres, 0 = unknown)."""
     return usable_depth(clip, frame, keep_steps=False)
 
 
-def inner_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
-    """Read depth away from steps, holes and what the sensor doubts (0 = unknown)."""
-    depth = steady_depth(clip, frame)
+def interior_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
+    """Read depth away from steps, holes and low confidence (metres, 0 = unknown)."""
+    depth = clean_depth(clip, frame)
     kernel = np.ones((2 * (depth.shape[1] // INNER_WIDTH_PX) + 1,) * 2, np.uint8)
     low, high = cv2.erode(depth, kernel), cv2.dilate(depth, kernel)
     return np.where((low > 0) & (high - low < INNER_STEP_SHARE * depth), depth, 0).astype(np.float32)
 
 
-def points_of(
+def world_points(
     clip: Clip,
     frame: int,
     world_from_camera: Float[np.ndarray, "4 4"],
     depth: Float[np.ndarray, "height width"],
     stride: int,
 ) -> Float[np.ndarray, "row column 3"]:
-    """Return every ``stride``-th pixel of a depth picture in the world, metres; NaN where it is 0."""
+    """Back-project every ``stride``-th depth pixel to the world, metres; NaN where depth is 0."""
     every = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     pixel, depth = cameras.pixel_grid(*depth.shape)[every], depth[every]
     rays = cameras.unproject(pixel, clip.depth_intrinsics[frame])
@@ -120,22 +118,22 @@ def sample(
     depth: Float[np.ndarray, "height width"],
     wanted_px: int,
 ) -> tuple[Float[np.ndarray, "row column 3"], Float[np.ndarray, "row column"], tuple[slice, slice]]:
-    """Take about ``wanted_px`` squared pixels of a depth picture: `points_of`, the area of each, which."""
+    """Subsample depth to about ``wanted_px`` squared pixels: points (`points_of`), areas in m^2, slices."""
     stride = max(1, round(math.sqrt(depth.size) / wanted_px))
     chosen = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     focal_px2 = clip.depth_intrinsics[frame, 0, 0] * clip.depth_intrinsics[frame, 1, 1]
-    points = points_of(clip, frame, world_from_camera, depth, stride)
+    points = world_points(clip, frame, world_from_camera, depth, stride)
     return points, (depth[chosen] * stride) ** 2 / focal_px2, chosen
 
 
 def gather(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], count: int) -> References:
     """Read the ``count`` depth pictures that vote."""
     frames = subsampling.evenly(len(clip), count, rounded=True)
-    depth = np.stack([steady_depth(clip, frame) for frame in frames])
-    color = np.stack([soft_color(clip.color(frame), clip.depth_size) for frame in frames])
+    depth = np.stack([clean_depth(clip, frame) for frame in frames])
+    color = np.stack([blurred_color(clip.color(frame), clip.depth_size) for frame in frames])
     camera_from_world, pinhole = rigid.inverse(world_from_camera[frames]), clip.depth_intrinsics[frames]
     noise = measure_noise(depth, camera_from_world, pinhole)
-    return References(camera_from_world, pinhole, depth, _nearest(depth, pinhole), color, frames, noise)
+    return References(camera_from_world, pinhole, depth, _min_filter(depth, pinhole), color, frames, noise)
 
 
 def measure_noise(
@@ -144,10 +142,10 @@ def measure_noise(
     intrinsics: Float[np.ndarray, "reference 3 3"],
     probes: int = 800,
 ) -> DepthNoise:
-    """Measure how far depth pictures err from what their neighbours in time and later ones predict, by range.
+    """Fit the depth noise to differences between overlapping depth pictures.
 
-    A robust deviation (1.48 times the median) per half metre; least squares with non-negative coefficients.
-    The default where too little overlaps.
+    A robust deviation (1.48 times the median) per half metre of range, then non-negative least squares. The
+    default if too little overlaps.
     """
     ranges, errors = [], []
     for first, second in _pairs(len(depth)):
@@ -161,7 +159,7 @@ def measure_noise(
         inside = cameras.in_picture(at, z, inner.shape, NEAREST_M)
         (column, row), z = at[inside].astype(int).T, z[inside]
         measured = depth[second][row, column]
-        near = (measured > 0) & (np.abs(measured - z) < NOISE_REACH_M)
+        near = (measured > 0) & (np.abs(measured - z) < MAX_NOISE_M)
         ranges.append(z[near])
         errors.append(np.abs(measured - z)[near])
     z, error = np.concatenate(ranges), np.concatenate(errors)
@@ -181,66 +179,66 @@ def _pairs(count: int) -> list[tuple[int, int]]:
     return [(a, a + gap) for a in range(0, count - 1, 2) for gap in (1, later) if a + gap < count]
 
 
-def without(references: References, hidden: Callable[[int], Bool[np.ndarray, "height width"]]) -> References:
-    """Forget what references saw where ``hidden`` (at any resolution) says so: they know no surface there."""
+def masked(references: References, hidden: Callable[[int], Bool[np.ndarray, "height width"]]) -> References:
+    """Remove the references' depth where ``hidden`` of a frame (at any resolution) is set."""
     depth, size = references.depth.copy(), references.depth.shape[1:][::-1]
     for picture, frame in zip(depth, references.frame, strict=True):
         forgotten = cv2.resize(hidden(int(frame)).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         picture[forgotten > 0] = 0
-    return replace(references, depth=depth, nearest=_nearest(depth, references.intrinsics))
+    return replace(references, depth=depth, nearest=_min_filter(depth, references.intrinsics))
 
 
-def soft_color(
+def blurred_color(
     color: UInt8[np.ndarray, "height width 3"], size: tuple[int, int]
 ) -> UInt8[np.ndarray, "new_height new_width 3"]:
-    """Resize to (height, width) and blur a little, so that colours compare in spite of small pose errors."""
-    return cv2.GaussianBlur(cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA), (5, 5), SOFTNESS_PX)
+    """Resize to (height, width) and blur, so that colour comparison tolerates small pose errors."""
+    return cv2.GaussianBlur(cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA), (5, 5), BLUR_PX)
 
 
 def vote(
     references: References, points_world: Float[np.ndarray, "*shape 3"], frame: int, surfaces: bool = False
 ) -> Votes:
-    """Let all other references judge points (world, metres; NaN: none); colors only with ``surfaces``."""
+    """Let the other references vote on points (world, metres; NaN: none); colours only with ``surfaces``."""
     known = np.isfinite(points_world[..., 0])
     points = np.ascontiguousarray(points_world[known], np.float32)
-    other = np.flatnonzero((references.frame != frame) & _looking_at(references, points))
+    other = np.flatnonzero((references.frame != frame) & _in_view(references, points))
     pinhole = references.intrinsics[:, [0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float32)
     poses, noise = references.camera_from_world.astype(np.float32), references.noise
-    margin = np.float32(MARGIN_M + SIGNIFICANT * noise.constant_m), np.float32(SIGNIFICANT * noise.quadratic)
+    margin = (np.float32(MARGIN_M + SIGMAS * noise.constant_m), np.float32(SIGMAS * noise.quadratic))
     pictures = references.depth, references.nearest, references.color
-    judged = _vote(points, other, poses, pinhole, *pictures, *margin, surfaces)
-    votes = [np.zeros(known.shape + values.shape[1:], values.dtype) for values in judged]
-    for whole, values in zip(votes, judged, strict=True):
+    results = _vote(points, other, poses, pinhole, *pictures, *margin, surfaces)
+    votes = [np.zeros(known.shape + values.shape[1:], values.dtype) for values in results]
+    for whole, values in zip(votes, results, strict=True):
         whole[known] = values
     if references.ignored is not None:
         votes[0][references.ignored(frame, points_world)] = 0
     return Votes(*votes)
 
 
-def _looking_at(
+def _in_view(
     references: References, points_world: Float[np.ndarray, "point 3"], probes: int = 96
 ) -> Bool[np.ndarray, "reference"]:
-    """Return which references have any of some evenly chosen points in their picture, or nearly so."""
+    """Return which references have some of the points in view, or nearly so."""
     chosen = points_world[:: max(1, len(points_world) // probes)].astype(float)
     points_camera = rigid.apply(references.camera_from_world, chosen[None])
     pixel, depth = cameras.project(points_camera, references.intrinsics[:, None])
     share = pixel / references.depth.shape[:0:-1]
-    near = (np.abs(share - 0.5) < NEARLY).all(-1)
+    near = (np.abs(share - 0.5) < VIEW_MARGIN).all(-1)
     return np.any((depth > NEAREST_M) & near, axis=1)
 
 
-def _nearest(
+def _min_filter(
     depth: Float[np.ndarray, "reference height width"], intrinsics: Float[np.ndarray, "reference 3 3"]
 ) -> Float[np.ndarray, "reference height width"]:
-    """Smallest depth in a window as wide as the tolerated drift at the median distance; 0 beside holes.
+    """Return the local minimum of depth in a window as wide as the tolerated drift; 0 beside holes.
 
-    Sensors lose thin and glossy things: what is seen beside a hole proves nothing about what stands there.
+    Sensors miss thin and glossy things, so depth beside a hole does not prove free space.
     """
     nearest = []
     for picture, focal_px in zip(depth, intrinsics[:, 0, 0], strict=True):
         known = picture > 0
         distance = float(np.median(picture[known])) if known.any() else 1.0
-        radius = int(np.clip(round(focal_px * ACROSS_M / distance), 1, 4))
+        radius = int(np.clip(round(focal_px * LATERAL_ERROR_M / distance), 1, 4))
         window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
         lowest = cv2.erode(np.where(known, picture, np.inf).astype(np.float32), window)
         whole = cv2.erode(known.astype(np.uint8), window) > 0

@@ -1,4 +1,4 @@
-"""Where the animal of a session is: a ball per frame, by what moves and, once learned, by its looks."""
+"""Localization of a session's animal: a sphere per frame, from motion and, once learned, appearance."""
 
 from collections.abc import Callable
 
@@ -14,14 +14,14 @@ from stages.segment_agent.movers import Candidate, Hint
 from stages.segment_agent.windows import Sphere, supported_depth
 
 COARSE_PX, FINE_PX = 111, 222
-"""side of the square that has as many pixels as candidates are made of: without and with known appearance"""
-REACH, MIN_REACH_M = 1.8, 0.15
-"""radius of the ball in those of candidates, which show one side of the animal; no ball is smaller"""
-SOLID = np.ones((2, 2), np.uint8)
-"""samples that an animal fills together; rims of furniture that poses misplace are thinner"""
+"""square root of the number of depth samples per frame, without and with known appearance"""
+SCALE, MIN_RADIUS_M = 1.8, 0.15
+"""radius of the sphere over that of candidates, which show one side of the animal; smallest radius"""
+OPENING = np.ones((2, 2), np.uint8)
+"""opening that removes rims of furniture due to pose error, samples"""
 
 AppearanceOf = Callable[[int], Float[np.ndarray, "height width"]]
-"""log-odds of showing the animal by its appearance, of one frame at any resolution"""
+"""log-odds of the animal's appearance in one frame, at any resolution"""
 
 
 def find_mover(
@@ -31,53 +31,53 @@ def find_mover(
     animal: AnimalConfig,
     hint: Hint | None,
     appearance: AppearanceOf | None = None,
-    apart: AppearanceOf | None = None,
+    margin_of: AppearanceOf | None = None,
 ) -> list[Sphere | None]:
-    """Track the animal of a session: a ball per frame, None where it is out of view.
+    """Track the animal of a session: a sphere per frame, None where it is out of view.
 
-    Without known appearance a hint holds only what hangs together with it; the rest of the track, which may
-    have gone over to another mover, is a guess. ``apart`` are log-odds against a home's other animals.
+    Without known appearance, only the part of the track connected to a hint is certain; the rest may have
+    switched to another mover and is presumed. ``margin_of`` gives log-odds against a home's other animals.
     """
     for share in movers.SURE_SHARES if appearance is None else (0.0,):
         found = [
-            _candidates(clip, frame, world_from_camera[frame], references, animal, (appearance, apart), share)
-            for frame in range(len(clip))
+            _candidates(clip, frame, pose, references, animal, (appearance, margin_of), share)
+            for frame, pose in enumerate(world_from_camera)
         ]
         choice = movers.track(found, clip.timestamp_s, animal, hint)
         chosen = [group[index] if index >= 0 else None for group, index in zip(found, choice, strict=True)]
         seen = np.array([candidate is not None for candidate in chosen])
         if appearance is not None:
-            surely = seen
+            reliable = seen
         elif hint is None:
-            surely = movers.self_moving(chosen, clip.timestamp_s, animal)
+            reliable = movers.self_moving(chosen, clip.timestamp_s, animal)
         else:
-            surely = movers.connected(chosen, clip.timestamp_s, animal, hint)
-        if surely.any():
+            reliable = movers.connected_to_hint(chosen, clip.timestamp_s, animal, hint)
+        if reliable.any():
             break
-    if hint is None and not surely.any():
-        surely = seen
-    radii = [candidate.radius_m for candidate, sure in zip(chosen, surely, strict=True) if candidate and sure]
-    radius = float(np.clip(REACH * np.quantile(radii, 0.9), MIN_REACH_M, animal.largest_m)) if radii else 0.0
-    balls = [
+    if hint is None and not reliable.any():
+        reliable = seen
+    radii = [each.radius_m for each, sure in zip(chosen, reliable, strict=True) if each and sure]
+    radius = float(np.clip(SCALE * np.quantile(radii, 0.9), MIN_RADIUS_M, animal.largest_m)) if radii else 0.0
+    spheres = [
         Sphere(candidate.centre_world, radius, presumed=not sure) if candidate else None
-        for candidate, sure in zip(chosen, surely, strict=True)
+        for candidate, sure in zip(chosen, reliable, strict=True)
     ]
-    return presume(balls, clip.timestamp_s)
+    return fill_gaps(spheres, clip.timestamp_s)
 
 
-def presume(balls: list[Sphere | None], timestamp_s: Float[np.ndarray, "frame"]) -> list[Sphere | None]:
-    """Fill short gaps of a track, and a while before and after it, by where the animal may still be."""
-    seen = np.array([frame for frame, ball in enumerate(balls) if ball is not None])
+def fill_gaps(spheres: list[Sphere | None], timestamp_s: Float[np.ndarray, "frame"]) -> list[Sphere | None]:
+    """Interpolate short gaps of a track and extend its ends for a while, as presumed spheres."""
+    seen = np.array([frame for frame, sphere in enumerate(spheres) if sphere is not None])
     if not len(seen):
-        return balls
-    centres = np.stack([balls[frame].centre_world for frame in seen])
+        return spheres
+    centres = np.stack([spheres[frame].centre_world for frame in seen])
     guess = np.stack([np.interp(timestamp_s, timestamp_s[seen], axis) for axis in centres.T], axis=1)
-    after = np.minimum(np.searchsorted(seen, np.arange(len(balls))), len(seen) - 1)
+    after = np.minimum(np.searchsorted(seen, np.arange(len(spheres))), len(seen) - 1)
     wait = np.abs(timestamp_s - timestamp_s[seen[[np.maximum(after - 1, 0), after]]]).min(0)
-    radius = balls[seen[0]].radius_m
+    radius = spheres[seen[0]].radius_m
     return [
-        ball or (Sphere(guess[frame], radius, presumed=True) if wait[frame] < movers.PRESUMED_S else None)
-        for frame, ball in enumerate(balls)
+        sphere or (Sphere(guess[frame], radius, presumed=True) if wait[frame] < movers.PRESUMED_S else None)
+        for frame, sphere in enumerate(spheres)
     ]
 
 
@@ -90,47 +90,48 @@ def _candidates(
     known: tuple[AppearanceOf | None, AppearanceOf | None],
     share: float,
 ) -> list[Candidate]:
-    """Group the points of one frame that move or, if its appearance is known, look rather like the animal.
+    """Group the points of one frame that move or, if the appearance is known, are likely the animal.
 
-    A known appearance leaves few points to judge, so all of them are: an animal may show no more than a paw
-    or an ear. ``known`` are its appearance and what distinguishes it from other animals, if any.
+    A known appearance leaves few points, so depth at edges counts too: only a paw or an ear may be visible.
+    ``known`` are the log-odds of its appearance and against other animals, if any.
     """
-    appearance, apart = known
+    appearance, margin_of = known
     wanted_px = COARSE_PX if appearance is None else FINE_PX
-    whole = free_space.inner_depth(clip, frame) if appearance is None else supported_depth(clip, frame)
+    whole = free_space.interior_depth(clip, frame) if appearance is None else supported_depth(clip, frame)
     points, area, chosen = free_space.sample(clip, frame, world_from_camera, whole, wanted_px)
     if appearance is not None:
-        like = sampled(appearance(frame), clip.depth_size, chosen)
-        area = np.where(like > -movers.CLEAR_MOTION, area, 0)
+        log_ratio = sample_nearest(appearance(frame), clip.depth_size, chosen)
+        area = np.where(log_ratio > -movers.CLEAR_MOTION, area, 0)
         points[area == 0] = np.nan
     votes = free_space.vote(references, points, frame)
     if appearance is None:
-        moving = solid(votes, share)
-        if apart is None:
+        moving = opened_motion(votes, share)
+        if margin_of is None:
             return movers.candidates(moving, np.ones(area.shape), points, area, animal)
-        own, probability = identity.of_one(moving, sampled(apart(frame), clip.depth_size, chosen))
+        margins = sample_nearest(margin_of(frame), clip.depth_size, chosen)
+        own, probability = identity.select_animal(moving, margins)
         return movers.candidates(own, probability, points, area, animal)
-    motion = movers.motion(votes)
-    settled = (votes.occupied > 0) & (motion == 0)
-    limited = np.clip(like, -movers.APPEARANCE_LIMIT, movers.APPEARANCE_LIMIT)
-    both = limited + motion - movers.SETTLED * settled
-    if apart is not None:
-        both += np.minimum(sampled(apart(frame), clip.depth_size, chosen), 0)
+    motion = movers.motion_log_odds(votes)
+    static = (votes.occupied > 0) & (motion == 0)
+    limited = np.clip(log_ratio, -movers.APPEARANCE_LIMIT, movers.APPEARANCE_LIMIT)
+    both = limited + motion - movers.STATIC_PENALTY * static
+    if margin_of is not None:
+        both += np.minimum(sample_nearest(margin_of(frame), clip.depth_size, chosen), 0)
     both[area == 0] = -movers.APPEARANCE_LIMIT
     return movers.candidates(both > 0, 1 / (1 + np.exp(-both)), points, area, animal)
 
 
-def solid(votes: Votes, share: float) -> Bool[np.ndarray, "row column"]:
-    """Return which samples surely move, but for what is thinner than `SOLID`."""
-    surely = movers.surely_moving(votes, share)
-    opened = cv2.dilate(cv2.erode(surely.astype(np.uint8), SOLID), SOLID[::-1, ::-1], anchor=(0, 0))
-    return surely & (opened > 0)
+def opened_motion(votes: Votes, share: float) -> Bool[np.ndarray, "row column"]:
+    """Return the surely moving samples after morphological opening."""
+    reliable = movers.surely_moving(votes, share)
+    opened = cv2.dilate(cv2.erode(reliable.astype(np.uint8), OPENING), OPENING[::-1, ::-1], anchor=(0, 0))
+    return reliable & (opened > 0)
 
 
-def sampled(
+def sample_nearest(
     picture: Shaped[np.ndarray, "height width"], size: tuple[int, int], chosen: tuple[slice, slice]
 ) -> Shaped[np.ndarray, "row column"]:
-    """Read a picture where the chosen pixels of a picture of another (height, width) lie."""
+    """Sample a picture at chosen pixels of a grid of another ``size`` (height, width), nearest neighbour."""
     sides = zip(size, picture.shape, chosen, strict=True)
     at = (((np.arange(side)[part] + 0.5) * (own / side)).astype(int) for side, own, part in sides)
     return picture[np.ix_(*at)]

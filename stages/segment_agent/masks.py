@@ -1,4 +1,4 @@
-"""Masks of one recording from its pictures alone: the steps of this stage in order."""
+"""Masks of one recording from its own pictures: the steps of this stage in order."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,51 +16,51 @@ from stages.segment_agent import free_space, movers, people
 from stages.segment_agent import prompt as prompts
 from stages.segment_agent.appearance import Appearance, Example, learn
 from stages.segment_agent.config import Config
-from stages.segment_agent.evidence import either, judge_motion
+from stages.segment_agent.evidence import motion_evidence, prefer_first
 from stages.segment_agent.follow import follow
 from stages.segment_agent.footage import Footage
 from stages.segment_agent.free_space import References
 from stages.segment_agent.locate import AppearanceOf, find_mover
 from stages.segment_agent.movers import Hint
-from stages.segment_agent.overlap import Shown
-from stages.segment_agent.painting import Mask, Painter, learn_palette
+from stages.segment_agent.overlap import Subject
 from stages.segment_agent.people import People
 from stages.segment_agent.prompt import Prompt
-from stages.segment_agent.refine import Palette
-from stages.segment_agent.resting import find_resting, rests
-from stages.segment_agent.trajectory import CameraPath, steady
-from stages.segment_agent.turnaround import EDGES, find_standing, meeting_point
-from stages.segment_agent.windows import Sphere, rectangle, working_picture, working_size
+from stages.segment_agent.refine import ColorHistogram
+from stages.segment_agent.resting import find_resting, is_resting
+from stages.segment_agent.segmenter import Mask, Segmenter, learn_color_histogram
+from stages.segment_agent.trajectory import CameraPath, estimate_trajectory
+from stages.segment_agent.turnaround import EDGES, axes_focus, find_standing
+from stages.segment_agent.windows import Sphere, project_sphere, working_size
 
-EMPTY_SHARE = 3
-"""times as many pictures with the animal as without it are learned from"""
-KNOWN_SHARE = 0.6
-"""of the animal that a network was shown, which it must find: one that learned too little would only veto"""
-GUESSED = 2.0
-"""times its size that the animal is looked for where its place is a guess, once its appearance is known"""
-STILL_STRIDE = 3
-"""pixels of depth between samples that decide where a frame without a track may show something that moves"""
+POSITIVES_PER_NEGATIVE = 3
+"""ratio of training pictures with the animal to those without it"""
+MIN_RECALL = 0.6
+"""minimum recall on training pictures: an undertrained network would suppress the animal"""
+GROWTH = 2.0
+"""factor on the search radius of presumed spheres, once the appearance is known"""
+STATIC_STRIDE = 3
+"""stride of depth samples that test a frame without a track for motion, pixels"""
 PROBES = 12
-"""frames that are looked at where a few suffice"""
-RIM = np.ones((5, 5), np.uint8)
-"""what may still be animal around what looks like it or moves, pixels or samples"""
+"""number of frames for checks for which a few suffice"""
+DILATION = np.ones((5, 5), np.uint8)
+"""dilation of what looks like the animal or moves, pixels or samples"""
 
 
 @dataclass(frozen=True)
 class Segmentation:
-    """What is found in a recording."""
+    """Masks of a recording and what they are based on."""
 
     masks: Iterator[Mask]
-    """One per frame, made as they are asked for."""
+    """One per frame, generated lazily."""
     path: CameraPath | None = None
     """Camera poses; None without depth."""
     walkers: People | None = None
     """People in a session with depth."""
     strangers: float | None = None
-    """Share of frames in which something moves about that is none of several animals."""
+    """Share of frames with a moving animal that is none of several known ones."""
     references: References | None = None
-    """Depth pictures that judge the masks; None without depth."""
-    shown: Shown = "mover"
+    """Depth pictures for checking the masks; None without depth."""
+    shown: Subject = "moving"
     """What the masks are of."""
 
 
@@ -72,10 +72,9 @@ def segment(
     config: Config,
     rng: np.random.Generator,
 ) -> Segmentation:
-    """Return one mask per frame, made as they are asked for, the poses they rest on, and people.
+    """Return one mask per frame, generated lazily, with the camera poses used, and people.
 
-    ``flow`` is the recording's flow folder. A recording without any depth is followed from its hint, with no
-    poses.
+    ``flow`` is the recording's flow folder. Without any depth, the hint is propagated; there are no poses.
 
     Raises:
         InputError: MSK-004 without depth and hint; MSK-002, MSK-003 where hint or cameras point at nothing.
@@ -87,160 +86,164 @@ def segment(
             remedy = "give a hint: one box around the animal in one frame (<recording>.prompt.toml)"
             raise InputError("MSK-004", what, str(clip.folder), remedy)
         return Segmentation(follow(Footage(clip, flow, config.height_px), hint, config.learning, rng))
-    path = steady(clip, flow, rng)
+    path = estimate_trajectory(clip, flow, rng)
     poses = path.world_from_camera
-    mark = None if hint is None else prompts.place(hint, clip, poses)
+    hint_world = None if hint is None else prompts.place(hint, clip, poses)
     match role:
         case "turnaround":
-            masks = _standing(clip, poses, mark, config).masks(range(len(clip)))
+            masks = _standing_segmenter(clip, poses, hint_world, config).masks(range(len(clip)))
             references = free_space.gather(clip, poses, config.references)
-            return Segmentation(masks, path, references=references, shown="rester")
+            return Segmentation(masks, path, references=references, shown="resting")
         case "session":
-            references, walkers = people.set_apart(clip, poses, config.references)
-            painter = _moving(clip, poses, references, mark, config, rng)
-            masks = people.hide(painter.masks(range(len(clip))), walkers, clip, poses)
-            shown = "mover" if mark is None else "rester"
+            references, walkers = people.gather_without_people(clip, poses, config.references)
+            segmenter = _session_segmenter(clip, poses, references, hint_world, config, rng)
+            masks = people.hide(segmenter.masks(range(len(clip))), walkers, clip, poses)
+            shown = "moving" if hint_world is None else "resting"
             return Segmentation(masks, path, walkers, references=references, shown=shown)
         case _:
             assert_never(role)
 
 
-def painter_of_turnaround(clip: Clip, flow: Path, config: Config, rng: np.random.Generator) -> Painter:
-    """Prepare the masks of a turnaround without a hint; raises MSK-003 as `segment` does."""
-    return _standing(clip, steady(clip, flow, rng).world_from_camera, None, config)
+def turnaround_segmenter(clip: Clip, flow: Path, config: Config, rng: np.random.Generator) -> Segmenter:
+    """Prepare the masks of a turnaround without a hint. Raises InputError MSK-003 as `segment` does."""
+    return _standing_segmenter(clip, estimate_trajectory(clip, flow, rng).world_from_camera, None, config)
 
 
-def _standing(
-    clip: Clip, poses: Float[np.ndarray, "frame 4 4"], mark: Hint | None, config: Config
-) -> Painter:
-    """Prepare the masks of a turnaround: what stands on the ground where all cameras look."""
-    focus = meeting_point(poses) if mark is None else mark.centre_world
-    balls, judge = find_standing(clip, poses, focus)
-    painter = Painter(clip, poses, balls, judge, config.height_px, Palette(), EDGES)
-    return replace(painter, appearance=learn_palette(painter))
+def _standing_segmenter(
+    clip: Clip, poses: Float[np.ndarray, "frame 4 4"], hint_world: Hint | None, config: Config
+) -> Segmenter:
+    """Prepare the masks of a turnaround: what stands on the ground where the optical axes meet."""
+    focus = axes_focus(poses) if hint_world is None else hint_world.centre_world
+    spheres, evidence_of = find_standing(clip, poses, focus)
+    segmenter = Segmenter(clip, poses, spheres, evidence_of, config.height_px, ColorHistogram(), EDGES)
+    return replace(segmenter, appearance=learn_color_histogram(segmenter))
 
 
-def _moving(
+def _session_segmenter(
     clip: Clip,
     poses: Float[np.ndarray, "frame 4 4"],
     references: References,
-    mark: Hint | None,
+    hint_world: Hint | None,
     config: Config,
     rng: np.random.Generator,
-) -> Painter:
-    """Prepare the masks of a session: motion first, then the appearance that it teaches, then both."""
-    balls = find_mover(clip, poses, references, config.animal, mark)
-    judge, resting = judge_motion(references), None
-    held = any(ball is not None and not ball.presumed for ball in balls)
-    if mark is not None and (not held or rests(clip, poses, references, mark)):
-        balls, resting = find_resting(clip, poses, mark, config.height_px, rng)
-        judge = resting
-    painter = Painter(clip, poses, balls, judge, config.height_px, Palette())
-    painter = replace(painter, appearance=learn_palette(painter))
-    network = learn_appearance(painter, references, config, rng)
+) -> Segmenter:
+    """Prepare the masks of a session: by motion, from which appearance is learned, then by both."""
+    spheres = find_mover(clip, poses, references, config.animal, hint_world)
+    evidence_of, resting = motion_evidence(references), None
+    held = any(_certain(sphere) for sphere in spheres)
+    if hint_world is not None and (not held or is_resting(clip, poses, references, hint_world)):
+        spheres, resting = find_resting(clip, poses, hint_world, config.height_px, rng)
+        evidence_of = resting
+    segmenter = Segmenter(clip, poses, spheres, evidence_of, config.height_px, ColorHistogram())
+    segmenter = replace(segmenter, appearance=learn_color_histogram(segmenter))
+    network = learn_appearance(segmenter, references, config, rng)
     if network is None:
-        return painter
-    room = free_space.without(references, lambda frame: hidden(painter, frame, network))
-    found = find_mover(clip, poses, room, config.animal, mark, appearance_of(painter, network))
-    balls = resized(found, balls)
-    judge = judge_motion(room) if resting is None else either(resting, judge_motion(room))
-    return Painter(clip, poses, balls, judge, config.height_px, network)
+        return segmenter
+    room = free_space.masked(references, lambda frame: occlusion_mask(segmenter, frame, network))
+    found = find_mover(clip, poses, room, config.animal, hint_world, appearance_of(segmenter, network))
+    spheres = with_motion_radius(found, spheres)
+    evidence_of = motion_evidence(room) if resting is None else prefer_first(resting, motion_evidence(room))
+    return Segmenter(clip, poses, spheres, evidence_of, config.height_px, network)
 
 
-def resized(balls: list[Sphere | None], first: list[Sphere | None]) -> list[Sphere | None]:
-    """Give the balls of a track by appearance the size that motion alone found: furniture may touch it."""
-    radius_m = next(ball.radius_m for ball in first if ball is not None)
-    return [ball and replace(ball, radius_m=radius_m * (GUESSED if ball.presumed else 1)) for ball in balls]
+def with_motion_radius(spheres: list[Sphere | None], first: list[Sphere | None]) -> list[Sphere | None]:
+    """Give spheres tracked by appearance the radius found by motion alone: furniture may touch the animal."""
+    radius_m = next(sphere.radius_m for sphere in first if sphere is not None)
+    return [each and replace(each, radius_m=radius_m * (GROWTH if each.presumed else 1)) for each in spheres]
 
 
-def appearance_of(painter: Painter, network: Appearance) -> AppearanceOf:
+def appearance_of(segmenter: Segmenter, network: Appearance) -> AppearanceOf:
     """Return the log-odds of a network at working resolution, frame by frame."""
-    return lambda frame: network.log_odds(painter.working_picture(frame))
+    return lambda frame: network.log_odds(segmenter.working_picture(frame))
 
 
 @dataclass(frozen=True)
-class Known:
-    """What other recordings showed of an animal."""
+class KnownAppearance:
+    """The appearance of an animal in other recordings."""
 
     examples: Sequence[Example]
     """pictures of it"""
     recognized: AppearanceOf
-    """log-odds of its appearance there; near where it is tracked, what is recognized is not taken for room"""
+    """log-odds of that appearance; near the track, what is recognized is unknown rather than background"""
 
 
 def learn_appearance(
-    painter: Painter,
+    segmenter: Segmenter,
     references: References,
     config: Config,
     rng: np.random.Generator,
-    known: Known | None = None,
+    known: KnownAppearance | None = None,
 ) -> Appearance | None:
-    """Learn the appearance of animal and room from first masks and from what is known of other recordings.
+    """Train the appearance network on first masks, and on examples from other recordings if there are any.
 
-    None where the animal is never seen, or not learned well enough to judge.
+    None if the animal is never seen, or recall is too low.
     """
-    seen = np.array([frame for frame, ball in enumerate(painter.balls) if _certain(ball)])
+    seen = np.array([frame for frame, sphere in enumerate(segmenter.spheres) if _certain(sphere)])
     if not len(seen):
         return None
     chosen = seen[subsampling.evenly(len(seen), config.learning.examples, rounded=True)]
     shown = []
     for frame in chosen.tolist():
-        labels = painter.working_mask(frame).labels
+        labels = segmenter.working_mask(frame).labels
         if known is not None:
-            unsure = (labels == 0) & _sought(painter, frame, labels.shape) & (known.recognized(frame) > 0)
+            sought = _window(segmenter, frame, labels.shape)
+            unsure = (labels == 0) & sought & (known.recognized(frame) > 0)
             labels = np.where(unsure, np.uint8(128), labels)
-        shown.append(Example(painter.working_picture(frame), labels))
-    empty = [frame for frame, ball in enumerate(painter.balls) if not _certain(ball)]
+        shown.append(Example(segmenter.working_picture(frame), labels))
+    empty = [frame for frame, sphere in enumerate(segmenter.spheres) if not _certain(sphere)]
     room = [
-        Example(working_picture(painter.clip, frame, painter.height_px), _still(painter, references, frame))
-        for frame in empty[:: max(1, -(-len(empty) * EMPTY_SHARE // len(shown)))]
+        Example(segmenter.working_picture(frame), _label_room(segmenter, references, frame))
+        for frame in empty[:: max(1, -(-len(empty) * POSITIVES_PER_NEGATIVE // len(shown)))]
     ]
     elsewhere = () if known is None else known.examples
     network = learn([*shown, *elsewhere], config.learning, rng, room=room)
-    if network is None or not _knows(network, shown[:: max(1, len(shown) // PROBES)]):
+    if network is None or not _finds_animal(network, shown[:: max(1, len(shown) // PROBES)]):
         return None
     return network
 
 
-def _still(painter: Painter, references: References, frame: int) -> UInt8[np.ndarray, "height width"]:
-    """Label a frame in which nothing was tracked: room, but for what may move unnoticed, which is unknown.
+def _label_room(
+    segmenter: Segmenter, references: References, frame: int
+) -> UInt8[np.ndarray, "height width"]:
+    """Label a frame without a track: background, except for what moves, which is unknown.
 
-    An animal that rests unnoticed is outvoted by the frames in which it moves.
+    An undetected resting animal is outweighed by the frames in which it moves.
     """
-    clip, pose = painter.clip, painter.world_from_camera[frame]
-    points = free_space.points_of(clip, frame, pose, free_space.steady_depth(clip, frame), STILL_STRIDE)
+    clip, pose = segmenter.clip, segmenter.world_from_camera[frame]
+    points = free_space.world_points(clip, frame, pose, free_space.clean_depth(clip, frame), STATIC_STRIDE)
     moving = movers.moving(free_space.vote(references, points, frame))
-    size, near = working_size(clip, painter.height_px), cv2.dilate(moving.astype(np.uint8), RIM)
+    size, near = working_size(clip, segmenter.height_px), cv2.dilate(moving.astype(np.uint8), DILATION)
     return cv2.resize(near, size[::-1], interpolation=cv2.INTER_NEAREST) * np.uint8(128)
 
 
-def _certain(ball: Sphere | None) -> bool:
-    return ball is not None and not ball.presumed
+def _certain(sphere: Sphere | None) -> bool:
+    return sphere is not None and not sphere.presumed
 
 
-def _knows(network: Appearance, examples: list[Example]) -> bool:
-    """Return whether a network finds most of the animal that it was shown."""
+def _finds_animal(network: Appearance, examples: list[Example]) -> bool:
+    """Return whether the network's recall on its training examples is high enough."""
     shown = [
         (network.log_odds(each.color)[each.labels == 255] > 0).mean()
         for each in examples
         if (each.labels == 255).any()
     ]
-    return bool(shown) and float(np.mean(shown)) > KNOWN_SHARE
+    return bool(shown) and float(np.mean(shown)) > MIN_RECALL
 
 
-def hidden(painter: Painter, frame: int, network: Appearance) -> Bool[np.ndarray, "height width"]:
-    """Mark where the animal, by its appearance, hides the room: near where it was seen to move, if it was."""
-    color = painter.working_picture(frame)
-    like = network.log_odds(color) > 0
-    if _certain(painter.balls[frame]):
-        like &= _sought(painter, frame, color.shape[:2])
-    return cv2.dilate(like.astype(np.uint8), RIM) > 0
+def occlusion_mask(segmenter: Segmenter, frame: int, network: Appearance) -> Bool[np.ndarray, "height width"]:
+    """Mark where the animal, by its appearance, occludes the room; near its track, if it was seen to move."""
+    color = segmenter.working_picture(frame)
+    shown = network.log_odds(color) > 0
+    if _certain(segmenter.spheres[frame]):
+        shown &= _window(segmenter, frame, color.shape[:2])
+    return cv2.dilate(shown.astype(np.uint8), DILATION) > 0
 
 
-def _sought(painter: Painter, frame: int, size: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
-    """Mark the rectangle in which the animal is looked for."""
-    inside, ball = np.zeros(size, bool), painter.balls[frame]
-    if ball is not None:
-        rows, columns = rectangle(painter.clip, frame, painter.world_from_camera[frame], ball, size)
+def _window(segmenter: Segmenter, frame: int, size: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
+    """Mark the search window: the bounding rectangle of the frame's sphere."""
+    inside, sphere = np.zeros(size, bool), segmenter.spheres[frame]
+    if sphere is not None:
+        pose = segmenter.world_from_camera[frame]
+        rows, columns = project_sphere(segmenter.clip, frame, pose, sphere, size)
         inside[rows, columns] = True
     return inside

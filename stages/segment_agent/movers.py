@@ -1,7 +1,7 @@
-"""Track the one animal-sized mover of a recording through its candidates, frame by frame.
+"""Track the one animal-sized moving object of a recording.
 
-`candidates` groups points that other frames saw through; `track` chooses at most one group a frame by dynamic
-programming over size, evidence and speed, looking at the whole recording at once.
+`candidates` groups points that other frames saw through; `track` chooses at most one group per frame by the
+Viterbi algorithm over size, evidence and speed, globally over the recording.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,37 +17,37 @@ from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.free_space import Votes
 
 HINT_REWARD, HINT_SLACK_M = 1000.0, 0.2
-"""outweighs everything else; how far beside a candidate a hint may lie"""
+"""score of a hinted candidate, above all else; tolerated distance of the hint from it"""
 SURE_SHARES = (1.0, 0.3)
-"""references that must have seen through a point to learn from it, as a share of those that saw a surface
-there; the second where nothing goes anywhere by the first"""
+"""references that must have seen through a point for training, as a share of those that saw a surface there;
+the second is used if nothing travels by the first"""
 TRAVEL_M = 0.2
-"""way that something must go by itself to be an animal beyond doubt: what people moved stays where it is"""
-FREE_M = 0.1
-"""how far a candidate's centre may jump without motion: another part of the animal is seen"""
+"""distance that a mover must travel to be certainly an animal: things moved by people stay in place"""
+JUMP_M = 0.1
+"""free jump of a candidate's centre: another part of the animal may be seen"""
 EXCESS_M = 0.3
-"""way beyond the fastest that costs as much as a convincing candidate is worth"""
+"""excess distance whose cost equals the score of a full candidate"""
 MIN_VOTES, MIN_SHARE = 2, 0.05
-"""references that must have seen through a point, and more as a share of those that saw a surface there"""
+"""votes for a moving point: references that saw through it, plus a share of those that saw a surface there"""
 MIN_AREA_M2, MIN_PIXELS = 0.003, 6
-"""smallest visible area of a candidate, the head of a cat; samples that chance does not bring together"""
-LIKELY_AREA_M2 = 0.03
-"""visible area from which on a candidate is fully convincing: a third of a cat from the side"""
+"""smallest visible area of a candidate, the head of a cat; fewest samples of a group"""
+FULL_SCORE_AREA_M2 = 0.03
+"""visible area of a candidate with full score: a third of a cat from the side"""
 CANDIDATES = 6
 """groups kept per frame"""
 PRESUMED_S = 3.0
-"""how long the animal is looked for around where it was last or will next be seen"""
+"""time for which the animal is presumed near its last or next known place"""
 ABSENT_S = 0.5
-"""absence after which a track is not trusted to go on with what a hint points at"""
+"""absence that splits a track"""
 MOTION, CLEAR_MOTION = 2.0, 3.0
-"""log-odds by which motion speaks for a point once the appearance is known; more where clearly more
-references saw through it than saw a surface there"""
-SETTLED = 1.0
-"""log-odds by which a surface that other frames saw speaks against it then"""
+"""log-odds of a moving point once the appearance is known; the second where clearly more references saw
+through it than saw a surface there"""
+STATIC_PENALTY = 1.0
+"""log-odds against a static surface once the appearance is known"""
 APPEARANCE_LIMIT = 3.0
-"""largest log-odds of the appearance there"""
+"""limit on the appearance's log-odds beside motion"""
 APPEAR_COST = 2.0
-"""cost of leaving or entering the view, in units of a convincing candidate"""
+"""cost of leaving or entering the view, in full candidate scores"""
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ class Candidate:
     centre_world: Float[np.ndarray, "3"]
     area_m2: float
     radius_m: float
-    """distance from the centre that holds 95 % of the points"""
-    conviction: float = 1.0
+    """95th percentile of the points' distances from the centre"""
+    probability: float = 1.0
     """mean probability of its points"""
 
 
@@ -69,7 +69,7 @@ class Hint:
     frame: int
     centre_world: Float[np.ndarray, "3"]
     reach_m: float = 0.5
-    """how far from there the animal reaches; a click leaves it open"""
+    """extent of the animal around that point; the default for a click"""
 
 
 def moving(votes: Votes) -> Bool[np.ndarray, "*shape"]:
@@ -78,22 +78,22 @@ def moving(votes: Votes) -> Bool[np.ndarray, "*shape"]:
 
 
 def surely_moving(votes: Votes, share: float) -> Bool[np.ndarray, "*shape"]:
-    """Return which points lie in space that is free at a good share of other times: enough to learn from."""
+    """Return which points lie in space that is free at a good share of other times, for training."""
     return (votes.free > MIN_VOTES) & (votes.free >= share * votes.occupied)
 
 
 def clearly_moving(votes: Votes) -> Bool[np.ndarray, "*shape"]:
-    """Return which points clearly more references saw through than saw a surface there."""
+    """Return points that clearly more references saw through than saw a surface at."""
     return votes.free - votes.occupied > MIN_VOTES
 
 
-def motion(votes: Votes) -> Float[np.ndarray, "*shape"]:
-    """Return the log-odds by which points that move speak for an animal of known appearance; else 0."""
+def motion_log_odds(votes: Votes) -> Float[np.ndarray, "*shape"]:
+    """Return the log-odds of moving points, for an animal of known appearance; 0 elsewhere."""
     return np.where(moving(votes), np.where(clearly_moving(votes), CLEAR_MOTION, MOTION), 0.0)
 
 
-def groups(is_moving: Bool[np.ndarray, "height width"]) -> Iterator[Bool[np.ndarray, "height width"]]:
-    """Return the groups of moving pixels that nearly touch, larger than what chance brings together."""
+def components(is_moving: Bool[np.ndarray, "height width"]) -> Iterator[Bool[np.ndarray, "height width"]]:
+    """Yield the connected components of the dilated moving pixels, without tiny ones."""
     closed = cv2.dilate(is_moving.astype(np.uint8), np.ones((3, 3), np.uint8))
     count, label = cv2.connectedComponents(closed, connectivity=8)
     for index in range(1, count):
@@ -109,9 +109,9 @@ def candidates(
     area_m2: Float[np.ndarray, "height width"],
     animal: AnimalConfig,
 ) -> list[Candidate]:
-    """Group moving pixels that touch, largest area first; ``area_m2`` is what each covers at its distance."""
+    """Group moving pixels, largest area first; ``area_m2`` is the area of each pixel at its distance."""
     found = []
-    for own in groups(is_moving):
+    for own in components(is_moving):
         area = float(area_m2[own].sum())
         if area < MIN_AREA_M2:
             continue
@@ -131,11 +131,11 @@ def track(
 ) -> Int[np.ndarray, "frame"]:
     """Choose one candidate per frame (-1: none in view) by the Viterbi algorithm over scores and speeds.
 
-    A hint outweighs everything else in its frame.
+    In its frame, a hint outweighs everything else.
     """
     scores = [np.array([0.0] + [_score(candidate, animal) for candidate in group]) for group in found]
     if hint is not None and hint.frame in range(len(found)):
-        scores[hint.frame][1:] += [HINT_REWARD * _meant(candidate, hint) for candidate in found[hint.frame]]
+        scores[hint.frame][1:] += [HINT_REWARD * _hinted(candidate, hint) for candidate in found[hint.frame]]
     scores[0][1:] -= APPEAR_COST
 
     def change(index: int) -> Float[np.ndarray, "before after"]:
@@ -145,83 +145,82 @@ def track(
     return viterbi.viterbi_decode([-score for score in scores], change) - 1
 
 
-def connected(
+def connected_to_hint(
     chosen: Sequence[Candidate | None],
     timestamp_s: Float[np.ndarray, "frame"],
     animal: AnimalConfig,
     hint: Hint,
 ) -> Bool[np.ndarray, "frame"]:
-    """Return in which frames a track surely has what a hint points at: nowhere on the way there it is absent
-    or faster than an animal. Nowhere if it is elsewhere at the time of the hint."""
+    """Return the frames of the track segment that contains the hint; none if the track misses the hint."""
     seen = np.array([frame for frame, candidate in enumerate(chosen) if candidate is not None], int)
-    surely = np.zeros(len(chosen), bool)
+    reliable = np.zeros(len(chosen), bool)
     wait_s = np.abs(timestamp_s[seen] - timestamp_s[hint.frame])
     nearest = chosen[int(seen[wait_s.argmin()])] if len(seen) else None
-    if nearest is None or wait_s.min() > ABSENT_S or not _meant(nearest, hint):
-        return surely
-    piece = pieces(chosen, seen, timestamp_s, animal)
-    surely[seen[piece == piece[wait_s.argmin()]]] = True
-    return surely
+    if nearest is None or wait_s.min() > ABSENT_S or not _hinted(nearest, hint):
+        return reliable
+    segment = split_track(chosen, seen, timestamp_s, animal)
+    reliable[seen[segment == segment[wait_s.argmin()]]] = True
+    return reliable
 
 
-def pieces(
+def split_track(
     chosen: Sequence[Candidate | None],
     seen: Int[np.ndarray, "seen"],
     timestamp_s: Float[np.ndarray, "frame"],
     animal: AnimalConfig,
 ) -> Int[np.ndarray, "seen"]:
-    """Number the pieces of a track between absences and jumps."""
+    """Number the segments of a track between absences and jumps."""
     gap_s = np.diff(timestamp_s[seen])
     apart_m = np.linalg.norm(np.diff([chosen[frame].centre_world for frame in seen], axis=0), axis=1)
-    jump = (gap_s > ABSENT_S) | (apart_m > FREE_M + animal.speed_m_s * gap_s)
+    jump = (gap_s > ABSENT_S) | (apart_m > JUMP_M + animal.speed_m_s * gap_s)
     return np.cumsum(np.r_[False, jump])
 
 
 def self_moving(
     chosen: Sequence[Candidate | None], timestamp_s: Float[np.ndarray, "frame"], animal: AnimalConfig
 ) -> Bool[np.ndarray, "frame"]:
-    """Return in which frames a track surely has an animal: in pieces that last and go somewhere.
+    """Return the frames of track segments that last and travel, which certainly show an animal.
 
-    Things that people put elsewhere, and rims that misalignment makes seem to move, stay in place or flash.
+    Things moved by people stay in place; edges that seem to move by misalignment are brief.
     """
     seen = np.array([frame for frame, candidate in enumerate(chosen) if candidate is not None], int)
-    surely = np.zeros(len(chosen), bool)
+    reliable = np.zeros(len(chosen), bool)
     if not len(seen):
-        return surely
-    piece = pieces(chosen, seen, timestamp_s, animal)
-    for number in range(piece[-1] + 1):
-        own = seen[piece == number]
+        return reliable
+    segment = split_track(chosen, seen, timestamp_s, animal)
+    for number in range(segment[-1] + 1):
+        own = seen[segment == number]
         if timestamp_s[own[-1]] - timestamp_s[own[0]] < ABSENT_S:
             continue
         centre = np.array([chosen[frame].centre_world for frame in own])
         centre = scipy.ndimage.median_filter(centre, (5, 1), mode="nearest")
         if np.linalg.norm(np.ptp(centre, axis=0)) > TRAVEL_M:
-            surely[own] = True
-    return surely
+            reliable[own] = True
+    return reliable
 
 
-def _meant(candidate: Candidate, hint: Hint) -> bool:
-    """Return whether a hint may point at a candidate."""
+def _hinted(candidate: Candidate, hint: Hint) -> bool:
+    """Return whether a hint lies at a candidate."""
     return bool(
         np.linalg.norm(candidate.centre_world - hint.centre_world) < candidate.radius_m + HINT_SLACK_M
     )
 
 
 def _score(candidate: Candidate, animal: AnimalConfig) -> float:
-    """Reward area up to a convincing one; half if larger than an animal, none if doubtful."""
-    reward = max(2 * candidate.conviction - 1, 0) * min(candidate.area_m2 / LIKELY_AREA_M2, 1.0) ** 0.5
+    """Score a candidate by area and probability; half if larger than an animal."""
+    reward = max(2 * candidate.probability - 1, 0) * min(candidate.area_m2 / FULL_SCORE_AREA_M2, 1.0) ** 0.5
     return reward * (0.5 if candidate.radius_m > animal.largest_m / 2 else 1.0)
 
 
 def _transition(
     before: Sequence[Candidate], after: Sequence[Candidate], seconds: float, animal: AnimalConfig
 ) -> Float[np.ndarray, "from to"]:
-    """Reward of going from each state to each; state 0 is absence."""
+    """Return transition scores between states; state 0 is absence."""
     step = np.full((len(before) + 1, len(after) + 1), -APPEAR_COST)
     step[0, 0] = 0.0
     if before and after:
         first, second = (np.stack([each.centre_world for each in group]) for group in (before, after))
-        apart = np.linalg.norm(first[:, None] - second[None], axis=-1)
-        excess = np.maximum(apart - FREE_M - animal.speed_m_s * seconds, 0) / EXCESS_M
+        distance_m = np.linalg.norm(first[:, None] - second[None], axis=-1)
+        excess = np.maximum(distance_m - JUMP_M - animal.speed_m_s * seconds, 0) / EXCESS_M
         step[1:, 1:] = -np.minimum(excess, 2 * APPEAR_COST)
     return step

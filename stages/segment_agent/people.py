@@ -1,7 +1,7 @@
-"""People who walk about in a recording: upright movers, larger than an animal. None of them is the animal.
+"""People who walk through a recording: upright movers, taller than an animal.
 
-`find_people` tracks them through the whole recording; `People.near` says which points are theirs, so that
-neither the animal's track nor its appearance is learned from somebody's legs.
+`find_people` tracks them through the whole recording; `People.near` tells which points are theirs, so that
+neither the animal's track nor its appearance includes their legs.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -20,29 +20,29 @@ from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.free_space import References
 from stages.segment_agent.locate import COARSE_PX
 from stages.segment_agent.movers import Candidate
-from stages.segment_agent.painting import Mask
+from stages.segment_agent.segmenter import Mask
 
 UPRIGHT_M = 0.9
-"""vertical extent that no animal of a home has and that a person who is not cut off has"""
-MIN_M = 0.4
-"""vertical extent from which on a mover may be the legs of somebody who was seen whole before or after"""
-SLENDER = 1.2
-"""how much higher than wide somebody upright is at least"""
+"""minimum vertical extent of a fully visible person; pets are lower"""
+MIN_HEIGHT_M = 0.4
+"""minimum vertical extent of a partly visible person, such as legs"""
+MIN_ASPECT = 1.2
+"""minimum ratio of height to width of a person"""
 MIN_UPRIGHT_FRAMES = 4
 """frames in which a track must be as high as a person"""
 MAX_PEOPLE = 3
 BODY_RADIUS_M = 0.125
-"""how far the body's axis lies behind what is seen of it: half the depth of a chest"""
+"""distance of the body axis behind the visible surface: half the depth of a chest"""
 REACH_M = 0.45
-"""horizontal distance from a person's axis within which points are his or hers"""
+"""horizontal distance from a person's axis within which points belong to the person"""
 FLOOR_QUANTILE, ABOVE_FLOOR_M = 0.05, 0.06
-"""quantile of the heights of all depth that is taken for the floor, and how far above it people begin"""
-RIM = np.ones((5, 5), np.uint8)
-"""what may still be a person around what is, pixels of depth"""
-WALK_M_S = 1.5
-"""how fast people walk in a room"""
+"""quantile of point heights that is taken as the floor, and least height of a person's points above it"""
+DILATION = np.ones((5, 5), np.uint8)
+"""dilation of people, depth pixels"""
+WALKING_M_S = 1.5
+"""walking speed of people in a room"""
 WALKER = AnimalConfig(largest_m=4.0, speed_m_s=2.5)
-"""size and speed of people, for the track"""
+"""size and speed of people, for tracking"""
 
 
 @dataclass(frozen=True)
@@ -95,20 +95,20 @@ def find_people(
             axis[frame] = mover.candidate.centre_world[[0, 2]]
             tops += [mover.top_m] if mover.whole else []
             found[frame].remove(mover)
-        axes.append(_bridged(axis, clip.timestamp_s))
+        axes.append(_fill_gaps(axis, clip.timestamp_s))
         heights.append(float(np.quantile(tops, 0.9)) - floor_m if len(tops) >= MIN_UPRIGHT_FRAMES else np.nan)
     return People(np.array(axes).reshape(-1, len(clip), 2), np.array(heights, float), floor_m)
 
 
-def set_apart(
+def gather_without_people(
     clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], count: int
 ) -> tuple[References, People]:
-    """Gather ``count`` references by which people are found, and which then ignore their motion."""
+    """Gather ``count`` references, find people by them, and make the references ignore people's motion."""
     references = free_space.gather(clip, world_from_camera, count)
     walkers = find_people(clip, world_from_camera, references)
     for axis, height_m in zip(walkers.axis_world, walkers.height_m, strict=True):
         tall = "" if np.isnan(height_m) else f", {height_m:.2f} m tall"
-        log(f"somebody walks here, seen in {np.isfinite(axis[:, 0]).sum()} of {len(clip)} frames{tall}")
+        log(f"a person walks here, seen in {np.isfinite(axis[:, 0]).sum()} of {len(clip)} frames{tall}")
     return replace(references, ignored=walkers.near if len(walkers.axis_world) else None), walkers
 
 
@@ -128,18 +128,18 @@ class UprightMover:
 def _upright(
     clip: Clip, frame: int, world_from_camera: Float[np.ndarray, "4 4"], references: References
 ) -> tuple[list[UprightMover], Float[np.ndarray, "height"]]:
-    """Group the moving points of a frame, and keep what is upright; and return the height of low surfaces."""
-    inner = free_space.inner_depth(clip, frame)
+    """Return the upright groups of moving points of a frame, and the height of low surfaces."""
+    inner = free_space.interior_depth(clip, frame)
     points, area, _ = free_space.sample(clip, frame, world_from_camera, inner, COARSE_PX)
     heights = points[area > 0, 1]
     low = np.quantile(heights, [FLOOR_QUANTILE]) if len(heights) else np.zeros(0)
     moving = movers.moving(free_space.vote(references, points, frame))
     found = []
-    for own in movers.groups(moving):
+    for own in movers.components(moving):
         group = points[own]
         bottom, top = np.quantile(group[:, 1], [0.02, 0.98])
         width = np.ptp(np.quantile(group[:, [0, 2]], [0.1, 0.9], axis=0), axis=0).max()
-        if top - bottom < max(MIN_M, SLENDER * width):
+        if top - bottom < max(MIN_HEIGHT_M, MIN_ASPECT * width):
             continue
         centre = np.median(group, axis=0)
         away = (centre - world_from_camera[:3, 3]) * [1, 0, 1]
@@ -154,14 +154,14 @@ def _upright(
 def _persistent(
     picked: Sequence[UprightMover | None], timestamp_s: Float[np.ndarray, "frame"]
 ) -> Bool[np.ndarray, "frame"]:
-    """Return in which frames a track surely has a person: in pieces that are as high as one often enough, and
-    in those soon before or after them that the same person can have walked to."""
+    """Return the frames of a track that certainly show a person: segments that are often tall enough, and
+    neighbouring segments that the same person can have reached."""
     seen = np.array([frame for frame, mover in enumerate(picked) if mover is not None], int)
     person = np.zeros(len(picked), bool)
     if not len(seen):
         return person
-    piece = movers.pieces([mover and mover.candidate for mover in picked], seen, timestamp_s, WALKER)
-    own = [seen[piece == number] for number in range(piece[-1] + 1)]
+    segment = movers.split_track([mover and mover.candidate for mover in picked], seen, timestamp_s, WALKER)
+    own = [seen[segment == number] for number in range(segment[-1] + 1)]
     tall = np.array([mover is not None and mover.extent_m > UPRIGHT_M for mover in picked])
     is_person = [int(tall[frames].sum()) >= MIN_UPRIGHT_FRAMES for frames in own]
     place = np.array([[np.nan] * 3 if mover is None else mover.candidate.centre_world for mover in picked])
@@ -175,16 +175,16 @@ def _persistent(
 
 
 def _reachable(place_world: Float[np.ndarray, "2 3"], timestamp_s: Float[np.ndarray, "2"]) -> bool:
-    """Return whether a person can have walked from one place to another, and had no time to leave between."""
+    """Return whether a person can have walked from one place to another within a short gap."""
     gap_s = abs(float(timestamp_s[1] - timestamp_s[0]))
     off_m = float(np.linalg.norm((place_world[1] - place_world[0])[[0, 2]]))
-    return gap_s < movers.PRESUMED_S and off_m < movers.FREE_M + REACH_M + WALK_M_S * gap_s
+    return gap_s < movers.PRESUMED_S and off_m < movers.JUMP_M + REACH_M + WALKING_M_S * gap_s
 
 
-def _bridged(
+def _fill_gaps(
     axis: Float[np.ndarray, "frame 2"], timestamp_s: Float[np.ndarray, "frame"]
 ) -> Float[np.ndarray, "frame 2"]:
-    """Cross short gaps of a track, in which a person stood still or in front of nothing that was seen."""
+    """Interpolate short gaps of a track, in which a person stood still or before unknown depth."""
     seen = np.isfinite(axis[:, 0])
     filled = np.stack([np.interp(timestamp_s, timestamp_s[seen], axis[seen, k]) for k in range(2)], axis=-1)
     short = subsampling.within_short_gaps(timestamp_s[seen], timestamp_s, movers.ABSENT_S)
@@ -194,13 +194,13 @@ def _bridged(
 def hide(
     masks: Iterable[Mask], people: People, clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]
 ) -> Iterator[Mask]:
-    """Mark people as unknown in the masks of all frames: neither the animal nor the room."""
+    """Mark people as unknown in all masks: neither animal nor background."""
     for frame, mask in enumerate(masks):
         if not np.isfinite(people.axis_world[:, frame]).any():
             yield mask
             continue
-        points = free_space.points_of(clip, frame, world_from_camera[frame], clip.depth(frame), 1)
+        points = free_space.world_points(clip, frame, world_from_camera[frame], clip.depth(frame), 1)
         theirs = people.near(frame, points)
-        theirs = cv2.dilate(theirs.astype(np.uint8), RIM)
+        theirs = cv2.dilate(theirs.astype(np.uint8), DILATION)
         theirs = cv2.resize(theirs, mask.labels.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
         yield replace(mask, labels=np.where(theirs & (mask.labels == 0), np.uint8(128), mask.labels))

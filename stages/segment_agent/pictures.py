@@ -1,4 +1,4 @@
-"""What the report shows of masks: overlays, the mask's area over time, and figures with thresholds."""
+"""Quality page of masks: overlays, the mask's area over time, and checks with thresholds."""
 
 from pathlib import Path
 
@@ -14,10 +14,10 @@ from stages.segment_agent.masks import Segmentation
 from stages.segment_agent.writing import Summary
 
 LOW_CONFIDENCE = 0.75
-"""probability below which presence is a guess"""
+"""probability below which presence is uncertain"""
 RIGHT_IOU, WRONG_IOU = 0.75, 0.6
-"""mean IoU that `evaluate` asks for, and an estimate that right masks never had: on nine sessions they are
-at most 0.07 off, wrong ones up to 0.14 too high and 0.22 too low"""
+"""mean IoU that `evaluate` requires, and an estimate below that of all good masks: on nine sessions their
+estimates are at most 0.07 off, those of bad masks up to 0.14 too high and 0.22 too low"""
 GREEN, BLUE = (60, 255, 90), (60, 90, 255)
 CAPTIONS = {
     "overlay": "masks over frames: outline green, unknown blue",
@@ -44,7 +44,7 @@ def contact_sheet(
 
 
 def area_jumps(area: Float[np.ndarray, "frame"]) -> float:
-    """Return how often its area doubles, halves, begins or ends, as a share of neighbors that show it."""
+    """Return the share of frame steps at which the area more than doubles, halves, starts or ends."""
     both = np.maximum(np.stack([area[:-1], area[1:]]), 1e-6)
     shown = (area[:-1] > 0) | (area[1:] > 0)
     return (
@@ -55,7 +55,7 @@ def area_jumps(area: Float[np.ndarray, "frame"]) -> float:
 def checks_of(
     summary: Summary, residual_m: float = np.nan, estimated: Float[np.ndarray, "frame"] | None = None
 ) -> list[Check]:
-    """Return the figures that reveal wrong masks; without an ``estimated`` IoU, area over time."""
+    """Return the checks of masks; without an ``estimated`` IoU, jumps of the area over time."""
     visible, confidence = np.array(summary.visible), np.array(summary.confidence)
     unsure = confidence[np.isfinite(confidence)] < LOW_CONFIDENCE
     checks = [
@@ -81,7 +81,7 @@ def _percent(flags: Bool[np.ndarray, "frame"]) -> float:
 def report_quality(
     folder: Path, clip: Clip, summary: Summary, animal: AnimalConfig, found: Segmentation | None
 ) -> None:
-    """Write the quality page of written masks; ``found``: what they are from, if no foundation model."""
+    """Write the quality page of written masks; ``found``: their segmentation, None for foundation models."""
     if found is None or found.path is None or found.references is None:
         checks = checks_of(summary)
     else:

@@ -10,17 +10,17 @@ from jaxtyping import Float
 from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip
 from pipeline.geometry import cameras, rigid
-from stages.segment_agent.free_space import steady_depth
+from stages.segment_agent.free_space import clean_depth
 from stages.segment_agent.movers import Hint
 
 FORESHORTENED, MIN_BOX_M = 1.5, 0.02
-"""times half its box that an animal may reach: along the line of sight it may be longer; half of a box below
-the second is a click"""
+"""reach of an animal in half box sizes, since it may be longer along the line of sight; half box size below
+which a box is a click"""
 
 
 @dataclass(frozen=True)
 class Prompt:
-    """A rectangle of colour pixels (x0, y0, x1, y1) in one frame that shows the animal in its middle."""
+    """A box of colour pixels (x0, y0, x1, y1) in one frame, with the animal in its middle."""
 
     frame: int
     box_px: tuple[float, float, float, float]
@@ -30,7 +30,7 @@ def parse(path: Path, clip: Clip) -> Prompt:
     """Read ``frame`` or ``time_s`` (since the first frame), and ``box = [x0, y0, x1, y1]`` or ``click = [x,
     y]``.
 
-    Places are pixels of the stored picture, or shares of it where none is above 1. Raises InputError MSK-001.
+    Coordinates are pixels of the stored picture, or fractions if none is above 1. Raises InputError MSK-001.
     """
     try:
         table = tomllib.loads(path.read_text())
@@ -56,7 +56,7 @@ def parse(path: Path, clip: Clip) -> Prompt:
 
 
 def place(prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Hint:
-    """Take a prompt to the world; a box says how far the animal reaches. Raises InputError MSK-002."""
+    """Lift a prompt to the world; a box gives the animal's reach. Raises InputError MSK-002."""
     centre = position(prompt, clip, world_from_camera)
     x0, y0, x1, y1 = prompt.box_px
     distance = rigid.apply(rigid.inverse(world_from_camera[prompt.frame]), centre[None])[0, 2]
@@ -68,13 +68,13 @@ def place(prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "fram
 def position(
     prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]
 ) -> Float[np.ndarray, "3"]:
-    """Return the nearest surface in the box's middle third, in the world. Raises InputError MSK-002."""
+    """Return a near surface point in the box's middle third, in the world. Raises InputError MSK-002."""
     x0, y0, x1, y1 = prompt.box_px
     scale = np.array([clip.depth_size[1] / clip.color_size[1], clip.depth_size[0] / clip.color_size[0]])
     centre = np.array([x0 + x1, y0 + y1]) / 2 * scale
     half = np.maximum(np.array([x1 - x0, y1 - y0]) / 6 * scale, 2)
     low, high = np.maximum(np.floor(centre - half), 0).astype(int), np.ceil(centre + half).astype(int)
-    depth = steady_depth(clip, prompt.frame)[low[1] : high[1] + 1, low[0] : high[0] + 1]
+    depth = clean_depth(clip, prompt.frame)[low[1] : high[1] + 1, low[0] : high[0] + 1]
     if not (depth > 0).any():
         what = "the hint lies where depth is unknown"
         remedy = "point at another part of the animal or another frame"

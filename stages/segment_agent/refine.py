@@ -1,8 +1,8 @@
-"""Turn coarse evidence into a sharp mask: depth evidence, colour, and edges of the picture.
+"""Refine coarse evidence to a sharp mask by colour and image edges.
 
-Everything is a log-odds picture of a window around the animal; a guided filter lets the colour picture's
-edges decide where depth is missing. `Palette` learns the animal's colours over the recording, the window's
-rest gives the room's.
+Evidence is a log-odds image of a window around the animal; a guided filter transfers image edges to it where
+depth is missing. `ColorHistogram` models the animal's colours over the recording; the room's come from the
+window.
 """
 
 from dataclasses import dataclass
@@ -14,28 +14,28 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 @dataclass(frozen=True)
 class Edges:
-    """How sharply evidence becomes a mask."""
+    """Parameters of refinement."""
 
     radius_px: int = 1
-    """reach of the edge-preserving filter at working resolution"""
+    """radius of the guided filter at working resolution"""
     unsure: float = 0.5
-    """log-odds below which a pixel at the boundary is unknown"""
+    """magnitude of log-odds below which a boundary pixel is unknown"""
 
 
 EDGE = 0.1
-"""colour variance (0..1 squared) below which the filter smooths, as its root"""
-BINS, TONES = 12, 96
-"""of a histogram along each axis of Lab, and the range of a and b that they divide"""
+"""standard deviation of colour (0..1) below which the guided filter smooths"""
+BINS, AB_RANGE = 12, 96
+"""histogram bins along each axis of Lab, and the range of a and b that they cover"""
 MIN_COLORS, PRIOR, PRIOR_BINS = 50, 0.02, 200
-"""pixels without which there is no palette, and the share of all that every so many unseen bins count as"""
+"""minimum pixels for a histogram; weight of its uniform prior, and the bins that share it"""
 MIN_CERTAINTY = 0.05
-"""below, filtered evidence fades"""
+"""filtered certainty below which evidence fades"""
 SURE_SHARE, HOLE_SHARE = 0.05, 0.05
-"""share of a part that must be sure, and of the mask up to which a hole is closed"""
+"""minimum share of sure pixels in a component; largest hole that is filled, as a share of the mask"""
 
 
-class Palette:
-    """Colour histograms in Lab of the animal over a whole recording."""
+class ColorHistogram:
+    """Lab colour histogram of the animal over a whole recording."""
 
     def __init__(self) -> None:
         self._counts = np.zeros((BINS, BINS, BINS), np.float32)
@@ -44,19 +44,18 @@ class Palette:
         """Add the colours of pixels that surely show the animal."""
         np.add.at(self._counts, _bin(color), 1.0)
 
-    def ratio(
+    def log_likelihood_ratio(
         self, color: UInt8[np.ndarray, "height width 3"], room: Bool[np.ndarray, "height width"]
     ) -> Float[np.ndarray, "height width"]:
-        """Return log p(colour | animal) / p(colour | room), within +-2; ``room`` marks sure room."""
+        """Return log p(colour | animal) / p(colour | room), within +-2; ``room`` marks certain background."""
         if min(self._counts.sum(), room.sum()) < MIN_COLORS:
             return np.zeros(color.shape[:2], np.float32)
         counts = np.zeros_like(self._counts)
         np.add.at(counts, _bin(color[room]), 1.0)
-        animal, around = _density(self._counts), _density(counts)
-        where = _bin(color.reshape(-1, 3))
-        return (
-            np.clip(np.log(animal[where] / around[where]), -2, 2).reshape(color.shape[:2]).astype(np.float32)
-        )
+        animal, background = _density(self._counts), _density(counts)
+        bins = _bin(color.reshape(-1, 3))
+        log_ratio = np.log(animal[bins] / background[bins])
+        return np.clip(log_ratio, -2, 2).reshape(color.shape[:2]).astype(np.float32)
 
 
 def sharpen(
@@ -65,7 +64,7 @@ def sharpen(
     color: UInt8[np.ndarray, "height width 3"],
     edges: Edges,
 ) -> Float[np.ndarray, "height width"]:
-    """Spread log-odds along the picture: where certainty is low the neighbours of like colour decide."""
+    """Filter log-odds guided by the image: uncertain pixels follow neighbours of similar colour."""
     guide = cv2.GaussianBlur(color, (3, 3), 0).astype(np.float32) / 255
     both = np.dstack([evidence * certainty, certainty]).astype(np.float32)
     filtered = cv2.ximgproc.guidedFilter(guide, both, edges.radius_px, EDGE**2)
@@ -75,12 +74,12 @@ def sharpen(
 def label(
     log_odds: Float[np.ndarray, "height width"], sure: Bool[np.ndarray, "height width"], edges: Edges
 ) -> UInt8[np.ndarray, "height width"]:
-    """Decide 255 / 0 / 128: parts that hold sure pixels stay, holes close, a weak boundary is unknown."""
+    """Label 255 / 0 / 128: keep components with sure pixels, fill holes, weak boundaries are unknown."""
     inside = (log_odds > 0).astype(np.uint8)
-    parts, area = _parts(inside, 8)
-    held = np.bincount(parts[sure], minlength=len(area)) > np.maximum(3, SURE_SHARE * area)
+    component, area = _components(inside, 8)
+    held = np.bincount(component[sure], minlength=len(area)) > np.maximum(3, SURE_SHARE * area)
     held[0] = False
-    inside = held[parts].astype(np.uint8)
+    inside = held[component].astype(np.uint8)
     inside = _fill_holes(inside, limit=HOLE_SHARE)
     cross = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
     rim = cv2.dilate(inside, cross) != cv2.erode(inside, cross)
@@ -89,39 +88,39 @@ def label(
     return mask
 
 
-def without_strays(
-    labels: UInt8[np.ndarray, "height width"], like: Float[np.ndarray, "height width"]
+def remove_strays(
+    labels: UInt8[np.ndarray, "height width"], log_ratio: Float[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width"]:
-    """Take away parts, but for the largest, that look rather like the room: rims that seem to move."""
-    parts, area = _parts((labels > 0).astype(np.uint8), 8)
+    """Remove components, except the largest, that look like the room: rims that seem to move."""
+    component, area = _components((labels > 0).astype(np.uint8), 8)
     if len(area) < 3:
         return labels
-    stray = np.bincount(parts.ravel(), like.ravel(), len(area)) / area < 0
+    stray = np.bincount(component.ravel(), log_ratio.ravel(), len(area)) / area < 0
     stray[[0, 1 + area[1:].argmax()]] = False
-    return np.where(stray[parts], 0, labels).astype(np.uint8)
+    return np.where(stray[component], 0, labels).astype(np.uint8)
 
 
-def _parts(
+def _components(
     inside: UInt8[np.ndarray, "height width"], connectivity: int
 ) -> tuple[Int[np.ndarray, "height width"], Int[np.ndarray, "part"]]:
-    """Return the connected part of each pixel (0: none) and the parts' areas."""
-    _, parts, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=connectivity)
-    return np.asarray(parts, np.int32), stats[:, cv2.CC_STAT_AREA]
+    """Return the connected component of each pixel (0: none) and the components' areas."""
+    _, component, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=connectivity)
+    return np.asarray(component, np.int32), stats[:, cv2.CC_STAT_AREA]
 
 
 def _fill_holes(inside: UInt8[np.ndarray, "height width"], limit: float) -> UInt8[np.ndarray, "height width"]:
-    """Close holes smaller than a share of the whole."""
-    parts, area = _parts(1 - inside, 4)
+    """Fill holes smaller than a share of the foreground."""
+    component, area = _components(1 - inside, 4)
     small = area < limit * max(int(inside.sum()), 1)
     small[0] = False
-    return np.where(small[parts], 1, inside).astype(np.uint8)
+    return np.where(small[component], 1, inside).astype(np.uint8)
 
 
 def _bin(color: UInt8[np.ndarray, "pixel 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lab bins; lightness is coarser than colour so that shade matters less."""
+    """Return Lab bins; lightness is coarser than colour to tolerate shading."""
     lab = cv2.cvtColor(np.ascontiguousarray(color.reshape(1, -1, 3)), cv2.COLOR_RGB2LAB)[0].astype(np.int32)
     light = lab[:, 0] * (BINS - 1) // 255
-    tone = np.clip((lab[:, 1:] - 128) * BINS // TONES + BINS // 2, 0, BINS - 1)
+    tone = np.clip((lab[:, 1:] - 128) * BINS // AB_RANGE + BINS // 2, 0, BINS - 1)
     return light, tone[:, 0], tone[:, 1]
 
 

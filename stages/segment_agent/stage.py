@@ -43,10 +43,10 @@ def run(
     video: Video | None = None,
     videos: Sequence[Video] = (),
 ) -> writing.Summary:
-    """Segment one recording and write its masks into `out`; in a home of several animals, those of the one
-    whose turnaround is among `videos`.
+    """Segment one recording and write its masks into `out`.
 
-    Raises InputError MSK-006 for what says nothing of several animals.
+    With several animals, the one whose turnaround is among `videos` is segmented. Raises InputError
+    MSK-006 for a hint or a backend that cannot tell them apart.
     """
     if inputs.identities is not None and role_of_animal(video, config.role) == "session":
         return _run_of_several(inputs, inputs.identities, config, out, videos)
@@ -56,7 +56,7 @@ def run(
     match config.backend:
         case "weightless":
             if clip.odometry_from_camera is None:
-                log("no usable odometry: the motion comes from depth and flow, which drifts more")
+                log("no usable odometry: camera motion is estimated from depth and flow, which drifts more")
             rng = np.random.default_rng(config.seed)
             found = segment(clip, inputs.flow, role_of_animal(video, config.role), hint, config, rng)
             masks = found.masks

@@ -1,4 +1,4 @@
-"""Where the phone was: odometry without drift, or motion from depth and flow where there is none."""
+"""Camera trajectory: drift-corrected odometry, or motion from depth and flow without odometry."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +12,11 @@ from pipeline.geometry import cameras
 from pipeline.geometry.align import ransac_rigid
 from pipeline.mapping.icp import DepthImage, depth_image
 from pipeline.mapping.odometry import align_gravity, chain_alignments, correct_drift
-from stages.segment_agent.free_space import steady_depth
+from stages.segment_agent.free_space import clean_depth
 
 DEPTH_STRIDE = 3
-INLIER_M, TRIALS = 0.03, 200
-"""of RANSAC over points that flow brings from one frame to the next"""
+INLIER_M, ITERATIONS = 0.03, 200
+"""RANSAC over flow correspondences: inlier threshold and iterations"""
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,11 @@ class CameraPath:
     residual_m: float
 
 
-def steady(clip: Clip, flow: Path, rng: np.random.Generator) -> CameraPath:
-    """Return poses without drift; a recording without odometry is chained from picture to picture first."""
+def estimate_trajectory(clip: Clip, flow: Path, rng: np.random.Generator) -> CameraPath:
+    """Return drift-corrected poses; without odometry, frame-to-frame motion is chained first."""
 
     def view(frame: int) -> DepthImage:
-        depth = steady_depth(clip, frame)
+        depth = clean_depth(clip, frame)
         return depth_image(depth, clip.depth_intrinsics[frame], depth > 0, DEPTH_STRIDE)
 
     poses = clip.odometry_from_camera
@@ -50,21 +50,21 @@ def steady(clip: Clip, flow: Path, rng: np.random.Generator) -> CameraPath:
 def motion_from_flow(
     clip: Clip, frame: int, flow: Float[np.ndarray, "height width 2"], rng: np.random.Generator
 ) -> Float[np.ndarray, "4 4"]:
-    """Return ``first_from_second`` of a frame and the next from flow and depth."""
+    """Return ``first_from_second`` of a frame and the next, by RANSAC on flow and depth."""
     height, width = flow.shape[:2]
     pixel = cameras.pixel_grid(height, width) * STRIDE_PX
     first = _lift(clip, frame, pixel.reshape(-1, 2))
     second = _lift(clip, frame + 1, (pixel + flow).reshape(-1, 2))
     known = np.isfinite(first[:, 0]) & np.isfinite(second[:, 0])
     first_from_second, _ = ransac_rigid(
-        second[known], first[known], threshold_m=INLIER_M, iterations=TRIALS, rng=rng
+        second[known], first[known], threshold_m=INLIER_M, iterations=ITERATIONS, rng=rng
     )
     return first_from_second
 
 
 def _lift(clip: Clip, frame: int, pixel: Float[np.ndarray, "point 2"]) -> Float[np.ndarray, "point 3"]:
     """Back-project colour pixels by the depth there; NaN where it is unknown or the pixel is out of view."""
-    depth = steady_depth(clip, frame)
+    depth = clean_depth(clip, frame)
     at = pixel * [clip.depth_size[1] / clip.color_size[1], clip.depth_size[0] / clip.color_size[0]]
     inside = cameras.in_picture(at, np.ones(len(at)), clip.depth_size)
     column, row = np.floor(np.where(inside[:, None], at, 0)).astype(int).T

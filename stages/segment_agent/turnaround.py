@@ -1,4 +1,4 @@
-"""Find an animal that keeps still while the phone circles it: what stands where all cameras look.
+"""Find an animal that keeps still while the phone circles it, where the optical axes meet.
 
 The optical axes meet near the animal; the level surface beneath that point is its ground; the connected
 cluster of points above that ground nearest to the axes' meeting point is the animal.
@@ -17,66 +17,66 @@ from pipeline.geometry import rigid, subsampling
 from pipeline.geometry.flying_pixels import supported
 from pipeline.geometry.ground import GroundPlane, fit_ground
 from pipeline.mapping.icp import depth_image
-from stages.segment_agent.evidence import UNKNOWN, Evidence, Judge
+from stages.segment_agent.evidence import UNKNOWN, Evidence, EvidenceOf
 from stages.segment_agent.refine import Edges
 from stages.segment_agent.windows import Sphere, Window
 
-MIN_SPREAD = 1e-3
-"""mean squared sine of the angles between optical axes and their common line; below, they meet nowhere"""
-PICTURES = 40
-"""frames that the cluster is made of"""
+MIN_AXIS_SPREAD = 1e-3
+"""least mean squared sine of the angles between the optical axes and their common direction"""
+FRAMES = 40
+"""frames used for the cluster"""
 REACH_M = 0.9
-"""farthest part of an animal from the point where the optical axes meet"""
+"""largest distance of the animal's parts from the focus of the optical axes"""
 VOXEL_M = 0.025
-"""size of the cluster's cells"""
+"""edge of the cluster's voxels"""
 CLEARANCE_M = 0.03
-"""height above the ground from which points surely do not belong to it"""
+"""height above which points are certainly not ground"""
 FOOT_M, FOOT_SPREAD_M = 0.008, 0.004
-"""height above the ground that makes a point under the body rather a paw, and what is worth one more"""
+"""height above ground at even log-odds between ground and paw, and height per unit of log-odds"""
 MIN_HITS = 3
-"""pictures that must have seen a point in a cell"""
+"""minimum points per voxel"""
 EDGES = Edges(radius_px=2, unsure=0.4)
-"""cells are coarser than evidence of motion"""
-RIM_M, ASTRAY_M = 0.05, 0.15
-"""what may belong to the animal around its cells, and to the ground above the focus; distance of an optical
-axis from the focus from which on it counts less than half"""
-LEVEL, SURE = 0.9, 3.0
-"""least upward part of a level surface's normal; log-odds of what is beyond doubt"""
-MIN_LEVEL = 200
-"""points of level surface lower than the focus without which there is no ground"""
+"""voxels are coarser than evidence of motion"""
+MARGIN_M, AXIS_OUTLIER_M = 0.05, 0.15
+"""margin around the voxels, and of the ground above the focus; distance of an optical axis from the focus at
+which its robust weight is a half"""
+MIN_UP, SURE = 0.9, 3.0
+"""least upward component of a level surface's normal; limit of log-odds"""
+MIN_GROUND_POINTS = 200
+"""minimum points of level surface below the focus for a ground plane"""
 NEAREST_M = 0.25
-"""the optical axes meet at least so far before most cameras"""
+"""least median distance of the focus in front of the cameras"""
 
 
 @dataclass(frozen=True)
 class Cluster:
-    """The cells the animal fills, in the recording's world."""
+    """The voxels that the animal occupies, in the recording's world."""
 
     cells: Bool[np.ndarray, "x y z"]
     origin: Float[np.ndarray, "3"]
     voxel_m: float
 
-    def holds(self, points_world: Float[np.ndarray, "*shape 3"]) -> Bool[np.ndarray, "*shape"]:
-        """Return which points lie in the cells; NaN does not."""
+    def contains(self, points_world: Float[np.ndarray, "*shape 3"]) -> Bool[np.ndarray, "*shape"]:
+        """Return which points lie in occupied voxels; NaN does not."""
         at = np.floor(np.nan_to_num((points_world - self.origin) / self.voxel_m, nan=-1.0)).astype(int)
         inside = ((at >= 0) & (at < self.cells.shape)).all(-1)
         at = np.clip(at, 0, np.array(self.cells.shape) - 1)
         return inside & self.cells[at[..., 0], at[..., 1], at[..., 2]]
 
     @property
-    def ball(self) -> Sphere:
-        """Return a ball around the cells."""
+    def sphere(self) -> Sphere:
+        """Return a bounding sphere of the voxels."""
         centres = self.origin + (np.argwhere(self.cells) + 0.5) * self.voxel_m
         middle = (centres.min(0) + centres.max(0)) / 2
-        return Sphere(middle, float(np.linalg.norm(centres - middle, axis=1).max() + RIM_M))
+        return Sphere(middle, float(np.linalg.norm(centres - middle, axis=1).max() + MARGIN_M))
 
 
 def find_standing(
     clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], focus: Float[np.ndarray, "3"] | None
-) -> tuple[list[Sphere | None], Judge]:
-    """Locate what stands at the focus; return a ball per frame and the judge of its points. World: +y up.
+) -> tuple[list[Sphere | None], EvidenceOf]:
+    """Locate what stands at the focus; return a sphere per frame and its evidence. World: +y up.
 
-    Raises InputError MSK-003 when nothing stands there, there is no ground that it stands on, or no focus.
+    Raises InputError MSK-003 without a focus, a ground, or anything that stands on it there.
     """
 
     def refused(what: str) -> InputError:
@@ -91,33 +91,33 @@ def find_standing(
     cluster = find_cluster(points[ground.above(points) > CLEARANCE_M], focus)
     if not cluster.cells.any():
         raise refused("nothing stands where the cameras look")
-    return [cluster.ball] * len(clip), judge_standing(cluster, ground)
+    return [cluster.sphere] * len(clip), cluster_evidence(cluster, ground)
 
 
 def surroundings(
     clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], focus: Float[np.ndarray, "3"]
 ) -> tuple[Float[np.ndarray, "point 3"], GroundPlane | None]:
-    """Return the points that frames see near a focus, and the ground beneath it, if one is seen."""
+    """Return the points seen near a focus, and the ground plane beneath it, if one is seen."""
     points, level = _points_near(clip, world_from_camera, focus)
-    seen = (points[level, 1] < focus[1] + RIM_M).sum() >= MIN_LEVEL
+    seen = (points[level, 1] < focus[1] + MARGIN_M).sum() >= MIN_GROUND_POINTS
     return points, fit_ground(points[level], focus) if seen else None
 
 
-def meeting_point(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "3"] | None:
+def axes_focus(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "3"] | None:
     """Return the point nearest to all optical axes (robust least squares), metres.
 
-    None where they run alongside, or meet behind most cameras: the phone turns on the spot.
+    None if they are parallel, or meet behind most cameras because the phone turns on the spot.
     """
     centre, forward = world_from_camera[:, :3, 3], world_from_camera[:, :3, 2]
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     weight = np.ones(len(centre))
     for _ in range(10):
         total = (weight[:, None, None] * across).sum(0)
-        if np.linalg.eigvalsh(total)[0] < MIN_SPREAD * weight.sum():
+        if np.linalg.eigvalsh(total)[0] < MIN_AXIS_SPREAD * weight.sum():
             return None
         point = np.linalg.solve(total, np.einsum("f,fij,fj->i", weight, across, centre))
         distance = np.linalg.norm(np.einsum("fij,fj->fi", across, point - centre), axis=1)
-        weight = 1 / (1 + (distance / ASTRAY_M) ** 2)
+        weight = 1 / (1 + (distance / AXIS_OUTLIER_M) ** 2)
     before_m = np.einsum("fi,fi->f", point - centre, forward)
     return point if np.median(before_m) > NEAREST_M else None
 
@@ -125,7 +125,7 @@ def meeting_point(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np
 def find_cluster(
     points_world: Float[np.ndarray, "point 3"], focus: Float[np.ndarray, "3"], min_hits: int = MIN_HITS
 ) -> Cluster:
-    """Gather points into cells; take the connected group that is large and near the focus, grown by two."""
+    """Voxelize points; return the component that is large and near the focus, dilated by two voxels."""
     reach = REACH_M + 2 * VOXEL_M
     origin, count = focus - reach, int(np.ceil(2 * reach / VOXEL_M))
     at = np.floor((points_world - origin) / VOXEL_M).astype(int)
@@ -134,18 +134,18 @@ def find_cluster(
     filled = hits >= min_hits
     around = np.ones((3, 3, 3), bool)
     closed = np.asarray(scipy.ndimage.binary_closing(filled, around), bool) | filled
-    group, groups = cast("tuple[np.ndarray, int]", scipy.ndimage.label(closed, around))
+    component, components = cast("tuple[np.ndarray, int]", scipy.ndimage.label(closed, around))
     centre = origin + (np.argwhere(filled) + 0.5) * VOXEL_M
     nearness = np.exp(-((np.linalg.norm(centre - focus, axis=1) / 0.25) ** 2))
-    score = np.bincount(group[filled], nearness, minlength=groups + 1)
-    own = (group == score.argmax()) & filled
+    score = np.bincount(component[filled], nearness, minlength=components + 1)
+    own = (component == score.argmax()) & filled
     return Cluster(scipy.ndimage.binary_dilation(own, around, iterations=2), origin, VOXEL_M)
 
 
 def _points_near(clip: Clip, world_from_camera, focus) -> tuple[np.ndarray, np.ndarray]:
     """Read points within reach of the focus, tails and ears too, and whether they face upward."""
     points, level = [], []
-    for frame in subsampling.evenly(len(clip), PICTURES):
+    for frame in subsampling.evenly(len(clip), FRAMES):
         depth = clip.depth(frame)
         depth = np.where(supported(depth), depth, 0)
         view = depth_image(depth, clip.depth_intrinsics[frame], depth > 0, 2)
@@ -153,30 +153,30 @@ def _points_near(clip: Clip, world_from_camera, focus) -> tuple[np.ndarray, np.n
         up = (view.normals.reshape(-1, 3) @ world_from_camera[frame, :3, :3].T)[:, 1]
         near = (view.points.reshape(-1, 3)[:, 2] > 0) & (np.abs(world - focus).max(1) < REACH_M)
         points.append(world[near])
-        level.append(up[near] > LEVEL)
+        level.append(up[near] > MIN_UP)
     return np.concatenate(points), np.concatenate(level)
 
 
-def judge_standing(cluster: Cluster, ground: GroundPlane, whole: bool = True) -> Judge:
-    """Evidence of a cluster: its cells well above the ground are animal, the rest is room.
+def cluster_evidence(cluster: Cluster, ground: GroundPlane, whole: bool = True) -> EvidenceOf:
+    """Evidence of a cluster: its voxels well above the ground are animal, the rest is room.
 
-    If they are not the ``whole`` animal, nothing is known of what stands beside them.
+    If they do not cover the ``whole`` animal, what stands beside them is unknown.
     """
 
-    def judge(frame: int, window: Window, ball: Sphere) -> Evidence:
+    def evidence_of(frame: int, window: Window, sphere: Sphere) -> Evidence:
         known = np.isfinite(window.points_world[..., 0])
-        held, height = cluster.holds(window.points_world), ground.above(window.points_world)
-        beneath = window.points_world.copy()  # feet: cells begin at the clearance, look one up
-        beneath[..., 1] += CLEARANCE_M
-        held |= cluster.holds(beneath)
-        log_odds = np.where(held, np.clip((height - FOOT_M) / FOOT_SPREAD_M, -SURE, SURE), -SURE)
+        inside, height = cluster.contains(window.points_world), ground.above(window.points_world)
+        raised = window.points_world.copy()  # feet: voxels begin at the clearance
+        raised[..., 1] += CLEARANCE_M
+        inside |= cluster.contains(raised)
+        log_odds = np.where(inside, np.clip((height - FOOT_M) / FOOT_SPREAD_M, -SURE, SURE), -SURE)
         log_odds[~known] = 0.0
         certainty = np.where(known, np.where(window.trusted, 1.0, 0.5), UNKNOWN)
         if not whole:
-            near = np.linalg.norm(window.points_world - ball.centre_world, axis=-1) < ball.radius_m
-            uncertain = near & ~held & (height > CLEARANCE_M)
+            near = np.linalg.norm(window.points_world - sphere.centre_world, axis=-1) < sphere.radius_m
+            uncertain = near & ~inside & (height > CLEARANCE_M)
             log_odds[uncertain], certainty[uncertain] = 0.0, UNKNOWN
         sure = window.trusted & (log_odds > 2)
         return Evidence(log_odds, certainty, sure, sure, log_odds <= -2)
 
-    return judge
+    return evidence_of

@@ -1,4 +1,4 @@
-"""Write masks frame by frame and gather what the table and the report need."""
+"""Write masks frame by frame and collect the per-frame table and masks for the quality page."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -9,12 +9,12 @@ import numpy as np
 from pipeline.data import images, npz
 from pipeline.data.clips import PEOPLE, Clip
 from stages.segment_agent.masks import Segmentation
-from stages.segment_agent.painting import Mask
+from stages.segment_agent.segmenter import Mask
 
 
 @dataclass
 class Summary:
-    """Per-frame figures of masks, and a few whole masks for pictures."""
+    """Per-frame values of masks, and a few whole masks for pictures."""
 
     visible: list[bool] = field(default_factory=list)
     confidence: list[float] = field(default_factory=list)
@@ -23,7 +23,7 @@ class Summary:
 
 
 def write(folder: Path, masks: Iterable[Mask], count: int, pictures: int = 12) -> Summary:
-    """Write ``%06d.png`` and ``masks.npz``; keep every so many masks for the report."""
+    """Write ``%06d.png`` and ``masks.npz``; keep ``pictures`` evenly spaced masks for the quality page."""
     summary, shown = Summary(), set(np.linspace(0, count - 1, pictures).astype(int).tolist())
     for frame, mask in enumerate(masks):
         images.write_gray(folder / f"{frame:06d}.png", mask.labels)

@@ -1,7 +1,7 @@
-"""Grounding DINO finds the animal by its name in some frames, SAM 2 follows it from the most certain one.
+"""Grounding DINO detects the animal from a text prompt in some frames; SAM 2 tracks the best detection.
 
-A user's hint takes the place of the detector. Masks are made as they are asked for; those before the first
-frame are kept compressed, so that memory hardly grows with the recording.
+A user's hint replaces the detector. Masks are generated lazily; those before the first frame are stored
+compressed, so that memory hardly grows with the recording.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip
 from pipeline.geometry import subsampling
 from stages.segment_agent.config import FoundationConfig
-from stages.segment_agent.painting import Mask
 from stages.segment_agent.prompt import Prompt
+from stages.segment_agent.segmenter import Mask
 
 if TYPE_CHECKING:
     from pipeline.backends.grounding_dino import GroundingDino
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 
 
 LOOKED_AT = 16
-"""frames in which the animal is looked for"""
+"""number of frames given to the detector"""
 UNSURE = 1.0
-"""log-odds on both sides of even within which a pixel is unknown"""
+"""pixels with log-odds below this magnitude are unknown"""
 
 
 def segment(clip: Clip, hint: Prompt | None, options: FoundationConfig, device: str) -> Iterator[Mask]:
-    """Return one mask per frame. Raises MSK-004 if the animal is not found, MOD-001..003 without models."""
+    """Yield one mask per frame. Raises MSK-004 if the animal is not found, MOD-001..003 without models."""
     from pipeline.backends.grounding_dino import GroundingDino
     from pipeline.backends.sam2 import Sam2
 
@@ -45,7 +45,7 @@ def segment(clip: Clip, hint: Prompt | None, options: FoundationConfig, device: 
 
 
 def _find(clip: Clip, detector: GroundingDino, options: FoundationConfig) -> tuple[int, Float[np.ndarray, 4]]:
-    """Return the frame and box of the most certain detection."""
+    """Return the frame and box (x0, y0, x1, y1, pixels) of the detection with the highest score."""
     best: tuple[float, int, np.ndarray] | None = None
     for frame in subsampling.evenly(len(clip), LOOKED_AT, rounded=True).tolist():
         found = detector.find(clip.color(frame), options.description, options.threshold)
@@ -60,7 +60,7 @@ def _find(clip: Clip, detector: GroundingDino, options: FoundationConfig) -> tup
 
 
 def widened(hint: Prompt, size: tuple[int, int], least: float = 0.04) -> Float[np.ndarray, 4]:
-    """Return a hint's box (x0, y0, x1, y1, pixels); a click becomes a small one around it."""
+    """Return a hint's box (x0, y0, x1, y1, pixels), enlarged to a minimum size around a click."""
     x0, y0, x1, y1 = hint.box_px
     grow = np.maximum(least * max(size) - np.array([x1 - x0, y1 - y0]), 0) / 2
     low, high = np.array([x0, y0]) - grow, np.array([x1, y1]) + grow
@@ -84,7 +84,7 @@ def _follow(
 
 
 def labelled(log_odds: Float[np.ndarray, "height width"], presence: float, unsure: float) -> Mask:
-    """Turn log-odds into 255 agent, 0 not, 128 unknown; nothing where the animal is rather out of view."""
+    """Turn log-odds into 255 agent, 0 not, 128 unknown; an empty mask where presence has log-odds <= 0."""
     labels = np.where(log_odds > unsure, 255, np.where(log_odds < -unsure, 0, 128)).astype(np.uint8)
     inside = labels == 255
     if presence <= 0 or not inside.any():

@@ -1,1 +1,1 @@
-"""Learn what the animals of a home look like, from all their turnarounds."""
+"""Train the network that distinguishes the animals of a home, on all their turnarounds."""

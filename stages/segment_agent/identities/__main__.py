@@ -1,6 +1,6 @@
-"""Learn what the animals of a home look like, from all their turnarounds.
+"""Train the network that distinguishes the animals of a home, on all their turnarounds.
 
-One small network distinguishes them, pixel by pixel; `segment_agent` asks it who it is that moves.
+It classifies pixels; `segment_agent` uses it to identify what moves.
 
     python -m stages.segment_agent.identities --frames build/pair/frames --flow build/pair/flow \\
         --videos build/pair/plan/videos.json --out build/pair/identities

@@ -19,10 +19,10 @@ from stages.segment_agent.config import Config as MaskConfig
 from stages.segment_agent.identities.config import Config
 from stages.segment_agent.identity import Identities, Portrait
 
-APART = 0.8
-"""share of each animal's pixels, in portraits kept apart, that must be taken for it"""
-KEPT_APART = 4
-"""every so many portraits one is kept apart"""
+MIN_RECOGNIZED = 0.8
+"""minimum recall of each animal's pixels in test portraits"""
+TEST_EVERY = 4
+"""one portrait in so many is held out for testing"""
 
 
 @dataclass(frozen=True)
@@ -38,25 +38,25 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: Sequence[Video] = 
 
     Raises InputError MSK-005 where two look the same.
     """
-    whose = {video.id: video.animal for video in videos if video.animal}
-    names = tuple(sorted(whose[id] for id in inputs.frames))
+    animal_of = {video.id: video.animal for video in videos if video.animal}
+    names = tuple(sorted(animal_of[id] for id in inputs.frames))
     rng = np.random.default_rng(config.seed)
     learned, tested = [], []
     for id, folder in inputs.frames.items():
-        found = portraits(folder, inputs.flow[id], names.index(whose[id]), config, rng)
-        tested += found[KEPT_APART // 2 :: KEPT_APART]
-        learned += [each for index, each in enumerate(found) if index % KEPT_APART != KEPT_APART // 2]
+        found = portraits(folder, inputs.flow[id], names.index(animal_of[id]), config, rng)
+        tested += found[TEST_EVERY // 2 :: TEST_EVERY]
+        learned += [each for index, each in enumerate(found) if index % TEST_EVERY != TEST_EVERY // 2]
     network = identity.learn_identities(learned, names, config, rng)
-    shares = dict(zip(names, identity.recognized(network, tested).tolist(), strict=True))
+    shares = dict(zip(names, identity.recognition_rates(network, tested).tolist(), strict=True))
     log("recognized: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items()))
-    if min(shares.values()) < APART:
+    if min(shares.values()) < MIN_RECOGNIZED:
         what = f"{' and '.join(names)} look the same: {100 * min(shares.values()):.0f} % recognized"
         remedy = "is it one animal with two turnarounds? Keep one; else film both by the same light"
         raise InputError("MSK-005", what, str(next(iter(inputs.frames.values())).parent), remedy)
     network.save(out)
     identity.save_portraits(out, learned)
     checks = [
-        qa.Check(f"pixels of {name} recognized", 100 * share, "%", warn=92, fail=APART * 100, better="higher")
+        qa.Check(f"pixels of {name} recognized", 100 * share, "%", 92, 100 * MIN_RECOGNIZED, "higher")
         for name, share in shares.items()
     ]
     qa.write(
@@ -65,7 +65,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: Sequence[Video] = 
         bad="animals of two colours: they look alike, or one turnaround shows both",
         checks=checks,
         pictures=qa.captioned(
-            {"portraits": "Portraits kept apart, every pixel in the colour of whom it is taken for."},
+            {"portraits": "Held-out portraits, every pixel in the colour of its predicted identity."},
             portraits=sheet(network, tested),
         ),
     )
@@ -77,9 +77,9 @@ def portraits(
 ) -> list[Portrait]:
     """Segment frames spread evenly over a turnaround, at working resolution."""
     clip = Clip.open(frames)
-    painter = masks.painter_of_turnaround(clip, flow, MaskConfig(height_px=config.height_px), rng)
+    segmenter = masks.turnaround_segmenter(clip, flow, MaskConfig(height_px=config.height_px), rng)
     found = [
-        Portrait(animal, painter.working_picture(frame), painter.working_mask(frame).labels)
+        Portrait(animal, segmenter.working_picture(frame), segmenter.working_mask(frame).labels)
         for frame in subsampling.evenly(len(clip), config.portraits).tolist()
     ]
     return [each for each in found if (each.labels == 255).any()]
@@ -88,10 +88,10 @@ def portraits(
 def sheet(
     network: Identities, tested: Sequence[Portrait], columns: int = 6
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw portraits with every pixel of an animal in the colour of whom it is taken for."""
+    """Draw portraits with each of the animal's pixels in the colour of its predicted identity."""
     tiles = []
     for each in tested[:: max(1, len(tested) // (2 * columns))]:
-        taken = network.who(each.color)[1:].argmax(0)
+        taken = network.predict(each.color)[1:].argmax(0)
         hue = (taken * 180 / len(network.names)).astype(np.uint8)
         vivid = np.full_like(hue, 255)
         tint = cv2.cvtColor(np.dstack([hue, vivid, vivid]), cv2.COLOR_HSV2RGB)

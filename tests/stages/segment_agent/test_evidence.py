@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from stages.segment_agent.evidence import recolored
+from stages.segment_agent.evidence import color_change
 from stages.segment_agent.free_space import Votes
-from stages.segment_agent.windows import Window, unblurred
+from stages.segment_agent.windows import Window, snap_depth_steps
 
 
 @pytest.mark.parametrize(("share", "nearer"), [(0.4, 1.5), (0.6, 2.5)])
@@ -13,13 +13,13 @@ def test_what_floats_between_two_surfaces_goes_to_the_nearer_one(share, nearer):
     step = np.where(np.arange(40) < 20, 1.5, 2.5)[None].repeat(30, 0).astype(np.float32)
     blurred, expected = step.copy(), step.copy()
     blurred[:, 20], expected[:, 20] = 1.5 + share, nearer
-    np.testing.assert_array_equal(unblurred(blurred), expected)
+    np.testing.assert_array_equal(snap_depth_steps(blurred), expected)
 
 
 def test_a_slope_and_unknown_depth_stay():
     slope = np.linspace(1, 2, 60)[None].repeat(30, 0).astype(np.float32)
     slope[10:14, 20:24] = 0
-    np.testing.assert_array_equal(unblurred(slope), slope)
+    np.testing.assert_array_equal(snap_depth_steps(slope), slope)
 
 
 def test_only_what_is_no_neighbouring_colour_is_another_one():
@@ -33,6 +33,6 @@ def test_only_what_is_no_neighbouring_colour_is_another_one():
     window = Window(
         whole, whole, np.clip(now, 0, 255).astype(np.uint8), np.zeros((60, 60, 3)), np.ones((60, 60), bool)
     )
-    other = recolored(window, votes, np.ones((60, 60), bool))
+    other = color_change(window, votes, np.ones((60, 60), bool))
     assert (other[23:31, 23:31] > 1).mean() > 0.9
     assert (other[:, 40:] > 1).mean() < 0.02

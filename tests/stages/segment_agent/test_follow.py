@@ -9,10 +9,10 @@ from pipeline.data import images, npz
 from pipeline.data.clips import Clip
 from pipeline.data.flow import GAPS
 from stages.segment_agent.config import LearningConfig
-from stages.segment_agent.follow import MOTION_GAPS, cut_out, follow
+from stages.segment_agent.follow import MOTION_GAPS, follow, segment_hint
 from stages.segment_agent.footage import Footage
 from stages.segment_agent.prompt import Prompt
-from stages.segment_agent.propagation import SURE, Labels, connected, examples, message
+from stages.segment_agent.propagation import MAX_LOG_ODDS, Beliefs, connected, examples, message
 
 SIZE = (120, 160)
 CELLS = (30, 40)
@@ -59,7 +59,7 @@ def test_motion_tells_the_animal_from_what_else_is_in_its_box(tmp_path):
     frames = MOTION_GAPS[0] + 1
     step = 1.5 * animal[..., None] * np.array([1, 0])
     footage = _footage(tmp_path, frames * [noisy], frames * [step])
-    found = cut_out(footage, Prompt(0, (40, 30, 120, 90)), rng) > 0
+    found = segment_hint(footage, Prompt(0, (40, 30, 120, 90)), rng) > 0
     assert (found & animal).sum() > 0.95 * (found | animal).sum()
 
 
@@ -93,8 +93,8 @@ def test_an_animal_is_followed_both_ways(walk, hinted):
 
 def test_labels_come_along_the_flow(walk):
     footage, masks = walk
-    found: Labels = [None for _ in masks]
-    found[0] = np.where(masks[0], SURE, -SURE).astype(np.float16)
+    found: Beliefs = [None for _ in masks]
+    found[0] = np.where(masks[0], MAX_LOG_ODDS, -MAX_LOG_ODDS).astype(np.float16)
     there = message(footage, 8, found)
     assert (there > 0)[masks[8]].mean() > 0.9 and (there < 0)[~masks[0] & ~masks[8]].mean() > 0.9
     assert not message(footage, 3, found).any(), "no flow is stored over three frames"
@@ -108,7 +108,11 @@ def test_motion_speaks_for_what_moves_and_against_what_does_not(walk):
     assert (moving[masks[4]] > 0).mean() > 0.6 and (moving[masks[4]] < 0).mean() < 0.1
     assert (moving[84:94, 40:80] < 0).mean() > 0.9
     labels = examples(
-        footage, [None, None, None, None, np.where(inside, SURE, -SURE)], 4, 5, footage.with_motion
+        footage,
+        [None, None, None, None, np.where(inside, MAX_LOG_ODDS, -MAX_LOG_ODDS)],
+        4,
+        5,
+        footage.with_motion,
     )[0].labels
     assert (labels[84:94, 40:80] == 128).mean() > 0.9 and (labels[masks[4]] == 255).mean() > 0.6
 

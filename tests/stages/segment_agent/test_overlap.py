@@ -32,7 +32,7 @@ def session(tmp_path_factory):
     return clip, poses, free_space.gather(clip, poses, 90), truth.masks
 
 
-def judged(session, shown_px, what: overlap.Shown = "mover"):
+def judged(session, shown_px, what: overlap.Subject = "moving"):
     """Return the estimated mean IoU, the true one, and the status of the quality check."""
     clip, poses, references, true = session
     labels = [255 * each.astype(np.uint8) for each in shown_px]
@@ -40,8 +40,8 @@ def judged(session, shown_px, what: overlap.Shown = "mover"):
     area = shown_px.mean((1, 2))
     summary = Summary((area > 0).tolist(), [0.95] * len(area), area.tolist())
     status = {check.status for check in pictures.checks_of(summary, 0.01, found)}
-    either = (shown_px | true).sum((1, 2))
-    iou = ((shown_px & true).sum((1, 2)) / np.maximum(either, 1))[either > 0].mean()
+    union = (shown_px | true).sum((1, 2))
+    iou = ((shown_px & true).sum((1, 2)) / np.maximum(union, 1))[union > 0].mean()
     return float(np.nanmean(found)), float(iou), status
 
 
@@ -49,7 +49,7 @@ def with_room(session):
     """Add a part of the room to all masks."""
     clip, poses, _, true = session
     points = [
-        free_space.points_of(clip, frame, pose, clip.depth(frame), 1) for frame, pose in enumerate(poses)
+        free_space.world_points(clip, frame, pose, clip.depth(frame), 1) for frame, pose in enumerate(poses)
     ]
     return true | (np.linalg.norm(np.stack(points) - THING, axis=-1) < RADIUS_M)
 

@@ -68,7 +68,7 @@ def test_a_person_is_found_and_is_not_the_animal(visited, tmp_path):
 def test_an_animal_alone_is_nobody(tmp_path):
     poses, agent = scenery.session()
     scenery.record(tmp_path / "frames", poses, agent, poses)
-    references, walkers = people.set_apart(Clip.open(tmp_path / "frames"), poses, 40)
+    references, walkers = people.gather_without_people(Clip.open(tmp_path / "frames"), poses, 40)
     assert walkers.axis_world.shape == (0, len(poses), 2)
     assert references.ignored is None
     assert not walkers.near(0, np.zeros((3, 3))).any()

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from pipeline.geometry import rigid
-from stages.segment_agent import free_space, movers, painting, pictures
+from stages.segment_agent import free_space, movers, pictures, segmenter
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.evidence import Evidence
 from stages.segment_agent.free_space import DepthNoise, References
 from stages.segment_agent.movers import Candidate
-from stages.segment_agent.painting import Painter
 from stages.segment_agent.refine import Edges
+from stages.segment_agent.segmenter import Segmenter
 from stages.segment_agent.windows import Window
 from stages.segment_agent.writing import Summary
 
@@ -43,7 +43,7 @@ def test_depth_noise_is_measured_by_range():
 def references_of(depth):
     count = len(depth)
     pose, k = np.tile(rigid.inverse(np.eye(4)), (count, 1, 1)), np.tile(INTRINSICS, (count, 1, 1))
-    color, nearest = np.zeros((*depth.shape, 3), np.uint8), free_space._nearest(depth, k)
+    color, nearest = np.zeros((*depth.shape, 3), np.uint8), free_space._min_filter(depth, k)
     return References(pose, k, depth, nearest, color, np.arange(count), DepthNoise())
 
 
@@ -55,8 +55,8 @@ def test_what_is_seen_beside_a_hole_is_not_free():
     point = np.array([[[0.5 / 80 * 1.5, 0.0, 1.5]]])
     votes = free_space.vote(references_of(depth), point, frame=-1)
     assert votes.free.item() == 0
-    clear = np.full((10, 80, 100), 3.0, np.float32)
-    assert free_space.vote(references_of(clear), point, frame=-1).free.item() == 10
+    moving = np.full((10, 80, 100), 3.0, np.float32)
+    assert free_space.vote(references_of(moving), point, frame=-1).free.item() == 10
 
 
 def test_what_people_moved_is_no_animal():
@@ -82,14 +82,14 @@ def test_what_people_moved_is_no_animal():
 )
 def test_presence_is_decided_by_appearance_and_motion(similarity, moved, presumed, present):
     shape = (10, 10)
-    clear = np.arange(100).reshape(shape) < 100 * moved
+    moving = np.arange(100).reshape(shape) < 100 * moved
     no = np.zeros(shape, bool)
-    evidence = Evidence(np.zeros(shape), np.ones(shape), clear, clear, no)
-    painter = cast(Painter, SimpleNamespace())
+    evidence = Evidence(np.zeros(shape), np.ones(shape), moving, moving, no)
+    instance = cast(Segmenter, SimpleNamespace())
     inside = ~no
-    found = Painter._presence(painter, evidence, np.full(shape, similarity), inside, presumed)
+    found = Segmenter._presence(instance, evidence, np.full(shape, similarity), inside, presumed)
     assert (found > 0) == present
-    assert abs(found) < painting.LOG_ODDS_LIMIT + painting.PRESENCE_LIMIT
+    assert abs(found) < segmenter.LOG_ODDS_LIMIT + segmenter.PRESENCE_LIMIT
 
 
 def test_masks_that_are_implausible_over_time_are_reported_where_nothing_else_judges():
@@ -113,12 +113,12 @@ def test_appearance_decides_where_geometry_knows_nothing():
     like = np.where(animal, 2.4, -4.0)
     evidence = Evidence(np.zeros(shape), np.full(shape, 0.05), unknown, unknown, unknown)
     window = cast(Window, SimpleNamespace(color=np.full((*shape, 3), 128, np.uint8)))
-    painter = cast(Painter, SimpleNamespace(edges=Edges()))
-    labels, _ = Painter._by_appearance(painter, window, evidence, like)
+    instance = cast(Segmenter, SimpleNamespace(edges=Edges()))
+    labels, _ = Segmenter._by_appearance(instance, window, evidence, like)
     assert ((labels == 255) & animal).sum() > 0.9 * animal.sum()
     assert not (labels == 255)[~animal].any()
-    settled = Evidence(np.full(shape, -3.0), np.ones(shape), unknown, unknown, ~unknown)
-    labels, _ = Painter._by_appearance(painter, window, settled, like)
+    static = Evidence(np.full(shape, -3.0), np.ones(shape), unknown, unknown, ~unknown)
+    labels, _ = Segmenter._by_appearance(instance, window, static, like)
     assert not (labels == 255).any()
 
 
@@ -128,9 +128,11 @@ def test_gloss_that_does_not_look_like_the_animal_is_room():
     animal, gloss = no.copy(), no.copy()
     animal[20:40, 10:40], gloss[20:40, 40:75] = True, True
     like = np.where(animal, 2.0, -3.0)
-    recolored = np.where(animal | gloss, 6.0, 0.0)
-    evidence = Evidence(recolored - 2.0, np.ones(shape), animal, no, no, recolored)
+    color_change = np.where(animal | gloss, 6.0, 0.0)
+    evidence = Evidence(color_change - 2.0, np.ones(shape), animal, no, no, color_change)
     window = cast(Window, SimpleNamespace(color=np.full((*shape, 3), 128, np.uint8)))
-    labels, _ = Painter._by_appearance(cast(Painter, SimpleNamespace(edges=Edges())), window, evidence, like)
+    labels, _ = Segmenter._by_appearance(
+        cast(Segmenter, SimpleNamespace(edges=Edges())), window, evidence, like
+    )
     assert ((labels == 255) & animal).sum() > 0.8 * animal.sum()
     assert (labels == 255)[gloss].mean() < 0.1

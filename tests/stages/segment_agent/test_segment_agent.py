@@ -120,10 +120,10 @@ def candidate(x, area=0.03):
 
 
 def test_the_track_prefers_a_steady_mover_to_larger_flashes():
-    steady = [[candidate(0.05 * i, 0.02)] for i in range(12)]
+    estimate_path = [[candidate(0.05 * i, 0.02)] for i in range(12)]
     for i in (3, 7):
-        steady[i].append(candidate(3.0 + i, 0.04))
-    assert movers.track(steady, np.arange(12) * 0.1, AnimalConfig()).tolist() == [0] * 12
+        estimate_path[i].append(candidate(3.0 + i, 0.04))
+    assert movers.track(estimate_path, np.arange(12) * 0.1, AnimalConfig()).tolist() == [0] * 12
 
 
 def test_a_hint_decides_between_two_movers():
@@ -143,7 +143,7 @@ def test_a_hint_holds_what_hangs_together_with_it():
 
     def held(frame, x):
         return np.flatnonzero(
-            movers.connected(chosen, time, AnimalConfig(), Hint(frame, np.array([x, 0.0, 0.0])))
+            movers.connected_to_hint(chosen, time, AnimalConfig(), Hint(frame, np.array([x, 0.0, 0.0])))
         ).tolist()
 
     first = [*range(7), *range(9, 20)]

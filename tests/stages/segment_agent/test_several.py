@@ -77,22 +77,22 @@ def test_portraits_are_kept_and_are_examples_of_their_animal(portraits):
 def test_what_turnarounds_recognize_beside_the_animal_is_not_learned_as_room(monkeypatch):
     labels = np.zeros((60, 80), np.uint8)
     labels[20:30, 20:30] = 255
-    painter = SimpleNamespace(
+    segmenter = SimpleNamespace(
         clip=None,
         height_px=60,
-        balls=[Sphere(np.zeros(3), 1.0)] * 4,
+        spheres=[Sphere(np.zeros(3), 1.0)] * 4,
         world_from_camera=[None] * 4,
         working_mask=lambda frame: SimpleNamespace(labels=labels),
         working_picture=lambda frame: np.zeros((60, 80, 3), np.uint8),
     )
-    monkeypatch.setattr(masks, "rectangle", lambda *_: (slice(10, 50), slice(10, 50)))
+    monkeypatch.setattr(masks, "project_sphere", lambda *_: (slice(10, 50), slice(10, 50)))
     given = []
     monkeypatch.setattr(masks, "learn", lambda examples, *_, **__: given.extend(examples))
     recognized = np.full((60, 80), -1.0)
     recognized[25:60, 20:60] = 1.0
     elsewhere = Example(np.zeros((9, 9, 3), np.uint8), np.full((9, 9), 255, np.uint8))
-    known = masks.Known([elsewhere], lambda frame: recognized)
-    masks.learn_appearance(painter, None, OPTIONS, np.random.default_rng(0), known)
+    known = masks.KnownAppearance([elsewhere], lambda frame: recognized)
+    masks.learn_appearance(segmenter, None, OPTIONS, np.random.default_rng(0), known)
     assert given[-1] is elsewhere and len(given) == 5
     found = given[0].labels
     assert (found[20:30, 20:30] == 255).all(), "the animal"
@@ -103,11 +103,11 @@ def test_what_turnarounds_recognize_beside_the_animal_is_not_learned_as_room(mon
 def test_looks_are_told_apart_and_kept(network, turnarounds):
     assert network.names == ("green", "orange")
     clip = Clip.open(turnarounds["v001"])
-    who = network.who(clip.color(3))
-    assert np.exp(who).sum(0) == pytest.approx(1, abs=1e-4)
-    middle = identity.margin(who, 1)[50:70, 35:55]
+    log_prob = network.predict(clip.color(3))
+    assert np.exp(log_prob).sum(0) == pytest.approx(1, abs=1e-4)
+    middle = identity.identity_log_odds(log_prob, 1)[50:70, 35:55]
     assert np.median(middle) > 0
-    assert np.allclose(identity.margin(who, 0)[50:70, 35:55][middle > 3].max(), -3, atol=3.1)
+    assert np.allclose(identity.identity_log_odds(log_prob, 0)[50:70, 35:55][middle > 3].max(), -3, atol=3.1)
 
 
 def test_one_animal_filmed_twice_is_refused(turnarounds, tmp_path):
@@ -119,13 +119,13 @@ def test_one_animal_filmed_twice_is_refused(turnarounds, tmp_path):
 def test_bodies_that_touch_are_parted_and_a_patch_does_not_part_one():
     moving = np.zeros((80, 80), bool)
     moving[30:50, 10:70] = True
-    margins = np.where(np.arange(80) < 40, 4.0, -4.0) * np.ones((80, 1))
-    own, probability = identity.of_one(moving, margins)
+    log_odds = np.where(np.arange(80) < 40, 4.0, -4.0) * np.ones((80, 1))
+    own, probability = identity.select_animal(moving, log_odds)
     assert own[30:50, 10:38].all()
     assert not own[:, 42:].any()
     patch = np.full((80, 80), 4.0)
     patch[38:42, 30:34] = -4.0
-    own, probability = identity.of_one(moving, patch)
+    own, probability = identity.select_animal(moving, patch)
     assert own[moving].all()
     assert (probability[moving] > 0.9).all()
 
