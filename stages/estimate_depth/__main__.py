@@ -1,8 +1,8 @@
-"""Turn the pictures of a plain video into frames with depth, by the map of the walk-through.
+"""Turn the pictures of a plain video into frames with depth, given the map of the walk-through.
 
-Cameras come from what the pictures and the walk-through show alike; the lens is calibrated with them. The
-room's depth is the map's. The animal's is inferred: in a session from where it touches the map, or by a
-monocular network that the map scales. Of a turnaround several views measure it, since the animal rests.
+Cameras and lens are estimated by matching the pictures with the walk-through. The room's depth is rendered
+from the map. The animal's is inferred: in sessions from its contact with the map, or by a monocular network
+scaled by the map; in turnarounds, where the animal rests, by multi-view stereo.
 """
 
 from pipeline.workflow import cli

@@ -1,4 +1,4 @@
-"""Settings of depth for recordings without it; what nobody should turn stands beside its code."""
+"""Settings of depth estimation; constants that need no tuning stand beside the code that uses them."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -6,17 +6,17 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Config:
-    """How recordings without depth get it."""
+    """Depth estimation for recordings without depth."""
 
     length_m: float = 0.5
-    """Length of the animal without its tail, metres: how high its back is where one looks from above."""
+    """Length of the animal without its tail, metres; gives the height of its back."""
     backend: Literal["contact", "depth_anything_v2", "depth_pro"] = "contact"
-    """The animal's depth in sessions: by where it touches the map, or by a metric monocular network (`make
-    extras`, and its checkpoint), which the map's depth scales."""
+    """The animal's depth in sessions: by its contact with the map, or by a monocular network (`make extras`,
+    and its checkpoint) scaled by the map's depth."""
     weights: str = ""
     """Folder of the network's checkpoint."""
     jpeg_quality: int = 95
-    """JPEG quality 1..100 of pictures that were straightened; the others keep their bytes."""
+    """JPEG quality 1..100 of undistorted pictures; the others are copied."""
     seed: int = 0
     """Seed of RANSAC."""
     role: Literal["turnaround", "session"] = "session"

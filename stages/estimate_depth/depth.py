@@ -1,4 +1,4 @@
-"""Depth of every frame: the map's where the room is seen, the animal's by contact or by several views."""
+"""Depth of every frame: rendered from the map for the room, by contact or stereo for the animal."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,27 +16,27 @@ from stages.estimate_depth.foreground import ColorView
 from stages.estimate_depth.tracking import MapViews
 
 EDGE_SHARE = 0.06
-"""Depth that changes by more than this share within 3 pixels is an edge of the map, which is less certain."""
-RIM = np.ones((5, 5), np.uint8)
-"""What may still be animal around what differs from the room: its depth is unknown, pixels."""
+"""Depth range within 3 pixels, as a share of depth, above which a map pixel is an edge and less certain."""
+DILATION = np.ones((5, 5), np.uint8)
+"""Dilation of the foreground, pixels; depth there is unknown."""
 BACK_SHARE = 0.55
-"""Height of an animal's back over its length."""
+"""Ratio of the height of an animal's back to its length."""
 LARGEST_SHARE = 2.5
-"""What is wider or higher than so many lengths is no animal: light, a curtain, a person."""
-STRANGE_SHARE = 0.35
-"""Share of a picture that differs from the map's from which on its camera was misplaced."""
-CARRIED_S = 2.0
-"""How long a place of contact holds where none is seen, seconds."""
+"""Largest extent of an animal in lengths; larger foreground is light, a curtain or a person."""
+MAX_FOREGROUND = 0.35
+"""Share of foreground above which the camera pose is taken as wrong."""
+MAX_CONTACT_GAP_S = 2.0
+"""Longest time over which contact points are interpolated, seconds."""
 SWEPT_PX, SOURCES, PLANES, ANGLES_DEG = 224, 4, 96, (3.0, 22.0)
-"""Longer side of a turnaround's pictures in the sweep, pixels, frames that each one is compared with, planes,
-and the angles, at the middle of the view, under which the frames see it, degrees."""
+"""Plane sweep of turnarounds: longer side of pictures, pixels; source frames; planes; range of triangulation
+angles at the middle of the view, degrees."""
 NEAREST_M, FARTHEST_SHARE = 0.25, 1.3
-"""Nearest plane, metres, and the farthest, in units of the farthest of the map's depth."""
+"""Nearest plane, metres; farthest plane in units of the map's largest depth."""
 MIN_AGREEING = 2
-"""Other frames that must confirm a depth; one more makes it certain."""
+"""Other frames that must agree on a depth; one more makes it certain."""
 
-Learned = Callable[[int, Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]], np.ndarray]
-"""Depth of one frame by a network, metres, given the map's and where it counts."""
+DepthNet = Callable[[int, Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]], np.ndarray]
+"""Depth of one frame by a network, metres, given the map's depth and where it is valid."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class FrameDepth:
     depth: Float[np.ndarray, "height width"]
     """Metres, 0 = unknown."""
     confidence: UInt8[np.ndarray, "height width"]
-    """2 the map's, or confirmed by several frames; 1 at edges, or inferred; 0 unknown."""
+    """2 from the map, or confirmed by several frames; 1 at edges, or inferred; 0 unknown."""
     inferred: bool
-    """Part of it is an animal's, by contact or by a network."""
+    """Whether part of it is an animal's, by contact or by a network."""
 
 
 def of_map(target: ColorView) -> FrameDepth:
@@ -66,54 +66,54 @@ def of_session(
     room: MapViews,
     walk: Sequence[ColorView],
     length_m: float,
-    learned: Learned | None,
+    depth_net: DepthNet | None,
 ) -> list[FrameDepth | None]:
-    """Return the depth of a session's frames: the room's from the map, the animal's where it stands.
+    """Return the depth of a session's frames: from the map for the room, inferred for the animal.
 
-    None where the picture differs from what the map shows there nearly everywhere.
+    None for frames that differ too much from the map.
     """
     by_view = {id(each.view): each for each in walk}
     times = subsampling.evenly(len(shown), foreground.OTHER_TIMES)
     masks, contacts = [], []
-    for frame, target in enumerate(track(shown, "what stands before the room")):
-        apart = times[np.abs(timestamp_s[times] - timestamp_s[frame]) > foreground.APART_S]
+    for frame, target in enumerate(track(shown, "segmenting the foreground")):
+        distant = times[np.abs(timestamp_s[times] - timestamp_s[frame]) > foreground.MIN_GAP_S]
         seen = [by_view[id(view)] for view in tracking.walk_views(target.view, room)]
-        before = foreground.foreground(target, seen, [shown[other] for other in apart])
-        parts = None if before.mean() > STRANGE_SHARE else _parts(before)
+        in_front = foreground.foreground(target, seen, [shown[other] for other in distant])
+        blobs = None if in_front.mean() > MAX_FOREGROUND else _blobs(in_front)
         camera = target.view.intrinsics, target.view.world_from_camera
-        masks.append(parts)
-        contacts.append([contact.find(part, *camera, room.caster) for part in parts or ()])
+        masks.append(blobs)
+        contacts.append([contact.find(blob, *camera, room.caster) for blob in blobs or ()])
     largest = [touched[0] if touched else None for touched in contacts]
-    carried, found = contact.between(timestamp_s, largest, CARRIED_S), []
+    carried, found = contact.between(timestamp_s, largest, MAX_CONTACT_GAP_S), []
     for frame, seen in enumerate(zip(shown, masks, contacts, carried, strict=True)):
-        found.append(None if masks[frame] is None else _with_animal(frame, *seen, length_m, learned))
+        found.append(None if masks[frame] is None else _with_animal(frame, *seen, length_m, depth_net))
     return found
 
 
-def _parts(mask: Bool[np.ndarray, "height width"]) -> list[Bool[np.ndarray, "height width"]]:
-    """Return connected parts, the largest first."""
+def _blobs(mask: Bool[np.ndarray, "height width"]) -> list[Bool[np.ndarray, "height width"]]:
+    """Return the connected components, largest first."""
     count, label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     sizes = np.bincount(label.ravel(), minlength=count)[1:]
     order = 1 + np.argsort(-sizes, kind="stable")
-    return [label == part for part in order if sizes[part - 1] >= contact.MIN_AREA_PX]
+    return [label == blob for blob in order if sizes[blob - 1] >= contact.MIN_AREA_PX]
 
 
-def _with_animal(frame, target: ColorView, parts, touched, carried, length_m, learned) -> FrameDepth:
-    """Put what stands before the room into the map's depth; it is unknown around it."""
+def _with_animal(frame, target: ColorView, blobs, touched, carried, length_m, depth_net) -> FrameDepth:
+    """Insert the foreground's depth into the map's; around the foreground it is unknown."""
     room, view = of_map(target), target.view
     depth, confidence, inferred = room.depth.copy(), room.confidence.copy(), False
     union = np.zeros(depth.shape, bool)
-    for part in parts:
-        union |= cv2.dilate(part.astype(np.uint8), RIM) > 0
+    for blob in blobs:
+        union |= cv2.dilate(blob.astype(np.uint8), DILATION) > 0
     depth[union], confidence[union] = 0, 0
-    by_network = None if learned is None or not parts else learned(frame, room.depth, ~union)
-    for part, each in zip(parts, touched, strict=True):
+    by_network = None if depth_net is None or not blobs else depth_net(frame, room.depth, ~union)
+    for blob, each in zip(blobs, touched, strict=True):
         point = each.point_world if each is not None and each.certain else carried
         if by_network is not None:
-            own = np.where(part, by_network, 0)
+            own = np.where(blob, by_network, 0)
         elif np.isfinite(point).all():
             camera = view.intrinsics, view.world_from_camera
-            own = contact.depth_of(part, point, BACK_SHARE * length_m, *camera)
+            own = contact.depth_of(blob, point, BACK_SHARE * length_m, *camera)
         else:
             continue
         own = np.where((room.depth > 0) & (own > room.depth), room.depth, own)
@@ -127,16 +127,16 @@ def _with_animal(frame, target: ColorView, parts, touched, carried, length_m, le
 
 
 def of_turnaround(shown: Sequence[ColorView], room: MapViews, walk: Sequence[ColorView]) -> list[FrameDepth]:
-    """Return the depth of frames that circle an animal at rest: by several views, else the map's."""
+    """Return the depth of frames that circle a resting animal: by multi-view stereo, else from the map."""
     views = [_sweep_view(each) for each in shown]
-    others = [_around(number, shown) for number in range(len(shown))]
+    others = [_source_frames(number, shown) for number in range(len(shown))]
     swept = []
-    for number, each in enumerate(track(views, "depth by several views")):
+    for number, each in enumerate(track(views, "plane sweep")):
         near = [views[other] for other in others[number]]
         reach = NEAREST_M, FARTHEST_SHARE * float(shown[number].view.depth.max(initial=1.0))
         swept.append(plane_sweep.sweep(each, near, reach, PLANES) if near else np.zeros_like(each.gray))
     by_view, found = {id(each.view): each for each in walk}, []
-    for number, target in enumerate(track(shown, "what several views agree on")):
+    for number, target in enumerate(track(shown, "multi-view consistency")):
         near = [(swept[other], views[other]) for other in others[number]]
         agree = plane_sweep.agreement(swept[number], views[number], near)
         size = target.view.gray.shape[::-1]
@@ -144,9 +144,9 @@ def of_turnaround(shown: Sequence[ColorView], room: MapViews, walk: Sequence[Col
         several = cv2.resize(swept[number], size, interpolation=cv2.INTER_NEAREST)
         known = agree >= MIN_AGREEING
         seen = [by_view[id(view)] for view in tracking.walk_views(target.view, room)]
-        before = cv2.dilate(foreground.foreground(target, seen, []).astype(np.uint8), RIM) > 0
+        in_front = cv2.dilate(foreground.foreground(target, seen, []).astype(np.uint8), DILATION) > 0
         mapped = of_map(target)
-        depth = np.where(known, several, np.where(before, 0, mapped.depth))
+        depth = np.where(known, several, np.where(in_front, 0, mapped.depth))
         sure = np.clip(agree.astype(int) - MIN_AGREEING + 1, 0, 2)
         confidence = np.where(known, sure, np.where(depth > 0, 1, 0))
         found.append(FrameDepth(depth.astype(np.float32), confidence.astype(np.uint8), False))
@@ -162,8 +162,8 @@ def _sweep_view(shown: ColorView) -> SweepView:
     return SweepView(gray, intrinsics, view.world_from_camera)
 
 
-def _around(number: int, shown: Sequence[ColorView]) -> list[int]:
-    """Choose the frames that see the middle of a view under good angles, spread evenly over them."""
+def _source_frames(number: int, shown: Sequence[ColorView]) -> list[int]:
+    """Choose source frames with good triangulation angles at the middle of a view, evenly over the angles."""
     view = shown[number].view
     known = view.depth[view.depth > 0]
     if not len(known):

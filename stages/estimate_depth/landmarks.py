@@ -1,4 +1,4 @@
-"""What the walk-through's pictures show, as points of the map: SIFT with their place in the world.
+"""Landmarks: SIFT keypoints of the walk-through with their world points.
 
 `build` describes keyframes of the walk-through and casts each keypoint onto the scene's surface;
 `Landmarks.match` pairs the keypoints of another picture of the room with points of the world.
@@ -19,32 +19,32 @@ from pipeline.mapping import sift
 from pipeline.mapping.sift import Keypoints
 
 KEYFRAMES, POINTS = 80, 1200
-"""Pictures of the walk-through that are described, and keypoints of every picture, at most."""
+"""Largest number of keyframes of the walk-through, and of keypoints per picture."""
 PEAK_THRESHOLD = 0.02
 """SIFT's contrast threshold; plain walls need a low one (OpenCV's default is 0.04)."""
-RETRIEVED = 6
-"""Keyframes that a picture is matched with: those that hold the most of its nearest descriptors."""
+RETRIEVED_KEYFRAMES = 6
+"""Keyframes that a picture is matched with: those with most of its nearest descriptors."""
 TREES, CHECKS = 4, 32
-"""k-d trees over all descriptors, and leaves that are searched in them."""
+"""FLANN: number of randomized k-d trees, and of leaves searched."""
 INDEX_KDTREE = 1
 """FLANN's name for randomized k-d trees."""
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Pixels of one picture and the points of the world that look the same."""
+    """2D-3D correspondences: pixels of one picture and world points."""
 
     pixel: Float[np.ndarray, "match 2"]
     points_world: Float[np.ndarray, "match 3"]
 
 
 def describe(color: UInt8[np.ndarray, "height width 3"]) -> Keypoints:
-    """Find and describe the strongest keypoints of a picture."""
+    """Detect and describe the strongest keypoints of a picture."""
     return sift.describe(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), POINTS, PEAK_THRESHOLD)
 
 
 class Landmarks:
-    """Described keyframes of the walk-through, whose keypoints are points of the world."""
+    """Keyframes of the walk-through with descriptors and world points of their keypoints."""
 
     def __init__(self, keyframes: list[tuple[Keypoints, Float[np.ndarray, "point 3"]]]):
         self.keyframes = keyframes
@@ -55,22 +55,22 @@ class Landmarks:
         self._index.train()
 
     def match(self, keypoints: Keypoints) -> Matches:
-        """Match a picture with the keyframes that hold the most of its nearest descriptors."""
+        """Match a picture with the keyframes that have most of its nearest descriptors."""
         if not len(keypoints.pixel):
             return Matches(np.zeros((0, 2)), np.zeros((0, 3)))
         nearest = [each.trainIdx for each in self._index.match(keypoints.descriptors)]
-        held = np.bincount(self._owner[nearest], minlength=len(self.keyframes))
+        votes = np.bincount(self._owner[nearest], minlength=len(self.keyframes))
         pixel, points = [], []
-        for keyframe in np.argsort(-held, kind="stable")[:RETRIEVED]:
+        for keyframe in np.argsort(-votes, kind="stable")[:RETRIEVED_KEYFRAMES]:
             known, points_world = self.keyframes[keyframe]
-            mine, theirs = sift.matches(keypoints.descriptors, known.descriptors).T
-            pixel.append(keypoints.pixel[mine])
-            points.append(points_world[theirs])
+            query, train = sift.matches(keypoints.descriptors, known.descriptors).T
+            pixel.append(keypoints.pixel[query])
+            points.append(points_world[train])
         return Matches(np.concatenate(pixel), np.concatenate(points))
 
 
 def build(walk: Clip, walk_cameras: SceneCameras, caster: RayCaster) -> Landmarks:
-    """Describe keyframes spread over the walk-through, those that the template registered."""
+    """Describe registered keyframes spread evenly over the walk-through."""
     keyframes = []
     for frame in track(keyframe_numbers(walk_cameras).tolist(), "landmarks"):
         found = describe(walk.color(frame))
@@ -82,7 +82,7 @@ def build(walk: Clip, walk_cameras: SceneCameras, caster: RayCaster) -> Landmark
 
 
 def keyframe_numbers(walk_cameras: SceneCameras) -> Int[np.ndarray, "keyframe"]:
-    """Choose the frames of the walk-through that stand for it."""
+    """Choose the keyframes of the walk-through."""
     registered = np.flatnonzero(walk_cameras.registered)
     return registered[subsampling.evenly(len(registered), KEYFRAMES)]
 
@@ -93,7 +93,7 @@ def on_surface(
     world_from_camera: Float[np.ndarray, "4 4"],
     caster: RayCaster,
 ) -> Float[np.ndarray, "point 3"]:
-    """Return the points of the surface that pixels of a camera show, NaN where there is none."""
+    """Intersect the rays of pixels with the surface: world points, NaN where nothing is hit."""
     direction = cameras.unproject(pixel, intrinsics) @ world_from_camera[:3, :3].T
     hits = caster.cast(world_from_camera[:3, 3], direction)
     distance = np.where(hits.face >= 0, hits.distance, np.nan)

@@ -1,4 +1,4 @@
-"""The lens of a plain video: focal length and radial distortion, from points of the map that it shows."""
+"""Calibration of a plain video: focal length and radial distortion, from correspondences with the map."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,28 +15,28 @@ from pipeline.geometry import rigid
 from stages.estimate_depth.landmarks import Matches
 
 FOCAL_SHARE = 0.85
-"""Focal length that calibration begins from, share of the picture's longer side: a phone's main camera."""
+"""Initial focal length, share of the picture's longer side: a phone's main camera."""
 FRAMES = 40
-"""Frames that calibrate the lens, those with the most points of the map."""
+"""Frames used for calibration: those with most matches."""
 MIN_MATCHES = 6
-"""Matches without which there is no camera: with fewer, three wrong ones may agree."""
+"""Least matches for a pose: with fewer, three wrong ones may agree."""
 MIN_INLIERS, MIN_SHARE = 25, 0.25
-"""Matches that must agree on a pose, and their share of all, for a frame to be sure of its place."""
-PIXELS_SHARE = 0.008
-"""Share of the picture's longer side within which a match agrees: the noise of a map of centimetres."""
-ROUNDS = 30
-"""Evaluations of all residuals at most."""
+"""Inliers and inlier ratio of a reliable pose."""
+INLIER_SHARE = 0.008
+"""RANSAC threshold, share of the picture's longer side: map points are accurate to centimetres."""
+MAX_EVALUATIONS = 30
+"""Largest number of residual evaluations."""
 LOSS_PX = 1.0
-"""Residual from which on a match counts less in the calibration, pixels."""
+"""Scale of the robust loss, pixels."""
 RADIAL_SIGMA = 0.05
-"""Deviation of the distortion from none, in units of a match's: phones straighten their videos."""
-MIN_BEND_PX = 0.5
-"""Distortion at the corner below which pictures stay as they are, pixels."""
+"""Prior standard deviation of the radial coefficient: phones undistort their videos."""
+MIN_DISTORTION_PX = 0.5
+"""Corner displacement below which distortion is ignored, pixels."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A pinhole in the middle of the picture, and its first radial distortion coefficient (COLMAP's k1)."""
+    """A centred pinhole camera with the first radial distortion coefficient (COLMAP's k1)."""
 
     focal_px: float
     radial: float
@@ -44,12 +44,12 @@ class Lens:
     """(height, width) of the pictures."""
 
     def resized(self, size: tuple[int, int]) -> "Lens":
-        """Return the lens for pictures of another (height, width), straightened ones."""
+        """Return the lens of undistorted pictures of another (height, width)."""
         return Lens(self.focal_px * size[1] / self.size[1], 0.0, size)
 
     @property
     def intrinsics(self) -> Float[np.ndarray, "3 3"]:
-        """Return the pinhole."""
+        """Return the pinhole matrix."""
         height, width = self.size
         return np.array([[self.focal_px, 0, width / 2], [0, self.focal_px, height / 2], [0, 0, 1]])
 
@@ -61,14 +61,14 @@ class Lens:
         return pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=parameters)
 
     @property
-    def bends(self) -> bool:
+    def is_distorted(self) -> bool:
         """Return whether pictures must be undistorted."""
         corner = np.hypot(*self.size) / 2 / self.focal_px
-        return abs(self.radial) * corner**3 * self.focal_px > MIN_BEND_PX
+        return abs(self.radial) * corner**3 * self.focal_px > MIN_DISTORTION_PX
 
-    def straightened(self, color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
-        """Return a picture as the pinhole alone would have taken it."""
-        if not self.bends:
+    def undistorted(self, color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+        """Undistort a picture."""
+        if not self.is_distorted:
             return color
         centred = self.intrinsics
         centred[:2, 2] -= 0.5
@@ -76,35 +76,35 @@ class Lens:
 
 
 @dataclass(frozen=True)
-class Located:
-    """One frame's camera, by the matches that agree."""
+class PnPResult:
+    """One frame's camera pose and its inliers."""
 
     world_from_camera: Float[np.ndarray, "4 4"]
     matches: Matches
-    """Those that agree."""
-    share: float
+    """The inliers."""
+    inlier_ratio: float
     """Of all matches."""
     focal_px: float
 
     @property
-    def sure(self) -> bool:
-        """Return whether enough matches agree to believe it without neighbours."""
-        return len(self.matches.pixel) >= MIN_INLIERS and self.share >= MIN_SHARE
+    def reliable(self) -> bool:
+        """Return whether the inliers suffice to trust the pose without neighbours."""
+        return len(self.matches.pixel) >= MIN_INLIERS and self.inlier_ratio >= MIN_SHARE
 
 
 def locate(
     matches: Matches, lens: Lens, seed: int, *, within_px: float | None = None, calibrate: bool = False
-) -> Located | None:
-    """Return a frame's camera by PnP with LO-RANSAC and refinement, to ``calibrate`` its focal length too.
+) -> PnPResult | None:
+    """Estimate a frame's camera by PnP with LO-RANSAC and refinement; ``calibrate``: its focal length too.
 
-    None where too few matches agree on any.
+    None without enough matches or a consensus.
     """
     if len(matches.pixel) < MIN_MATCHES:
         return None
     estimation = pycolmap.AbsolutePoseEstimationOptions()
     refinement = pycolmap.AbsolutePoseRefinementOptions()
     estimation.ransac.random_seed = seed
-    estimation.ransac.max_error = within_px or PIXELS_SHARE * max(lens.size)
+    estimation.ransac.max_error = within_px or INLIER_SHARE * max(lens.size)
     estimation.estimate_focal_length = refinement.refine_focal_length = calibrate
     camera = lens.camera
     found = pycolmap.estimate_and_refine_absolute_pose(
@@ -116,26 +116,26 @@ def locate(
     camera_from_world = np.eye(4)
     camera_from_world[:3] = found["cam_from_world"].matrix()
     agreeing = Matches(matches.pixel[inlier], matches.points_world[inlier])
-    return Located(rigid.inverse(camera_from_world), agreeing, float(inlier.mean()), camera.focal_length)
+    return PnPResult(rigid.inverse(camera_from_world), agreeing, float(inlier.mean()), camera.focal_length)
 
 
 def calibrate(matches: Sequence[Matches], size: tuple[int, int], seed: int) -> Lens | None:
-    """Find the lens by all frames together; None where no frame is sure of its place."""
+    """Calibrate the lens over all frames; None if no frame has a reliable pose."""
     most = np.argsort([-len(each.pixel) for each in matches], kind="stable")[:FRAMES]
     nominal = Lens(FOCAL_SHARE * max(size), 0.0, size)
     free = [locate(matches[frame], nominal, seed, calibrate=True) for frame in most]
-    focal = [(each.focal_px, len(each.matches.pixel)) for each in filter(None, free) if each.sure]
+    focal = [(each.focal_px, len(each.matches.pixel)) for each in filter(None, free) if each.reliable]
     if not focal:
         return None
     px, weight = np.array(sorted(focal)).T
     first = Lens(float(px[np.searchsorted(np.cumsum(weight), 0.5 * weight.sum())]), 0.0, size)
     located = [locate(matches[frame], first, seed) for frame in most]
-    sure = [each for each in filter(None, located) if each.sure]
-    return adjusted(first, sure) if sure else first
+    reliable = [each for each in filter(None, located) if each.reliable]
+    return bundle_adjust(first, reliable) if reliable else first
 
 
-def adjusted(lens: Lens, located: Sequence[Located], *, bend: bool = True) -> Lens:
-    """Adjust focal length, all cameras and, if it may ``bend``, distortion together; the map is fixed."""
+def bundle_adjust(lens: Lens, located: Sequence[PnPResult], *, distortion: bool = True) -> Lens:
+    """Jointly refine focal length, cameras and, if asked, ``distortion`` on fixed map points."""
     camera_from_world = np.stack([rigid.inverse(each.world_from_camera) for each in located])
     count = [len(each.matches.pixel) for each in located]
     frame = np.repeat(np.arange(len(located)), count)
@@ -151,7 +151,7 @@ def adjusted(lens: Lens, located: Sequence[Located], *, bend: bool = True) -> Le
         flat = moved[:, :2] / np.maximum(moved[:, 2:], 1e-3)
         distorted = flat * (1 + radial * (flat**2).sum(1, keepdims=True))
         off_px = (scale * lens.focal_px * distorted + centre - pixel).ravel()
-        sigma = RADIAL_SIGMA if bend else 1e-6
+        sigma = RADIAL_SIGMA if distortion else 1e-6
         return np.append(off_px, (radial - lens.radial) * np.sqrt(len(pixel)) / sigma)
 
     sparsity = scipy.sparse.lil_matrix((2 * len(pixel) + 1, 2 + 6 * len(located)), dtype=int)
@@ -166,6 +166,6 @@ def adjusted(lens: Lens, located: Sequence[Located], *, bend: bool = True) -> Le
         loss="soft_l1",
         f_scale=LOSS_PX,
         x_scale="jac",
-        max_nfev=ROUNDS,
+        max_nfev=MAX_EVALUATIONS,
     )
     return Lens(float(fitted.x[0] * lens.focal_px), float(fitted.x[1]), lens.size)

@@ -1,14 +1,14 @@
-"""Metres for a network's depth: the map's depth around the animal gives scale and shift, frame by frame."""
+"""Align monocular depth to metres: per-frame scale and shift from the map's depth."""
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 ROUNDS = 8
-"""Reweighted least-squares fits; the weights have settled by then."""
+"""Iterations of reweighted least squares; the weights converge earlier."""
 MIN_PIXELS = 50
-"""Pixels of the map without which a frame cannot be scaled."""
+"""Least map pixels for alignment."""
 NEAREST_M, FARTHEST_M = 0.1, 20.0
-"""Depth beyond these is none, metres."""
+"""Range of valid depth, metres."""
 
 
 def aligned(
@@ -16,10 +16,10 @@ def aligned(
     mapped: Float[np.ndarray, "height width"],
     counts: Bool[np.ndarray, "height width"],
 ) -> Float[np.ndarray, "height width"]:
-    """Return depth in metres from numbers that grow with inverse depth: 1 / depth = scale * number + shift.
+    """Return metric depth from relative inverse depth: 1 / depth = scale * inverse + shift.
 
-    Scale and shift are fitted to the map's depth (metres) where it ``counts``, Cauchy weights at the median
-    residual; 0 where there is none, and everywhere where too little counts or the scale is not positive.
+    Scale and shift are fitted to the map's depth (metres) where ``counts``, with Cauchy weights scaled by the
+    median residual. Returns 0 where depth is invalid, and everywhere if too little counts or scale <= 0.
     """
     if counts.sum() < MIN_PIXELS:
         return np.zeros(inverse.shape, np.float32)

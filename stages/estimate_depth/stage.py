@@ -26,7 +26,7 @@ from stages.estimate_depth.lens import Lens
 from stages.estimate_depth.tracking import MapViews, Tracked, TrackingInput
 
 MIN_PLACED, MIN_FRAMES = 0.3, 10
-"""Share of the frames, and their number, that must find a place in the map."""
+"""Least share and number of frames with a camera pose in the map."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Inputs:
     pictures: Path
     """`pictures/<id>` of the recording."""
     frames: Mapping[str, Path]
-    """The walk-through that the map was made from, by recording."""
+    """The walk-through of the map, by recording id."""
     scene_template: Path
     """The map."""
 
@@ -46,7 +46,7 @@ def run(
 ) -> writing.Estimated:
     """Estimate cameras and depth of one recording into `out`.
 
-    Raises MAP-007 where the map does not show what the recording does, MOD-001 to MOD-003 for a checkpoint.
+    Raises MAP-007 if the recording does not match the map, MOD-001 to MOD-003 for a checkpoint.
     """
     pictures, walk = Pictures.open(inputs.pictures), Clip.open(next(iter(inputs.frames.values())))
     walk_cameras = SceneCameras.open(inputs.scene_template)
@@ -54,25 +54,25 @@ def run(
     network = None if config.backend == "contact" else MonocularDepth(config.backend, config.weights, device)
     known = landmarks.build(walk, walk_cameras, caster)
     keyframes = landmarks.keyframe_numbers(walk_cameras).tolist()
-    walked = [_walk_view(walk, walk_cameras, frame, caster) for frame in keyframes]
-    room = MapViews(caster, [each.view for each in walked])
+    walk_views = [_walk_view(walk, walk_cameras, frame, caster) for frame in keyframes]
+    room = MapViews(caster, [each.view for each in walk_views])
     found, tracked = _placed(pictures, known, room, config)
     placed = np.flatnonzero(tracked.placed)
     if len(placed) < max(MIN_FRAMES, MIN_PLACED * len(pictures)):
         raise _unrecognized(pictures, f"{len(placed)} of {len(pictures)} frames find a place in the map")
     log(f"focal length {found.focal_px:.1f} px; {len(placed)} of {len(pictures)} frames placed")
     shown = []
-    for frame in track(placed.tolist(), "looking at the map"):
-        color = found.straightened(pictures.color(frame))
+    for frame in track(placed.tolist(), "rendering the map"):
+        color = found.undistorted(pictures.color(frame))
         pose, gray = tracked.world_from_camera[frame], views.small_gray(color)
         shown.append(foreground.color_view(color, views.view_of(gray, tracked.lens.intrinsics, pose, caster)))
     match role_of_animal(video, config.role):
         case "turnaround":
-            depths = depth.of_turnaround(shown, room, walked)
+            depths = depth.of_turnaround(shown, room, walk_views)
         case "session":
             time_s = pictures.timestamp_s[placed]
-            learned = None if network is None else _learned(network, pictures, placed, found)
-            depths = depth.of_session(shown, time_s, room, walked, config.length_m, learned)
+            depth_net = None if network is None else _depth_net(network, pictures, placed, found)
+            depths = depth.of_session(shown, time_s, room, walk_views, config.length_m, depth_net)
         case role:
             assert_never(role)
     chosen = [number for number, each in enumerate(depths) if each is not None]
@@ -97,15 +97,15 @@ def _walk_view(walk: Clip, walk_cameras: SceneCameras, frame: int, caster: RayCa
 def _placed(
     pictures: Pictures, known: landmarks.Landmarks, room: MapViews, config: Config
 ) -> tuple[Lens, Tracked]:
-    """Calibrate the lens and place the frames."""
+    """Calibrate the lens and estimate the camera poses."""
     frames = range(len(pictures))
-    keypoints = [landmarks.describe(pictures.color(each)) for each in track(frames, "describing pictures")]
-    matches = [known.match(each) for each in track(keypoints, "recognizing the room")]
+    keypoints = [landmarks.describe(pictures.color(each)) for each in track(frames, "detecting keypoints")]
+    matches = [known.match(each) for each in track(keypoints, "matching the map")]
     found = lens.calibrate(matches, pictures.color_size, config.seed)
     if found is None:
         raise _unrecognized(pictures, "no frame shows anything that the walk-through shows as well")
     located = [lens.locate(each, found, config.seed) for each in matches]
-    gray = [views.small_gray(found.straightened(pictures.color(frame))) for frame in frames]
+    gray = [views.small_gray(found.undistorted(pictures.color(frame))) for frame in frames]
     scale = gray[0].shape[1] / pictures.color_size[1]
     small = [Keypoints(each.pixel * scale, each.descriptors) for each in keypoints]
     footage = TrackingInput(pictures.timestamp_s, gray, small, found.resized(gray[0].shape))
@@ -113,13 +113,15 @@ def _placed(
     return Lens(tracked.lens.focal_px / scale, found.radial, pictures.color_size), tracked
 
 
-def _learned(network: MonocularDepth, pictures: Pictures, placed: np.ndarray, found: Lens) -> depth.Learned:
-    def learned(number: int, mapped: np.ndarray, counts: np.ndarray) -> np.ndarray:
-        color = found.straightened(pictures.color(int(placed[number])))
+def _depth_net(
+    network: MonocularDepth, pictures: Pictures, placed: np.ndarray, found: Lens
+) -> depth.DepthNet:
+    def depth_net(number: int, mapped: np.ndarray, counts: np.ndarray) -> np.ndarray:
+        color = found.undistorted(pictures.color(int(placed[number])))
         inverse = cv2.resize(network.inverse_depth(color), mapped.shape[::-1], interpolation=cv2.INTER_LINEAR)
         return monocular.aligned(inverse, mapped, counts & (mapped > 0))
 
-    return learned
+    return depth_net
 
 
 def _unrecognized(pictures: Pictures, what: str) -> InputError:

@@ -1,8 +1,8 @@
-"""Cameras of a plain video in the map: landmarks, tracking between frames, and one adjustment of all.
+"""Cameras of a plain video in the map: landmarks, tracking between frames, and joint optimization.
 
-A picture that shows much of the walk-through is placed by its landmarks. The others are tracked from their
-neighbours by optical flow over the map's surface. Then all frames are optimized together: by flow from the
-walk-through's pictures, seen from each camera, and by flow between neighbours.
+Pictures with enough landmarks are localized by them. The others are tracked from their neighbours by optical
+flow on the map's surface. Then all frames are optimized jointly, by flow to warped pictures of the
+walk-through and flow between neighbours.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,27 +20,26 @@ from pipeline.mapping.sift import Keypoints
 from stages.estimate_depth import landmarks, views
 from stages.estimate_depth import lens as lenses
 from stages.estimate_depth.landmarks import Matches
-from stages.estimate_depth.lens import Lens, Located, locate
+from stages.estimate_depth.lens import Lens, PnPResult, locate
 from stages.estimate_depth.views import View
 
 WALK_VIEWS = 2
-"""Pictures of the walk-through that each frame is compared with: those that see the most of the same."""
+"""Pictures of the walk-through that each frame is compared with: those with most overlap."""
 NEIGHBOURS = (1, 3)
-"""Frames after a frame that it is compared with."""
+"""Frame gaps of the flow between neighbours."""
 PROBES = 60
-"""Pixels of a frame by which pictures of the walk-through that see the same are found."""
-TRACKED_SHARE, ENOUGH_SHARE = 0.35, 0.7
-"""Share of the flow between frames that must agree on a camera for it to be placed, and with which no other
-explanation is searched."""
-MIN_SURE = 3
-"""Frames placed by landmarks that a piece between two jumps needs."""
-FASTEST_M_S, FASTEST_RAD_S = 3.0, 4.0
-"""A camera that moves faster than this between frames was misplaced."""
-SIGMA_PX, GATE_PX = 8.0, 2.5
-"""Deviation of flow, which errs together over hundreds of pixels, and how far a match may lie from the
-camera's first answer, pixels of the small pictures."""
+"""Sample pixels that measure the overlap with pictures of the walk-through."""
+MIN_RATIO, GOOD_RATIO = 0.35, 0.7
+"""Inlier ratio of flow that a tracked pose needs, and with which no further hypothesis is tried."""
+MIN_RELIABLE = 3
+"""Frames localized by landmarks that a segment between jumps needs."""
+MAX_M_S, MAX_RAD_S = 3.0, 4.0
+"""Faster camera motion between frames is a jump."""
+SIGMA_PX, INLIER_PX = 8.0, 2.5
+"""Standard deviation of flow, whose errors are correlated over hundreds of pixels, and RANSAC threshold, in
+pixels of the small pictures."""
 PASSES, REACH_M = 2, (0.1, 0.05, 0.05)
-"""How often pictures are compared anew, and widths of the robust weight in each pass, metres."""
+"""Passes of matching, and scales of the robust weight within each, metres."""
 
 
 @dataclass(frozen=True)
@@ -48,25 +47,25 @@ class Tracked:
     """Cameras in the map's world."""
 
     world_from_camera: Float[np.ndarray, "frame 4 4"]
-    """NaN where a frame was not placed."""
+    """NaN for frames without a pose."""
     by_landmarks: Bool[np.ndarray, "frame"]
-    """Placed by the map alone; the others beside their neighbours."""
+    """Localized by landmarks; the others are tracked from their neighbours."""
     lens: Lens
-    """Of the small pictures, adjusted with the cameras."""
+    """Of the small pictures, refined with the cameras."""
 
     @property
     def placed(self) -> Bool[np.ndarray, "frame"]:
-        """Return which frames have a place."""
+        """Return which frames have a pose."""
         return np.isfinite(self.world_from_camera[:, 0, 0])
 
 
 @dataclass(frozen=True)
 class TrackingInput:
-    """What tracking reads of a video."""
+    """A video's input to tracking."""
 
     timestamp_s: Float[np.ndarray, "frame"]
     gray: Sequence[UInt8[np.ndarray, "height width"]]
-    """Small straightened pictures (`views.small_gray`)."""
+    """Small undistorted pictures (`views.small_gray`)."""
     keypoints: Sequence[Keypoints]
     """In pixels of the small pictures."""
     lens: Lens
@@ -75,58 +74,58 @@ class TrackingInput:
 
 @dataclass(frozen=True)
 class MapViews:
-    """The map as pictures see it."""
+    """The map: its surface, and views of the walk-through."""
 
     caster: RayCaster
     walk: Sequence[View]
 
 
-def place(footage: TrackingInput, located: Sequence[Located | None], room: MapViews, seed: int) -> Tracked:
-    """Place all frames that can be; ``located`` are those that landmarks place."""
+def place(footage: TrackingInput, located: Sequence[PnPResult | None], room: MapViews, seed: int) -> Tracked:
+    """Estimate all cameras; ``located`` are the poses by landmarks."""
     poses = np.full((len(located), 4, 4), np.nan)
     for frame, each in enumerate(located):
-        if each is not None and each.sure:
+        if each is not None and each.reliable:
             poses[frame] = each.world_from_camera
-    forget_strays(footage.timestamp_s, poses, np.isfinite(poses[:, 0, 0]))
+    discard_stray_segments(footage.timestamp_s, poses, np.isfinite(poses[:, 0, 0]))
     sure = np.isfinite(poses[:, 0, 0])
-    for frame in track(_outward(sure), "tracking"):
+    for frame in track(_by_distance(sure), "tracking"):
         _track_one(frame, footage, poses, room, seed)
-    forget_strays(footage.timestamp_s, poses, sure)
+    discard_stray_segments(footage.timestamp_s, poses, sure)
     placed = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     log(f"{int(sure.sum())} frames placed by landmarks, {len(placed)} of {len(poses)} in all")
     for number in range(PASSES if len(placed) else 0):
-        poses[placed], lens = _adjusted(placed, footage, poses[placed], room, seed)
+        poses[placed], lens = _optimize(placed, footage, poses[placed], room, seed)
         if number == 0:
             footage = replace(footage, lens=lens)
     return Tracked(poses, sure, footage.lens)
 
 
-def _outward(sure: Bool[np.ndarray, "frame"]) -> list[int]:
-    """Order the other frames by their distance from a sure one."""
+def _by_distance(sure: Bool[np.ndarray, "frame"]) -> list[int]:
+    """Order the other frames by their distance from a localized one."""
     if not sure.any():
         return []
     distance = np.abs(np.arange(len(sure))[:, None] - np.flatnonzero(sure)).min(1)
     return [int(frame) for frame in np.argsort(distance, kind="stable") if distance[frame] > 0]
 
 
-def forget_strays(
+def discard_stray_segments(
     timestamp_s: Float[np.ndarray, "frame"],
     poses: Float[np.ndarray, "frame 4 4"],
     sure: Bool[np.ndarray, "frame"],
 ) -> None:
-    """Forget, in place, pieces between jumps that fewer than `MIN_SURE` frames placed by landmarks hold.
+    """Discard, in place, segments between jumps with fewer than `MIN_RELIABLE` frames localized by landmarks.
 
-    On floors that repeat, flow locks on to the wrong board.
+    On repetitive floors, flow locks on to the wrong board.
     """
     known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     if len(known) < 2:
         return
     gap_s = np.maximum(np.diff(timestamp_s[known]), 1e-3)
-    fast = np.linalg.norm(np.diff(poses[known, :3, 3], axis=0), axis=1) > FASTEST_M_S * gap_s
-    fast |= rigid.rotation_angle(poses[known[:-1], :3, :3], poses[known[1:], :3, :3]) > FASTEST_RAD_S * gap_s
-    piece = np.r_[0, np.cumsum(fast)]
-    held = np.bincount(piece, sure[known], minlength=piece[-1] + 1)
-    poses[known[(held < min(MIN_SURE, held.max()))[piece]]] = np.nan
+    fast = np.linalg.norm(np.diff(poses[known, :3, 3], axis=0), axis=1) > MAX_M_S * gap_s
+    fast |= rigid.rotation_angle(poses[known[:-1], :3, :3], poses[known[1:], :3, :3]) > MAX_RAD_S * gap_s
+    segment = np.r_[0, np.cumsum(fast)]
+    reliable_count = np.bincount(segment, sure[known], minlength=segment[-1] + 1)
+    poses[known[(reliable_count < min(MIN_RELIABLE, reliable_count.max()))[segment]]] = np.nan
 
 
 def _view(frame: int, footage: TrackingInput, pose, room: MapViews) -> View:
@@ -134,23 +133,23 @@ def _view(frame: int, footage: TrackingInput, pose, room: MapViews) -> View:
 
 
 def _track_one(frame, footage: TrackingInput, poses, room: MapViews, seed) -> None:
-    """Place one frame beside its nearest placed neighbour, in place, from the guess that explains most."""
+    """Track one frame, in place, from its nearest neighbour, by the hypothesis with most inliers."""
     known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     other = int(known[np.abs(known - frame).argmin()])
     source, best = _view(other, footage, poses[other], room), None
-    for guess in _guesses(frame, other, footage, poses, room, seed):
-        matches = views.flow_matches(_view(frame, footage, guess, room), source)
-        found = locate(matches, footage.lens, seed, within_px=GATE_PX)
-        if found is not None and (best is None or found.share > best.share):
+    for hypothesis in _hypotheses(frame, other, footage, poses, room, seed):
+        matches = views.flow_matches(_view(frame, footage, hypothesis, room), source)
+        found = locate(matches, footage.lens, seed, within_px=INLIER_PX)
+        if found is not None and (best is None or found.inlier_ratio > best.inlier_ratio):
             best = found
-        if best is not None and best.share >= ENOUGH_SHARE:
+        if best is not None and best.inlier_ratio >= GOOD_RATIO:
             break
-    if best is not None and best.share >= TRACKED_SHARE:
+    if best is not None and best.inlier_ratio >= MIN_RATIO:
         poses[frame] = best.world_from_camera
 
 
-def _guesses(frame, other, footage: TrackingInput, poses, room: MapViews, seed) -> Iterator[np.ndarray]:
-    """Yield where a frame may be: moved on as before, by matched keypoints, and where its neighbour is."""
+def _hypotheses(frame, other, footage: TrackingInput, poses, room: MapViews, seed) -> Iterator[np.ndarray]:
+    """Yield pose hypotheses: constant velocity, matched keypoints, and the neighbour's pose."""
     beyond = 2 * other - frame
     if 0 <= beyond < len(poses) and np.isfinite(poses[beyond, 0, 0]):
         yield poses[other] @ rigid.inverse(poses[beyond]) @ poses[other]
@@ -165,7 +164,7 @@ def _guesses(frame, other, footage: TrackingInput, poses, room: MapViews, seed) 
 
 
 def walk_views(target: View, room: MapViews) -> list[View]:
-    """Return the pictures of the walk-through that see the most of what a view shows, at a like distance."""
+    """Return the pictures of the walk-through with most overlap with a view, at a similar scale."""
     rows, columns = np.nonzero(target.depth > 0)
     chosen = np.linspace(0, len(rows) - 1, PROBES).astype(int) if len(rows) else np.zeros(0, int)
     z = target.depth[rows[chosen], columns[chosen]]
@@ -186,8 +185,8 @@ def walk_views(target: View, room: MapViews) -> list[View]:
 
 
 @dataclass(frozen=True)
-class _Tie:
-    """Rays of one camera, and the points of the map, or of another camera, that they meet."""
+class _FlowFactor:
+    """Rays of one camera and the corresponding points of the map or of another camera."""
 
     first: int
     second: int
@@ -197,43 +196,43 @@ class _Tie:
     """In the world, or in the second camera, metres."""
 
 
-def _adjusted(
+def _optimize(
     frames, footage: TrackingInput, poses, room: MapViews, seed
 ) -> tuple[Float[np.ndarray, "placed 4 4"], Lens]:
-    """Optimize the placed frames together, by what pictures show from where they are now; then the lens."""
+    """Jointly optimize the poses by flow matched from the current ones; then refine the lens."""
     seen = [_view(int(frame), footage, pose, room) for frame, pose in zip(frames, poses, strict=True)]
     at, sigma = {int(frame): number for number, frame in enumerate(frames)}, SIGMA_PX / footage.lens.focal_px
-    ties: list[_Tie] = []
-    for number, frame in enumerate(track(frames.tolist(), "comparing pictures")):
+    factors: list[_FlowFactor] = []
+    for number, frame in enumerate(track(frames.tolist(), "matching by flow")):
         for walk in walk_views(seen[number], room):
-            matches = _agreeing(views.flow_matches(seen[number], walk), footage.lens, seed)
-            ties.append(_Tie(number, MAP, matches.pixel, matches.points_world))
+            matches = _inliers(views.flow_matches(seen[number], walk), footage.lens, seed)
+            factors.append(_FlowFactor(number, MAP, matches.pixel, matches.points_world))
         for other in (at[frame + gap] for gap in NEIGHBOURS if frame + gap in at):
-            matches = _agreeing(views.flow_matches(seen[other], seen[number]), footage.lens, seed)
+            matches = _inliers(views.flow_matches(seen[other], seen[number]), footage.lens, seed)
             points_camera = rigid.apply(rigid.inverse(poses[number]), matches.points_world)
-            ties.append(_Tie(other, number, matches.pixel, points_camera))
+            factors.append(_FlowFactor(other, number, matches.pixel, points_camera))
 
     def find(current, reach_m):
-        return Correspondences.join(*(_across(tie, current, sigma, footage.lens) for tie in ties))
+        return Correspondences.join(*(_to_rays(factor, current, sigma, footage.lens) for factor in factors))
 
     poses = optimize_poses(poses, find, None, reach_m=REACH_M).world_from_camera
-    mapped = [tie for tie in ties if tie.second == MAP and len(tie.pixel)]
+    mapped = [factor for factor in factors if factor.second == MAP and len(factor.pixel)]
     placed = []
-    for tie in (mapped[number] for number in subsampling.evenly(len(mapped), lenses.FRAMES)):
-        matches = Matches(tie.pixel, tie.points)
-        placed.append(Located(poses[tie.first], matches, 1.0, footage.lens.focal_px))
-    return poses, lenses.adjusted(footage.lens, placed, bend=False) if placed else footage.lens
+    for factor in (mapped[number] for number in subsampling.evenly(len(mapped), lenses.FRAMES)):
+        matches = Matches(factor.pixel, factor.points)
+        placed.append(PnPResult(poses[factor.first], matches, 1.0, footage.lens.focal_px))
+    return poses, lenses.bundle_adjust(footage.lens, placed, distortion=False) if placed else footage.lens
 
 
-def _agreeing(matches: Matches, lens: Lens, seed) -> Matches:
-    """Keep the matches that one camera explains."""
-    found = locate(matches, lens, seed, within_px=GATE_PX)
+def _inliers(matches: Matches, lens: Lens, seed) -> Matches:
+    """Keep the inliers of one camera."""
+    found = locate(matches, lens, seed, within_px=INLIER_PX)
     return Matches(np.zeros((0, 2)), np.zeros((0, 3))) if found is None else found.matches
 
 
-def _across(tie: _Tie, current, sigma, lens: Lens) -> Correspondences:
-    """Return a tie across its rays, from where the cameras are now."""
-    first, second, pixel, points = tie.first, tie.second, tie.pixel, tie.points
+def _to_rays(factor: _FlowFactor, current, sigma, lens: Lens) -> Correspondences:
+    """Return point-to-ray correspondences across the rays at the current cameras."""
+    first, second, pixel, points = factor.first, factor.second, factor.pixel, factor.points
     world = points if second == MAP else rigid.apply(current[second], points)
     z = np.maximum(rigid.apply(rigid.inverse(current[first]), world)[:, 2], 0.1)
     rays, count = cameras.unproject(pixel, lens.intrinsics), len(pixel)

@@ -1,7 +1,7 @@
-"""Pictures of a surface that is known: what one shows, as seen from another's camera.
+"""Warping pictures of a known surface between cameras.
 
-A `View` is a small grey picture with its camera and the surface's depth in it. `warp` brings one into
-another's camera, `flow_matches` compares both there by optical flow.
+A `View` is a small grey picture with its camera and the surface's depth. `warp` maps one view into another's
+camera, and `flow_matches` measures the remaining displacement by optical flow.
 """
 
 from dataclasses import dataclass
@@ -15,22 +15,22 @@ from pipeline.geometry.meshes import RayCaster, render_view
 from stages.estimate_depth.landmarks import Matches
 
 SHORTER_PX = 240
-"""Shorter side of the pictures that are compared, pixels: optical flow is fast there and still sub-pixel."""
+"""Shorter side of small pictures, pixels: optical flow is fast and still sub-pixel."""
 STRIDE_PX, MARGIN_PX = 8, 5
-"""One pixel in so many, each way, is matched, away from the margin."""
-LONGEST_PX = 20.0
-"""Longer flow between pictures of one camera is none, pixels."""
+"""Stride of matched pixels, and margin of the picture without matches."""
+MAX_FLOW_PX = 20.0
+"""Largest valid flow between aligned pictures, pixels."""
 OCCLUDED_SHARE, OCCLUDED_M = 0.03, 0.03
-"""A point is hidden where the surface lies nearer by this share of its depth and this many metres."""
+"""Depth difference at which a point is occluded: share of its depth plus metres."""
 MIN_KNOWN = 0.05
-"""Share of a picture that must be known from the other's camera for both to be compared."""
+"""Least overlap of two pictures for matching, share."""
 CLAHE_CLIP, CLAHE_TILES = 4.0, (6, 8)
-"""Local contrast equalisation before flow: clip limit and tiles (columns, rows)."""
+"""CLAHE before flow: clip limit and tiles (columns, rows)."""
 
 
 @dataclass(frozen=True)
 class View:
-    """One small picture, its camera, and the surface in it."""
+    """One small picture, its camera, and the surface's depth."""
 
     gray: UInt8[np.ndarray, "height width"]
     """Contrast equalised."""
@@ -42,12 +42,12 @@ class View:
 
 @dataclass(frozen=True)
 class Warped:
-    """One picture as seen from another camera."""
+    """Mapping from one picture's pixels to another's."""
 
     there: Float[np.ndarray, "height width 2"]
-    """Pixel of the source that each pixel shows."""
+    """Source pixel of each pixel."""
     known: Bool[np.ndarray, "height width"]
-    """Where the source sees the same surface."""
+    """Where the source sees the same surface point."""
 
 
 def small_gray(color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "small_height small_width"]:
@@ -64,13 +64,13 @@ def view_of(
     world_from_camera: Float[np.ndarray, "4 4"],
     caster: RayCaster,
 ) -> View:
-    """Look at the surface from a camera; intrinsics in pixels of the small picture."""
+    """Render the surface's depth for a picture; intrinsics in pixels of the small picture."""
     depth, _ = render_view(caster, world_from_camera, intrinsics, *gray.shape)
     return View(gray, intrinsics, world_from_camera, depth)
 
 
 def warp(target: View, source: View) -> Warped:
-    """Find where a source shows what each pixel of a target shows."""
+    """Map each pixel of a target to the source pixel of the same surface point."""
     points = cameras.back_project(target.depth, target.intrinsics).reshape(-1, 3)
     moved = rigid.apply(rigid.inverse(source.world_from_camera) @ target.world_from_camera, points)
     there, z = cameras.project(moved, source.intrinsics)
@@ -81,9 +81,9 @@ def warp(target: View, source: View) -> Warped:
 
 
 def flow_matches(target: View, source: View) -> Matches:
-    """Match a target's pixels with points of the world by what the source shows of them.
+    """Match a target's pixels with world points seen in the source.
 
-    The target's camera is a guess: the source's picture is brought there, flow measures how far off it is.
+    The source is warped to the target's approximate camera; flow measures the remaining displacement.
     """
     warped = warp(target, source)
     if warped.known.mean() < MIN_KNOWN:
@@ -95,6 +95,6 @@ def flow_matches(target: View, source: View) -> Matches:
     inner = tuple(slice(MARGIN_PX, side - MARGIN_PX, STRIDE_PX) for side in shown.shape)
     rows, columns = np.mgrid[inner].reshape(2, -1)
     start, moved = np.stack([columns, rows], axis=-1) + 0.5, flow[rows, columns]
-    good = warped.known[rows, columns] & (np.abs(moved).max(1) < LONGEST_PX)
+    good = warped.known[rows, columns] & (np.abs(moved).max(1) < MAX_FLOW_PX)
     rays = cameras.unproject(start[good], target.intrinsics) * target.depth[rows, columns][good, None]
     return Matches(start[good] + moved[good], rigid.apply(target.world_from_camera, rays))

@@ -22,14 +22,14 @@ DARK = 0.15
 
 @dataclass(frozen=True)
 class Estimated:
-    """What was found of a recording."""
+    """Estimated cameras and depth of a recording."""
 
     placed: Int[np.ndarray, "chosen"]
-    """Frames that are chosen."""
+    """Indices of the frames written."""
     tracked: Tracked
     lens: Lens
     depths: Sequence[FrameDepth]
-    """Of the chosen frames."""
+    """Of the frames written."""
 
 
 def write(folder: Path, pictures: Pictures, estimated: Estimated, jpeg_quality: int) -> None:
@@ -39,8 +39,8 @@ def write(folder: Path, pictures: Pictures, estimated: Estimated, jpeg_quality: 
     chosen, lens = estimated.placed, estimated.lens
     for number, (frame, found) in enumerate(zip(chosen.tolist(), estimated.depths, strict=True)):
         color = folder / "color" / f"{number:06d}.jpg"
-        if lens.bends:
-            images.write_color(color, lens.straightened(pictures.color(frame)), jpeg_quality)
+        if lens.is_distorted:
+            images.write_color(color, lens.undistorted(pictures.color(frame)), jpeg_quality)
         else:
             color.write_bytes(pictures.file(frame).read_bytes())
         images.write_depth(folder / "depth" / f"{number:06d}.exr", found.depth)
@@ -66,7 +66,7 @@ def write(folder: Path, pictures: Pictures, estimated: Estimated, jpeg_quality: 
 
 
 def report_quality(folder: Path, pictures: Pictures, estimated: Estimated) -> None:
-    """Write the stage's own judgement: what is measured, what inferred."""
+    """Write the quality page: shares of measured and inferred depth."""
     chosen, depths = estimated.placed, estimated.depths
     placed = 100 * len(chosen) / len(pictures)
     alone = 100 * float(estimated.tracked.by_landmarks[chosen].mean())
