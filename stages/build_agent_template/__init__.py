@@ -1,6 +1,6 @@
-"""Make the animal's canonical body from a walk around it.
+"""Build the animal's canonical body from a turnaround.
 
-`poses` places the phone around the standing animal, `fuse` carves and fuses masked depth into a closed
-surface, `canonical` chooses the agent's axes and lays Gaussian bones along its limbs, `appearance` gathers
-color and features per vertex; `template` runs them in this order.
+`poses` registers the cameras, `fuse` fuses masked depth and silhouettes into a closed surface, `canonical`
+chooses the agent's axes and fits Gaussian bones, `appearance` averages colour and features per vertex;
+`template` runs them in this order.
 """

@@ -10,11 +10,11 @@ from pipeline.geometry import cameras, rigid
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 
 SEEN_WEIGHT = 0.05
-"""total weight of its views above which a vertex counts as seen"""
-LAST_CELL = 1.001
-"""positions are clamped this far inside the picture, so that a cell follows to blend with"""
+"""total view weight above which a vertex counts as seen"""
+BORDER_CELLS = 1.001
+"""positions are clamped this many cells inside the border, for bilinear interpolation"""
 NEAREST_M = 0.1
-"""nearer vertices are not looked at"""
+"""vertices nearer to the camera are ignored"""
 
 
 def visibility(
@@ -24,9 +24,9 @@ def visibility(
     size: tuple[int, int],
     tolerance_m: float = 0.01,
 ) -> tuple[Float[np.ndarray, "view vertex"], Float[np.ndarray, "view vertex 2"]]:
-    """Return how squarely each view sees each vertex (0: hidden, 1: face to face) and at which color pixel.
+    """Return view weights of vertices (squared cosine to the normal; 0: occluded) and their colour pixels.
 
-    ``size`` is (height, width) of the color pictures; hidden is what lies behind the mesh by the tolerance.
+    ``size`` is (height, width) of the colour pictures; those behind the mesh by the tolerance are occluded.
     """
     caster = RayCaster(mesh_agent)
     normals = mesh_agent.vertex_normals()
@@ -50,22 +50,22 @@ def visibility(
 def on_mask(
     pixel: Float[np.ndarray, "vertex 2"], labels: UInt8[np.ndarray, "height width"]
 ) -> Bool[np.ndarray, "vertex"]:
-    """Return which vertices project onto the mask (255): where a limb moved, frames show the background."""
+    """Return which vertices project onto the mask (255); a moved limb shows the background instead."""
     inside = cameras.in_picture(pixel, np.ones(len(pixel)), labels.shape)
     column, row = np.floor(np.where(inside[:, None], pixel, 0)).astype(int).T
     return inside & (labels[row, column] == 255)
 
 
-def gather(
+def average_views(
     vertices: Float[np.ndarray, "vertex 3"],
     weight: Float[np.ndarray, "view vertex"],
     pixel: Float[np.ndarray, "view vertex 2"],
     pictures: Sequence[Num[np.ndarray, "height width channel"]],
     stride_px: int,
 ) -> Float[np.ndarray, "vertex channel"]:
-    """Average pictures, a cell per ``stride_px`` color pixels, over views; what none sees as its nearest."""
+    """Average pictures (cells of ``stride_px`` colour pixels) over views; unseen vertices copy neighbours."""
     total = sum(
-        w[:, None] * _sample(picture, at / stride_px)
+        w[:, None] * _bilinear(picture, at / stride_px)
         for w, at, picture in zip(weight, pixel, pictures, strict=True)
     )
     seen = weight.sum(0) > SEEN_WEIGHT
@@ -75,12 +75,12 @@ def gather(
     return mean
 
 
-def _sample(
+def _bilinear(
     picture: Num[np.ndarray, "height width channel"], position: Float[np.ndarray, "point 2"]
 ) -> Float[np.ndarray, "point channel"]:
-    """Blend bilinearly at positions in cells; a cell's centre lies in the middle of its square."""
+    """Interpolate bilinearly at positions in cells, whose centres lie at half-integers."""
     height, width = picture.shape[:2]
-    grid = np.clip(position - 0.5, 0, [width - LAST_CELL, height - LAST_CELL])
+    grid = np.clip(position - 0.5, 0, [width - BORDER_CELLS, height - BORDER_CELLS])
     low = np.floor(grid).astype(int)
     part = grid - low
     picture, (x, y) = picture.astype(np.float32), low.T

@@ -1,8 +1,8 @@
 """The agent's own axes (origin in the middle of the body, +y up, +z towards the head) and its Gaussian bones.
 
-Bones group the body's cells by distance *through* the body. Seeds spread by farthest distance reach every
-paw, the tail's tip and the head first; a few rounds of k-medoids even them out, thin parts counting more than
-thick ones so that limbs get bones of their own.
+Bones cluster the body's voxels by geodesic distance. Farthest-point seeds reach every paw, the tail's tip and
+the head first; a few iterations of k-medoids refine them, with more weight on thin parts so that limbs get
+bones of their own.
 """
 
 from dataclasses import dataclass
@@ -17,15 +17,15 @@ from pipeline.geometry import rigid
 from pipeline.geometry.ground import GroundPlane
 
 END_SHARE = 0.18
-"""Share of the body's length that counts as an end."""
-ROUNDS = 6
-"""rounds of k-medoids after spreading the seeds"""
-CELLS = 5000
-"""cells of the body that are used"""
-WIDEN, MIN_SCALE_M = 1.3, 0.012
-"""scale of a bone in standard deviations of its cells (larger blends softer), and the smallest scale"""
-NEAR_M = 0.04
-"""cells count by how few others lie this near: limbs are thin"""
+"""share of the body's length that counts as an end"""
+MEDOID_ITERATIONS = 6
+"""iterations of k-medoids"""
+MAX_CELLS = 5000
+"""largest number of voxels used"""
+SCALE_FACTOR, MIN_SCALE_M = 1.3, 0.012
+"""scale of a bone in standard deviations of its voxels (larger blends softer), and the smallest scale"""
+DENSITY_RADIUS_M = 0.04
+"""radius for the density of voxels, whose inverse is their weight: limbs are thin"""
 
 
 @dataclass(frozen=True)
@@ -34,17 +34,16 @@ class Heading:
 
     world_from_agent: Float[np.ndarray, "4 4"]
     head_share: float
-    """share of both ends' volume times height that the end taken for the head's has (0.5 = ambiguous)"""
+    """the head end's share of volume times height over both ends (0.5 = ambiguous)"""
     elongation: float
-    """extent along the axis that was found against the extent across it, both level (1 = ambiguous)"""
+    """ratio of horizontal extents along and across the axis (1 = ambiguous)"""
 
 
 def find_heading(inside_world: Float[np.ndarray, "cell 3"], ground: GroundPlane, turn_deg: float) -> Heading:
-    """Lay +z along the longest level axis of the body, towards the end that holds more volume, higher up.
+    """Choose +z along the longest horizontal axis of the body, towards the end with more and higher volume.
 
-    The head is thick and high where the tail is thin or, curled up, the rump is low. Who stands upright or
-    lies curled up may be wider than long: ``turn_deg``, counterclockwise from above, turns an answer that is
-    wrong.
+    The head is thick and high, the tail thin, and the rump of a curled animal low. An animal that stands
+    upright or lies curled may be wider than long: ``turn_deg``, counterclockwise from above, corrects this.
     """
     centre = np.median(inside_world, axis=0)
     level = (inside_world - inside_world.mean(0))[:, [0, 2]]
@@ -72,14 +71,14 @@ class Bones:
     bone_scale_m: Float[np.ndarray, "bone 3"]
 
 
-def lay_bones(
+def fit_bones(
     inside_agent: Float[np.ndarray, "cell 3"], voxel_m: float, bones: int, rng: np.random.Generator
 ) -> Bones:
-    """Divide the body's cells (agent frame) into bones from front to back; a bone's z is its longest axis."""
-    cells = inside_agent[np.sort(rng.permutation(len(inside_agent))[:CELLS])]
-    graph = body_graph(cells, voxel_m * max(1.0, (len(inside_agent) / len(cells)) ** (1 / 3)))
-    near = KDTree(inside_agent).query_ball_point(cells, NEAR_M, return_length=True)
-    label = group_cells(graph, cells, 1.0 / np.maximum(near, 1), bones)
+    """Cluster the body's voxels (agent frame) into bones, front to back; a bone's z is its longest axis."""
+    cells = inside_agent[np.sort(rng.permutation(len(inside_agent))[:MAX_CELLS])]
+    graph = neighbour_graph(cells, voxel_m * max(1.0, (len(inside_agent) / len(cells)) ** (1 / 3)))
+    near = KDTree(inside_agent).query_ball_point(cells, DENSITY_RADIUS_M, return_length=True)
+    label = k_medoids(graph, cells, 1.0 / np.maximum(near, 1), bones)
     frames, scales = [], []
     for bone in range(bones):
         own = cells[label == bone]
@@ -88,13 +87,13 @@ def lay_bones(
         axes *= np.where(axes[np.abs(axes).argmax(0), range(3)] < 0, -1, 1)
         axes[:, 0] = np.cross(axes[:, 1], axes[:, 2])
         frames.append(rigid.make(axes, middle))
-        scales.append(np.maximum(WIDEN * np.sqrt(np.maximum(variance, 0)), MIN_SCALE_M))
+        scales.append(np.maximum(SCALE_FACTOR * np.sqrt(np.maximum(variance, 0)), MIN_SCALE_M))
     order = np.argsort([-frame[2, 3] for frame in frames])
     return Bones(np.stack(frames)[order], np.stack(scales)[order])
 
 
-def body_graph(cells: Float[np.ndarray, "cell 3"], spacing_m: float) -> scipy.sparse.csr_matrix:
-    """Connect cells nearer than two spacings by their distance; tie loose parts at their nearest points."""
+def neighbour_graph(cells: Float[np.ndarray, "cell 3"], spacing_m: float) -> scipy.sparse.csr_matrix:
+    """Connect voxels within two spacings, weighted by distance; join components at their nearest points."""
     pairs = KDTree(cells).query_pairs(2 * spacing_m, output_type="ndarray")
     length = np.linalg.norm(cells[pairs[:, 0]] - cells[pairs[:, 1]], axis=1)
     graph = scipy.sparse.coo_matrix((length, pairs.T), shape=(len(cells),) * 2).tocsr()
@@ -106,20 +105,20 @@ def body_graph(cells: Float[np.ndarray, "cell 3"], spacing_m: float) -> scipy.sp
     return graph
 
 
-def group_cells(
+def k_medoids(
     graph: scipy.sparse.csr_matrix,
     cells: Float[np.ndarray, "cell 3"],
     weight: Float[np.ndarray, "cell"],
     bones: int,
 ) -> Int[np.ndarray, "cell"]:
-    """Return each cell's bone: farthest-point seeds, then k-medoids by distance through the body."""
+    """Return each voxel's bone: farthest-point seeds, then k-medoids by geodesic distance."""
     first = int(np.linalg.norm(cells - cells.mean(0), axis=1).argmin())
     seeds, distance = [], dijkstra(graph, directed=False, indices=first)
     for _ in range(bones):
         seeds.append(int(distance.argmax()))
         distance = np.minimum(distance, dijkstra(graph, directed=False, indices=seeds[-1]))
     label = np.zeros(len(cells), int)
-    for _ in range(ROUNDS):
+    for _ in range(MEDOID_ITERATIONS):
         reach = dijkstra(graph, directed=False, indices=seeds)
         label = reach.argmin(0)
         for bone in range(bones):

@@ -1,4 +1,4 @@
-"""What the report shows of the template: turntables of color and bones, figures with thresholds."""
+"""Quality page of the template: turntables of color and bones, checks with thresholds."""
 
 import numpy as np
 import trimesh
@@ -13,13 +13,13 @@ from pipeline.geometry.meshes import Mesh, RayCaster
 from stages.build_agent_template.template import CanonicalTemplate
 
 FOCAL, LIFTS_RAD, DISTANCE = 1.4, (0.25, 0.9), 3.2
-"""the turntable's focal length in picture widths, its heights of view, its distance in radii of the mesh"""
+"""the turntable's focal length in picture widths, elevations, and distance in radii of the mesh"""
 SATURATION, VALUES = 0.75, (0.7, 0.95)
-"""of a bone's colour; neighbours alternate in value"""
+"""saturation and value of a bone's colour; neighbours alternate in value"""
 
 
 def turntable(mesh: Mesh, views: int = 8, size_px: int = 220) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw the mesh (agent frame) from around, the head's side first, rows from the side and from above."""
+    """Draw the mesh (agent frame) all around, starting at the head, one row per elevation."""
     caster, radius = RayCaster(mesh), float(np.linalg.norm(mesh.vertices, axis=1).max())
     focal, up = FOCAL * size_px, np.array([0.0, 1.0, 0.0])
     intrinsics = np.array([[focal, 0, size_px / 2], [0, focal, size_px / 2], [0, 0, 1]])
@@ -33,7 +33,7 @@ def turntable(mesh: Mesh, views: int = 8, size_px: int = 220) -> UInt8[np.ndarra
 
 
 def bone_colors(weights: Float[np.ndarray, "vertex bone"]) -> UInt8[np.ndarray, "vertex 3"]:
-    """Mix one hue per bone by the skinning weights."""
+    """Blend one hue per bone by the skinning weights."""
     bone = np.arange(weights.shape[1])
     hue, value = (7 * bone % len(bone)) / len(bone), np.where(bone % 2, VALUES[1], VALUES[0])
     color = hsv_to_rgb(np.stack([hue, np.full(len(bone), SATURATION), value], axis=1))
@@ -41,13 +41,13 @@ def bone_colors(weights: Float[np.ndarray, "vertex bone"]) -> UInt8[np.ndarray, 
 
 
 def report(template: CanonicalTemplate) -> tuple[list[Check], list[Picture]]:
-    """Return the stage's figures and pictures."""
+    """Return the stage's checks and pictures."""
     mesh = template.mesh
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     influence = template.weights.sum(0)
     idle = influence < 0.01 * influence.mean() * len(influence)
     checks = [
-        Check("circle covered", template.around_deg, "deg", warn=330, fail=200, better="higher"),
+        Check("circle covered", template.coverage_deg, "deg", warn=330, fail=200, better="higher"),
         Check("agreement of depth pictures", 1000 * template.residual_m, "mm", warn=20, fail=50),
         Check("surface is closed", float(solid.is_watertight), "", warn=0.5, better="higher"),
         Check("length", float(np.ptp(mesh.vertices[:, 2])), "m"),

@@ -1,4 +1,4 @@
-"""Where the phone was around the standing animal: odometry without drift, the circle closed."""
+"""Camera poses around the standing animal: drift-corrected odometry with loop closure."""
 
 from dataclasses import dataclass
 
@@ -14,17 +14,17 @@ from pipeline.mapping.odometry import CorrectedOdometry, align_gravity, chain_al
 
 STRIDE = 2
 LOOPS = 5
-"""Earlier views each keyframe is aligned to: a circle around one animal sees the same place often."""
+"""earlier views that each keyframe is aligned to: an orbit sees the same place often"""
 GROUND_FRAMES, REACH_M = 40, 0.4
-"""frames that show the ground, and how far from the animal it counts"""
+"""frames used for the ground, and its radius around the animal"""
 LEVEL_COSINE = 0.9
-"""surfaces within 26 degrees of level are ground"""
+"""ground normals are within 26 degrees of vertical"""
 MIN_POINTS = 200
-"""points of depth, over some 40 frames at that stride, without which no template is built"""
+"""least depth points on animal and on ground, over about 40 frames at that stride"""
 
 
 @dataclass(frozen=True)
-class Circle:
+class Turnaround:
     """The turnaround in a world of its own, +y up, with the ground the animal stands on."""
 
     world_from_camera: Float[np.ndarray, "frame 4 4"]
@@ -32,10 +32,10 @@ class Circle:
     odometry_fit: CorrectedOdometry
 
 
-def walk_around(clip: Clip, masks: Masks) -> Circle:
-    """Place all cameras by the whole still scene, the animal included; the ground is the level around it.
+def register_turnaround(clip: Clip, masks: Masks) -> Turnaround:
+    """Register all cameras by the whole static scene, animal included, and fit the ground around it.
 
-    Raises InputError AGT-001 where hardly any depth was measured on the animal, or on a level surface.
+    Raises InputError AGT-001 if hardly any depth was measured on the animal, or on a level surface.
     """
 
     def view(frame: int) -> DepthImage:
@@ -63,7 +63,8 @@ def walk_around(clip: Clip, masks: Masks) -> Circle:
         what = f"only {len(on_animal)} depth points lie on the animal and {len(on_floor)} on level ground"
         remedy = "circle it from 1.2 m, in light, with the floor in view; sensors miss what is black or wet"
         raise InputError("AGT-001", what, str(masks.folder), remedy)
-    return Circle(poses, fit_ground(on_floor, np.median(on_animal, axis=0), reach_m=REACH_M), odometry_fit)
+    ground = fit_ground(on_floor, np.median(on_animal, axis=0), reach_m=REACH_M)
+    return Turnaround(poses, ground, odometry_fit)
 
 
 def depth_labels(

@@ -33,7 +33,7 @@ def run(inputs: Inputs, config: Config, out: Path) -> None:
     clip, masks = Clip.open(inputs.frames[video]), Masks.open(inputs.masks[video])
     features = open_features(inputs.features[video])
     template = build(clip, masks, features, config, np.random.default_rng(config.seed))
-    log(f"surface: {len(template.mesh.vertices)} vertices from {template.around_deg:.0f} deg around")
+    log(f"surface: {len(template.mesh.vertices)} vertices from {template.coverage_deg:.0f} deg around")
     log(f"depth pictures agree within {1000 * template.residual_m:.0f} mm")
     ply.write_ply(out / "agent.ply", template.mesh)
     bones = template.bones

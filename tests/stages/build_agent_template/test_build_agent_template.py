@@ -12,10 +12,10 @@ from scipy.spatial import cKDTree
 from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip
 from pipeline.geometry import rigid
-from stages.build_agent_template.canonical import lay_bones
+from stages.build_agent_template.canonical import fit_bones
 from stages.build_agent_template.config import Config
 from stages.build_agent_template.fuse import Silhouettes
-from stages.build_agent_template.poses import depth_labels, walk_around
+from stages.build_agent_template.poses import depth_labels, register_turnaround
 from stages.build_agent_template.template import build
 
 _spec = importlib.util.spec_from_file_location(
@@ -92,7 +92,7 @@ def test_cameras_stand_where_they_stood(template, turnaround):
     placed = true_from_ours(template, turnaround) @ template.agent_from_camera
     error = np.linalg.norm(placed[:, :3, 3] - turnaround[3][:, :3, 3], axis=1)
     assert np.median(error) < 0.015, "metres; odometry drifts by some centimetres on the circle"
-    assert template.around_deg > 340
+    assert template.coverage_deg > 340
 
 
 def test_skin_and_features_are_normalised(template):
@@ -109,7 +109,7 @@ def test_limbs_have_bones_of_their_own():
     inside = grid[
         np.any([np.all((grid > part.bounds[0]) & (grid < part.bounds[1]), axis=1) for part in parts], axis=0)
     ]
-    bones = lay_bones(inside, 0.012, Config().bones, np.random.default_rng(0))
+    bones = fit_bones(inside, 0.012, Config().bones, np.random.default_rng(0))
     tips = np.array(
         [[x, -0.21, z] for x in (-0.05, 0.05) for z in (-0.16, 0.16)] + [[0, 0.12, 0.28], [0, 0.06, -0.36]]
     )
@@ -151,4 +151,4 @@ def test_an_animal_without_depth_is_refused(turnaround):
             return np.where(depth_labels(masks[frame], self.depth_size) == 255, 0, super().depth(frame))
 
     with pytest.raises(InputError, match="AGT-001.*only 0 depth points"):
-        walk_around(Blind(**vars(clip)), masks)
+        register_turnaround(Blind(**vars(clip)), masks)

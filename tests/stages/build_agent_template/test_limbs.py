@@ -4,7 +4,7 @@ import numpy as np
 
 from pipeline.geometry.tsdf import Volume
 from stages.build_agent_template import appearance
-from stages.build_agent_template.fuse import find_limb, space_of
+from stages.build_agent_template.fuse import find_limb, limb_region
 
 CELLS = np.stack(np.meshgrid(*[np.arange(-0.1, 0.101, 0.02)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 """of a still body, 20 cm wide"""
@@ -29,7 +29,7 @@ def test_frames_in_which_a_tail_stood_alike_are_chosen():
         "metres at the tip: alike within 3 cm to either side of where points are dense"
     )
     volume = Volume(np.array([-0.4, -0.1, -0.1]), (81, 21, 46), 0.01, 0.03)
-    there = space_of(limb, volume)
+    there = limb_region(limb, volume)
     tip = np.round((tail(angles.max())[-1] - volume.origin) / 0.01).astype(int)
     assert there[tuple(tip)] and not there[40, 10, 10], (
         "where the limb was, and not in the middle of the body"
