@@ -34,8 +34,8 @@ MIN_PAIRS, MAD_TO_SIGMA, MIN_NOISE_M = 200, 1.48, 0.002
 BLUR_PX = 1.2
 """standard deviation of the blur before colours are compared"""
 INNER_WIDTH_PX = 320
-"""picture width per pixel of window radius for `interior_depth`; narrower pictures are phones', whose confidence
-marks steps"""
+"""picture width per pixel of window radius for `interior_depth`; narrower pictures are phones', whose
+confidence marks steps"""
 INNER_STEP_SHARE = 0.12
 """depth range within that window, as a share of the depth, that is a step between surfaces"""
 
@@ -118,7 +118,7 @@ def sample(
     depth: Float[np.ndarray, "height width"],
     wanted_px: int,
 ) -> tuple[Float[np.ndarray, "row column 3"], Float[np.ndarray, "row column"], tuple[slice, slice]]:
-    """Subsample depth to about ``wanted_px`` squared pixels: points (`world_points`), areas in m^2, slices."""
+    """Subsample depth to about ``wanted_px`` squared pixels: `world_points`, areas in m^2, slices."""
     stride = max(1, round(math.sqrt(depth.size) / wanted_px))
     chosen = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     focal_px2 = clip.depth_intrinsics[frame, 0, 0] * clip.depth_intrinsics[frame, 1, 1]
