@@ -29,7 +29,7 @@ def estimate(
 ) -> Float[np.ndarray, "frame"]:
     """Return the estimated intersection over union of each frame; NaN where nothing is seen or missed."""
     room = free_space.masked(references, lambda frame: masks[frame] != 0)
-    intersection_m2, union_m2, missed = np.zeros(len(clip)), np.zeros(len(clip)), []
+    intersection_m2, union_m2, missing = np.zeros(len(clip)), np.zeros(len(clip)), []
     for frame, pose in enumerate(world_from_camera):
         inner = free_space.interior_depth(clip, frame)
         points, area_m2, chosen = free_space.sample(clip, frame, pose, inner, locate.COARSE_PX)
@@ -39,9 +39,9 @@ def estimate(
         right |= (shown == "resting") & (votes.occupied == 0)
         intersection_m2[frame], union_m2[frame] = (area_m2[own].sum() for own in (inside & right, inside))
         outside = locate.opened_motion(votes, movers.SURE_SHARES[0]) & (labels == 0) & (shown == "moving")
-        missed.append(movers.candidates(outside, right, points, area_m2, animal))
-    choice = movers.track(missed, clip.timestamp_s, animal)
-    chosen = [group[index] if index >= 0 else None for group, index in zip(missed, choice, strict=True)]
+        missing.append(movers.candidates(outside, right, points, area_m2, animal))
+    choice = movers.track(missing, clip.timestamp_s, animal)
+    chosen = [group[index] if index >= 0 else None for group, index in zip(missing, choice, strict=True)]
     self_moving = movers.self_moving(chosen, clip.timestamp_s, animal)
     union_m2 += [each.area_m2 if each and own else 0 for each, own in zip(chosen, self_moving, strict=True)]
     return np.where(union_m2 < movers.MIN_AREA_M2, np.nan, intersection_m2 / np.maximum(union_m2, 1e-9))

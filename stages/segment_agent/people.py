@@ -1,6 +1,6 @@
 """People who walk through a recording: upright movers, taller than an animal.
 
-`find_people` tracks them through the whole recording; `People.near` tells which points are theirs, so that
+`find_people` tracks them through the whole recording; `People.near` marks the points that are theirs, so that
 neither the animal's track nor its appearance includes their legs.
 """
 

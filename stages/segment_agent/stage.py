@@ -46,7 +46,7 @@ def run(
     """Segment one recording and write its masks into `out`.
 
     With several animals, the one whose turnaround is among `videos` is segmented. Raises InputError
-    MSK-006 for a hint or a backend that cannot tell them apart.
+    MSK-006 for a hint or a backend that cannot distinguish them.
     """
     if inputs.identities is not None and role_of_animal(video, config.role) == "session":
         return _run_of_several(inputs, inputs.identities, config, out, videos)
