@@ -73,7 +73,7 @@ class ObjectiveConfig:
     with its noise levels in place of the 50 linear ones of the paper."""
     motion_weight: float = 4.0
     """Weight of the change of a body's error from frame to frame beside the error itself (velocity loss of
-    Tevet et al. 2023): errors that change make feet skate."""
+    Tevet et al. 2022): errors that change make feet skate."""
     path_share: float = 0.5
     """Share of a batch's windows that paths, whose network is costly, are trained on in a step."""
     body_share: float = 0.5
