@@ -153,7 +153,7 @@ def trained(folder: Path, config: TrainingConfig) -> Path:
 def forecast(fold: Fold, model: Path, context: Context, rng: np.random.Generator) -> Samples:
     """Draw the samples that are scored: independent ones, none of which is chosen."""
     ats = Ats.load(model, fold.scenes, SAMPLING)
-    return ats.courses(context, SAMPLES, rng, at_once=WINDOWS_AT_ONCE)
+    return ats.paths(context, SAMPLES, rng, at_once=WINDOWS_AT_ONCE)
 
 
 def others_of(fold: Fold, windows: list[ForecastWindow]) -> list[Float[np.ndarray, "frame other 2"]]:

@@ -1,9 +1,8 @@
-"""Denoising of the body along a path: conditioned on where the path leads, it predicts how the body departs
-from its posture.
+"""The denoiser of body motion along a path, relative to the current posture.
 
-`BodyDenoiser` wraps the UNet of the body. The posture that the animal holds now, turned as the path turns, is
-taken from the noisy body before the UNet sees it; what is left is small for an animal that stays, and no
-heading for one that walks.
+`BodyDenoiser` wraps the UNet of the body. The current posture, rotated to the heading of the path, is
+subtracted from the noisy body before the UNet reads it. The residual is small for a resting animal, and free
+of heading for a walking one.
 """
 
 import torch
@@ -15,49 +14,50 @@ from pipeline.behavior.path_encoding import PATH_CHANNELS, expected_steps
 from pipeline.behavior.trajectories import RATE_HZ
 
 CONTROL_CHANNELS = 8
-"""channels of a path that condition the UNet: position, velocity, heading"""
+"""channels of a path as it controls the UNet: position, velocity, heading"""
 ROOT_CHANNELS = 6
-"""the body's leading channels: the root's rotation in the ego frame, its x and its y axis"""
+"""the body's leading channels: x and y axis of the root's rotation, ego frame"""
 HEADING_MEMORY_M = 0.1
-"""way after which an earlier heading counts for a third"""
+"""distance over which the weight of earlier headings decays by a factor of e"""
 PATH_NOISE_M = 0.02
-"""step of a path, per frame, of which half is taken for noise"""
+"""step per frame at which the direction of a path has weight one half; shorter steps are mostly noise"""
 
 MIN_DIRECTION = 0.01
-"""length of a vector, in metres or of a unit, below which it has no direction"""
+"""length (metres, or of a unit vector) below which a vector has no direction"""
 
 
 class BodyDenoiser(nn.Module):
-    """Denoise what a body does along a path: its departure from the posture that it holds now.
+    """Denoise a body along a path as the residual from its current posture.
 
-    The last numbers of the condition are the posture, scaled as the body is but for its root rotation, or
-    zeros where nothing is remembered. With x_t = sqrt(alpha_bar) clean + sqrt(1 - alpha_bar) noise the same
-    noise is in x_t - sqrt(alpha_bar) posture.
+    The last channels of the condition are the posture, scaled as the body is except for the root rotation;
+    zeros if the past is dropped. With x_t = sqrt(alpha_bar) clean + sqrt(1 - alpha_bar) noise, subtracting
+    sqrt(alpha_bar) posture leaves the noise unchanged.
     """
 
     path_std: Tensor
     root_mean: Tensor
     root_std: Tensor
     rotation_std: Tensor
-    share: Tensor
-    past: Tensor
+    sqrt_alpha_bar: Tensor
+    causal_mask: Tensor
 
     def __init__(
         self,
         unet: nn.Module,
-        posture: int,
+        posture_channels: int,
         frames: int,
         schedule: Schedule = STANDARD,
         rate_hz: float = RATE_HZ,
     ):
         super().__init__()
-        self.unet, self.posture, self.rate_hz = unet, posture, rate_hz
+        self.unet, self.posture_channels, self.rate_hz = unet, posture_channels, rate_hz
         self.register_buffer("path_std", torch.ones(3, frames))
         self.register_buffer("root_mean", torch.zeros(ROOT_CHANNELS))
         self.register_buffer("root_std", torch.ones(ROOT_CHANNELS))
         self.register_buffer("rotation_std", torch.ones(ROOT_CHANNELS))
-        self.register_buffer("share", torch.from_numpy(schedule.alpha_bar).float().sqrt(), persistent=False)
-        self.register_buffer("past", torch.ones(frames, frames).tril(), persistent=False)
+        sqrt_alpha_bar = torch.from_numpy(schedule.alpha_bar).float().sqrt()
+        self.register_buffer("sqrt_alpha_bar", sqrt_alpha_bar, persistent=False)
+        self.register_buffer("causal_mask", torch.ones(frames, frames).tril(), persistent=False)
 
     def forward(
         self,
@@ -67,15 +67,16 @@ class BodyDenoiser(nn.Module):
         control: Float[Tensor, "batch 3 frame"],
         keep: Float[Tensor, "batch 1"] | None,
     ) -> Float[Tensor, "batch channel frame"]:
-        held = condition[:, -self.posture :, None].expand(-1, -1, x.shape[-1])
-        root = held[:, :ROOT_CHANNELS] * self.root_std[:, None] + self.root_mean[:, None]
+        posture = condition[:, -self.posture_channels :, None].expand(-1, -1, x.shape[-1])
+        root = posture[:, :ROOT_CHANNELS] * self.root_std[:, None] + self.root_mean[:, None]
         step = self.steps(x, t, control)
         heading = self.headings(step, root)
         root = (rotated_to_heading(root, heading) - self.root_mean[:, None]) / self.rotation_std[:, None]
-        held = torch.cat([root, held[:, ROOT_CHANNELS:]], dim=1)
-        held = nn.functional.pad(held, (0, 0, x.shape[1] - self.posture, 0))
+        posture = torch.cat([root, posture[:, ROOT_CHANNELS:]], dim=1)
+        posture = nn.functional.pad(posture, (0, 0, x.shape[1] - self.posture_channels, 0))
         unet_control = torch.cat([control, step * self.rate_hz, heading], dim=1)
-        return self.unet(x - self.share[t.long()][:, None, None] * held, t, condition, unet_control, keep)
+        residual = x - self.sqrt_alpha_bar[t.long()][:, None, None] * posture
+        return self.unet(residual, t, condition, unet_control, keep)
 
     def steps(
         self,
@@ -83,7 +84,7 @@ class BodyDenoiser(nn.Module):
         t: Float[Tensor, "batch"],
         control: Float[Tensor, "batch 3 frame"],
     ) -> Float[Tensor, "batch 3 frame"]:
-        """Return how far the path goes in each frame, metres; in the first as in the second."""
+        """Return the displacement per frame, metres; the first frame repeats the second."""
         del x, t
         place = control * self.path_std
         step = place[..., 1:] - place[..., :-1]
@@ -92,37 +93,38 @@ class BodyDenoiser(nn.Module):
     def headings(
         self, step: Float[Tensor, "batch 3 frame"], root: Float[Tensor, "batch 6 frame"]
     ) -> Float[Tensor, "batch 2 frame"]:
-        """Return where a body looks that looks where it goes, and stays as it is while it stays: horizontal
+        """Return the heading of a body that faces where it goes and keeps its heading at rest: horizontal
         unit vectors.
 
-        Each is the sum of all steps before, which are forgotten with the way that was made since, and of the
-        heading at the beginning.
+        Each is an average of the initial heading and all earlier steps, with weights that decay
+        exponentially with the distance travelled since.
         """
-        level = step[:, ::2]
-        square = level.square().sum(1, keepdim=True)
-        level = level * (square / (square + PATH_NOISE_M**2))
-        way = (level.square().sum(1) + 1e-12).sqrt().cumsum(-1)
-        since = (way[:, None, :] - way[:, :, None]).clamp(max=0)
-        gone = level @ (torch.exp(since / HEADING_MEMORY_M) * self.past).transpose(-1, -2)
+        horizontal = step[:, ::2]
+        square = horizontal.square().sum(1, keepdim=True)
+        horizontal = horizontal * (square / (square + PATH_NOISE_M**2))
+        travelled = (horizontal.square().sum(1) + 1e-12).sqrt().cumsum(-1)
+        since = (travelled[:, None, :] - travelled[:, :, None]).clamp(max=0)
+        displacement = horizontal @ (torch.exp(since / HEADING_MEMORY_M) * self.causal_mask).transpose(-1, -2)
         return soft_unit(
-            gone + HEADING_MEMORY_M * torch.exp(-way / HEADING_MEMORY_M)[:, None] * horizontal_forward(root)
+            displacement
+            + HEADING_MEMORY_M * torch.exp(-travelled / HEADING_MEMORY_M)[:, None] * horizontal_forward(root)
         )
 
 
 class OneStageDenoiser(BodyDenoiser):
-    """Denoise path and body as one sequence, path first; the heading is that of the noisy path."""
+    """Denoise path and body as one sequence, path channels first; the heading is that of the noisy path."""
 
     velocity_std: Tensor
 
     def __init__(
         self,
         unet: nn.Module,
-        posture: int,
+        posture_channels: int,
         frames: int,
         schedule: Schedule = STANDARD,
         rate_hz: float = RATE_HZ,
     ):
-        super().__init__(unet, posture, frames, schedule, rate_hz)
+        super().__init__(unet, posture_channels, frames, schedule, rate_hz)
         self.register_buffer("velocity_std", torch.ones(PATH_CHANNELS))
 
     def steps(
@@ -131,9 +133,9 @@ class OneStageDenoiser(BodyDenoiser):
         t: Float[Tensor, "batch"],
         control: Float[Tensor, "batch 3 frame"],
     ) -> Float[Tensor, "batch 3 frame"]:
-        """Return how far the noisy path is expected to go in each frame, metres."""
+        """Return the expected displacement per frame given the noisy path, metres."""
         del control
-        strides = (self.share[t.long()][:, None, None] * x[:, :PATH_CHANNELS]).transpose(-1, -2)
+        strides = (self.sqrt_alpha_bar[t.long()][:, None, None] * x[:, :PATH_CHANNELS]).transpose(-1, -2)
         return expected_steps(strides * self.velocity_std, self.rate_hz).transpose(-1, -2)
 
 
@@ -147,7 +149,7 @@ def horizontal_forward(root: Float[Tensor, "batch 6 frame"]) -> Float[Tensor, "b
 def rotated_to_heading(
     root: Float[Tensor, "batch 6 frame"], heading: Float[Tensor, "batch 2 frame"]
 ) -> Float[Tensor, "batch 6 frame"]:
-    """Turn rotations (x and y axis, ego frame) about the vertical so that they look along ``heading``."""
+    """Rotate orientations (x and y axis, ego frame) about the vertical to face along ``heading``."""
     now = soft_unit(horizontal_forward(root))
     cosine = (now * heading).sum(1, keepdim=True)
     sine = (heading[:, 0] * now[:, 1] - heading[:, 1] * now[:, 0])[:, None]
@@ -156,5 +158,5 @@ def rotated_to_heading(
 
 
 def soft_unit(vector: Float[Tensor, "batch 2 frame"]) -> Float[Tensor, "batch 2 frame"]:
-    """Return vectors of about length 1, shorter where there is hardly a direction."""
+    """Return vectors normalised to about length 1; shorter where the direction is ill-defined."""
     return vector / (vector.square().sum(1, keepdim=True) + MIN_DIRECTION**2).sqrt()

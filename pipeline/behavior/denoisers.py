@@ -1,11 +1,10 @@
-"""The denoising networks of sequences: 1-D ControlUNets for path and body (Eq. 9, 10), and what all denoisers
-share.
+"""Denoising networks of sequences: 1-D ControlUNets for path and body (Eq. 9, 10), and shared layers.
 
-All predict the noise in x at step t, given the perception code. Inside they estimate the velocity v =
-sqrt(alpha_bar) noise - sqrt(1 - alpha_bar) clean (Salimans & Ho 2022), which is of unit scale at every step;
-`NoiseFromVelocity` turns it into the noise, so that an untrained network begins as the best linear predictor.
-A ControlUNet is two identical UNets: the first denoises, the second reads the control (goal or path) and adds
-its features to every block of the first.
+All predict the noise in x at step t, given the perception code. Their outputs are v-predictions, v =
+sqrt(alpha_bar) noise - sqrt(1 - alpha_bar) clean (Salimans & Ho 2022), which have unit scale at every step;
+`NoiseFromVelocity` converts v to noise, so that an output of 0 is the best linear predictor. A ControlUNet is
+two identical UNets: the main branch denoises; the control branch (ControlNet) reads the control, goal or
+path, and adds its features to every block of the main branch.
 """
 
 import math
@@ -20,40 +19,40 @@ TIME_CHANNELS, EMBEDDING = 64, 128
 
 
 def time_embedding(t: Float[Tensor, "batch"]) -> Float[Tensor, "batch 64"]:
-    """Return sines and cosines of the step number at 32 frequencies from 1 down to 1e-4."""
+    """Return the sinusoidal embedding of the step at 32 frequencies from 1 down to 1e-4."""
     number = torch.arange(TIME_CHANNELS // 2, dtype=torch.float32, device=t.device)
     angle = t[:, None] * torch.exp(-math.log(1e4) / (TIME_CHANNELS // 2) * number)
     return torch.cat([angle.sin(), angle.cos()], dim=-1)
 
 
 class NoiseFromVelocity(nn.Module):
-    """The noise, given the noisy sample and its velocity."""
+    """Convert a predicted velocity and the noisy sample to the noise."""
 
-    of_sample: Tensor
-    of_velocity: Tensor
+    sigma: Tensor
+    alpha: Tensor
 
     def __init__(self, schedule: Schedule):
         super().__init__()
-        share = torch.from_numpy(schedule.alpha_bar).float()
-        self.register_buffer("of_sample", (1 - share).sqrt(), persistent=False)
-        self.register_buffer("of_velocity", share.sqrt(), persistent=False)
+        alpha_bar = torch.from_numpy(schedule.alpha_bar).float()
+        self.register_buffer("sigma", (1 - alpha_bar).sqrt(), persistent=False)
+        self.register_buffer("alpha", alpha_bar.sqrt(), persistent=False)
 
     def forward(
         self, x: Float[Tensor, "batch ..."], velocity: Float[Tensor, "*stack"], t: Float[Tensor, "batch"]
     ) -> Float[Tensor, "*stack"]:
         step, shape = t.long(), (-1, *[1] * (x.ndim - 1))
-        return self.of_sample[step].reshape(shape) * x + self.of_velocity[step].reshape(shape) * velocity
+        return self.sigma[step].reshape(shape) * x + self.alpha[step].reshape(shape) * velocity
 
 
 class TrailingLinear(nn.Linear):
-    """A linear layer that reads the last numbers of a longer row: what follows the maps."""
+    """A linear layer on the last ``in_features`` channels of the condition, which follow the maps."""
 
     def forward(self, row: Float[Tensor, "batch number"]) -> Float[Tensor, "batch out"]:
         return super().forward(row[:, -self.in_features :])
 
 
 class Embedding(nn.Module):
-    """Step and code as one vector, which conditions every block; ``read`` maps the code to its numbers."""
+    """The embedding of step and code that conditions every block; ``read`` projects the code."""
 
     def __init__(self, read: nn.Module):
         super().__init__()
@@ -69,7 +68,7 @@ class Embedding(nn.Module):
 
 
 class TemporalBlock(nn.Module):
-    """Two convolutions over time with group norm; the embedding of step and condition enters between them."""
+    """Residual block: two temporal convolutions with group norm, the embedding added between them."""
 
     def __init__(self, inner: int, outer: int, embedding: int, kernel: int = 5):
         super().__init__()
@@ -89,7 +88,7 @@ class TemporalBlock(nn.Module):
 
 
 class UNet1d(nn.Module):
-    """A 1-D UNet of three levels over frames that takes features to add to each block."""
+    """A 1-D UNet over frames, whose blocks can take added features of a control branch."""
 
     def __init__(self, channels: int, widths: tuple[int, ...], embedding: int):
         super().__init__()
@@ -131,7 +130,7 @@ class UNet1d(nn.Module):
 
 
 class ControlUNet(nn.Module):
-    """Denoise a sequence under a control sequence or vector; ``keep`` 0 stands for no control."""
+    """Denoise a sequence given a control sequence or vector; ``keep`` 0 drops the control."""
 
     def __init__(
         self,
@@ -173,13 +172,13 @@ class ControlUNet(nn.Module):
         t: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
     ) -> Float[Tensor, "batch channel frame"]:
-        """Return what the first UNet reads: the noisy sequence."""
+        """Return the input of the main branch: the noisy sequence."""
         del t, condition
         return x
 
 
 class UncontrolledUNet(nn.Module):
-    """Denoise a sequence that nothing steers; called as `ControlUNet` is."""
+    """Denoise a sequence without control; same signature as `ControlUNet`."""
 
     def __init__(
         self,
@@ -189,7 +188,7 @@ class UncontrolledUNet(nn.Module):
         multipliers: tuple[int, ...] = (1, 2, 4),
         schedule: Schedule = STANDARD,
     ):
-        """``read`` makes `EMBEDDING` numbers of a condition."""
+        """``read`` projects a condition to `EMBEDDING` channels."""
         super().__init__()
         self.noise, widths = NoiseFromVelocity(schedule), tuple(width * m for m in multipliers)
         self.embedding = Embedding(read)
@@ -209,7 +208,7 @@ class UncontrolledUNet(nn.Module):
 
 
 class ConcatenationUNet(UncontrolledUNet):
-    """The ablation of Table 5: a control that is one more part of the code; called as `ControlUNet` is."""
+    """The ablation of Table 5: the control is concatenated to the code; same signature as `ControlUNet`."""
 
     def __init__(
         self,
@@ -220,7 +219,7 @@ class ConcatenationUNet(UncontrolledUNet):
         multipliers: tuple[int, ...] = (1, 2, 4),
         schedule: Schedule = STANDARD,
     ):
-        """``control`` counts the numbers of the whole control: 3 of a goal, 8 per frame of a path."""
+        """``control``: channels of the flattened control, 3 for a goal, 8 per frame for a path."""
         read = nn.Sequential(
             nn.Linear(condition + control + 1, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING)
         )

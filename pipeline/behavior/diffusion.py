@@ -1,7 +1,7 @@
 """Diffusion in 50 steps: schedules, noising, DDPM and DDIM sampling, classifier-free guidance.
 
-Arithmetic only, on NumPy arrays and torch tensors alike: `sample` takes any function that predicts the noise,
-be it a torch module, an ONNX session, or a guided pair of calls.
+Works on NumPy arrays and torch tensors alike: `sample` takes any function that predicts the noise, such as a
+torch module, an ONNX session, or a guided combination of calls.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,24 +19,24 @@ Array = TypeVar("Array", np.ndarray, Tensor)
 
 @dataclass(frozen=True)
 class Schedule:
-    """How much noise each step holds."""
+    """Noise schedule."""
 
     steps: int = 50
     """noise levels"""
     beta_first: float = 1e-4
-    """variance added at the first step, where it is linear"""
+    """beta of the first step of the linear schedule"""
     beta_last: float = 0.2
-    """variance added at the last step, where it is linear"""
+    """beta of the last step of the linear schedule"""
     clip: float = 5.0
-    """bound of the clean estimate, in standard deviations"""
+    """clipping bound of the clean estimate, in standard deviations"""
     course: NoiseCourse = "linear"
-    """variances that grow linearly (Ho et al. 2020), or rectified flow (Liu et al. 2023): straight ways (1 -
-    s) clean + s noise, scaled to unit variance, which DDIM follows in Euler's steps; learn it with
-    `weighting` "flow\""""
+    """variances that grow linearly (Ho et al. 2020), or rectified flow (Liu et al. 2023): straight lines (1 -
+    s) clean + s noise, scaled to unit variance, on which DDIM takes Euler steps; train it with `weighting`
+    "flow\""""
 
     @property
     def method(self) -> Literal["ddpm", "ddim"]:
-        """Return how goals are best drawn (measured on homes kept from training)."""
+        """Return the best sampler of goals, as measured on held-out homes."""
         return "ddim" if self.course == "rectified" else "ddpm"
 
     @property
@@ -73,11 +73,11 @@ def noised(clean: Array, noise: Array, alpha_bar: Array) -> Array:
 def guided(
     denoisers: Sequence[Callable[[Array, float], Array]], scales: Sequence[float]
 ) -> Callable[[Array, float], Array]:
-    """Return e_n + sum over i of scale_i (e_i - e_i+1), where each denoiser knows one thing less than the
-    one before it; those that cancel out are not called.
+    """Return the guided noise e_n + sum over i of scale_i (e_i - e_i+1); each denoiser has one condition less
+    than the one before it. Denoisers of weight 0 are not called.
     """
-    known = (*scales[: len(denoisers) - 1], 1.0)
-    weights = np.diff(known, prepend=0.0)
+    cumulative = (*scales[: len(denoisers) - 1], 1.0)
+    weights = np.diff(cumulative, prepend=0.0)
     called = [(float(w), each) for w, each in zip(weights, denoisers, strict=True) if w]
 
     def mixed(x: Array, t: float) -> Array:
@@ -101,34 +101,34 @@ def sample(
     """Turn ``noise`` into a sample in ``count`` steps.
 
     ``denoise(x, t)`` predicts the noise. DDIM is deterministic; DDPM adds fresh noise from ``draw`` at each
-    step but the last, with the posterior variance of the steps visited (exact ancestral sampling when all
-    are) or, as `ddpm_large`, with that of the forward steps, which is exact for data of N(0, 1).
-    ``correct`` is applied to the clean estimates of the steps at which most of the variance is clean, the
-    last one among them.
+    step but the last, with the posterior variance of the steps visited (exact ancestral sampling if all
+    are) or, as `ddpm_large`, with the forward variance, which is exact for data of N(0, 1). ``correct`` is
+    applied to the clean estimate of every step with alpha_bar above 0.5, including the last.
     """
     x, steps, alpha_bar = noise, schedule.visited(count), schedule.alpha_bar
     for position, t in enumerate(steps):
-        now = float(alpha_bar[t])
+        alpha_bar_t = float(alpha_bar[t])
         epsilon = denoise(x, float(t))
-        clean = ((x - (1 - now) ** 0.5 * epsilon) / now**0.5).clip(-schedule.clip, schedule.clip)
-        epsilon = (x - now**0.5 * clean) / (1 - now) ** 0.5
-        clean = correct(clean) if correct and now > 0.5 else clean
+        clean = (x - (1 - alpha_bar_t) ** 0.5 * epsilon) / alpha_bar_t**0.5
+        clean = clean.clip(-schedule.clip, schedule.clip)
+        epsilon = (x - alpha_bar_t**0.5 * clean) / (1 - alpha_bar_t) ** 0.5
+        clean = correct(clean) if correct and alpha_bar_t > 0.5 else clean
         if position == len(steps) - 1:
             return clean
-        later = float(alpha_bar[steps[position + 1]])
-        beta = 1 - now / later
-        posterior = (1 - later) / (1 - now) * beta
+        alpha_bar_next = float(alpha_bar[steps[position + 1]])
+        beta = 1 - alpha_bar_t / alpha_bar_next
+        posterior = (1 - alpha_bar_next) / (1 - alpha_bar_t) * beta
         match method:
             case "ddpm":
-                replaced, fresh = posterior, posterior
+                removed, added = posterior, posterior
             case "ddpm_large":
-                replaced, fresh = posterior, beta
+                removed, added = posterior, beta
             case "ddim":
-                replaced, fresh = 0.0, 0.0
+                removed, added = 0.0, 0.0
             case _:
                 assert_never(method)
-        x = later**0.5 * clean + max(1 - later - replaced, 0.0) ** 0.5 * epsilon
-        if fresh:
+        x = alpha_bar_next**0.5 * clean + max(1 - alpha_bar_next - removed, 0.0) ** 0.5 * epsilon
+        if added:
             assert draw is not None, "DDPM draws fresh noise"
-            x = x + fresh**0.5 * draw()
+            x = x + added**0.5 * draw()
     return x

@@ -9,18 +9,17 @@ from torch import Tensor, nn
 from pipeline.geometry import rigid_torch
 
 POSE_CHANNELS = 9
-"""numbers of a pose in the ego frame: position, and the first two columns of the rotation; a kind follows"""
-NOBODY_M = 100.0
-"""somebody further away is not there: recordings put who is absent 1 km off"""
+"""channels of a pose in the ego frame: position and 6D rotation; the kind follows"""
+MAX_PRESENT_M = 100.0
+"""others beyond this distance are absent: recordings place absent ones 1 km away"""
 CLOSE_RANGE_M, EDGE_SHARPNESS = 1.5, 4.0
-"""distance around which another's is encoded, metres, and the inverse width, in radii, of the soft edge
-at the radius"""
+"""offset of the encoded distance, metres, and steepness of the soft edge at the radius, per radius"""
 APPROACH_SCALE = 1.5
-"""of approach speeds, at most 2 m/s, among the features: they then have the range of distances, +-3"""
+"""scale of approach speeds (at most 2 m/s), which gives them the range of the encoded distance, +-3"""
 HEADS = 4
-"""attention weights of a being, each for its part of the code"""
+"""attention heads, each for its part of the code"""
 MIN_WEIGHT = 1e-6
-"""of somebody beyond the radius, so that weights can be normalised where nobody is near"""
+"""attention weight of others beyond the radius, so that weights can be normalised when nobody is near"""
 
 
 def mlp(sizes: tuple[int, ...], dropout: float = 0.0) -> nn.Sequential:
@@ -31,13 +30,13 @@ def mlp(sizes: tuple[int, ...], dropout: float = 0.0) -> nn.Sequential:
     return nn.Sequential(*layers[:-2])
 
 
-def beings(
+def other_channels_torch(
     position: Float[Tensor, "batch past_frame 3"],
     rotation: Float[Tensor, "batch past_frame 3 3"],
     companions: Float[Tensor, "batch companion past_frame 4"],
     new_from_ego: Float[Tensor, "batch 3 3"],
 ) -> Float[Tensor, "batch other past_frame 10"]:
-    """Return what encoders read of an observer's poses and of companions, whose rotations are unknown (0)."""
+    """Return the encoder input of observer and companions, as `model.other_channels` does."""
     first = nn.functional.pad(torch.cat([position, rigid_torch.rotation_to_6d(rotation)], dim=-1), (0, 1))
     place = companions[..., :3] @ new_from_ego.mT[:, None]
     unknown = place.new_zeros(*place.shape[:3], POSE_CHANNELS - 3)
@@ -45,10 +44,8 @@ def beings(
 
 
 class SetEncoder(nn.Module):
-    """The code of a set of beings: each has one of the same layers, and the set their mean by attention (Ilse
-    et al. 2018) times nearness, in which order plays no part and somebody who leaves fades out.
-
-    The code of zero features is the learned null.
+    """Permutation-invariant encoder of a set: shared layers and attention pooling (Ilse et al. 2018) weighted
+    by nearness, so that others fade out as they leave. The code of zero features is the learned null.
     """
 
     def __init__(self, numbers: int, hidden: int, code: int):
@@ -64,7 +61,7 @@ class SetEncoder(nn.Module):
         inside: Float[Tensor, "batch other 1"],
         keep: Float[Tensor, "batch"],
     ) -> Float[Tensor, "batch code"]:
-        """Encode features that are zero where ``inside`` is 0; the code of one being is its own."""
+        """Encode features that are zero where ``inside`` is 0; a set of one is not pooled."""
         present = keep[:, None, None]
         hidden = self.layers[0](features * present) + kind * inside * present * self.animal
         codes = self.layers[1:](hidden)
@@ -75,12 +72,11 @@ class SetEncoder(nn.Module):
 
 
 class OthersEncoder(SetEncoder):
-    """Encode the past positions of others through features that vanish towards ``radius_m``.
+    """Encode the past positions of others by features that vanish towards ``radius_m``.
 
-    Distance and approach speed are encoded frame by frame in metres and m/s, well inside the radius undamped:
-    they decide whether the animal reacts, and to learn them from positions takes thousands of steps. Beyond
-    the radius all features are zero, so that a far being and none at all are the same to the agent: the
-    code of zero features is also the learned null.
+    Distance and approach speed of each frame (metres, m/s) are explicit features, undamped well inside the
+    radius: they decide whether the animal reacts, and learning them from positions takes thousands of steps.
+    Beyond the radius all features are zero, so that far others and none at all have the same code.
     """
 
     def __init__(self, frames: int, hidden: int, code: int, radius_m: float, rate_hz: float):
@@ -115,7 +111,7 @@ class OtherPosesEncoder(SetEncoder):
     def forward(
         self, others: Float[Tensor, "batch other past_frame 10"], keep: Float[Tensor, "batch"]
     ) -> Float[Tensor, "batch code"]:
-        near = (others[..., :3].square().sum(-1) < NOBODY_M**2).all(-1, keepdim=True)
+        near = (others[..., :3].square().sum(-1) < MAX_PRESENT_M**2).all(-1, keepdim=True)
         features = torch.where(near, others[..., :POSE_CHANNELS].flatten(-2), 0)
         return self.code_of_set(features, others[..., -1, -1:], near.to(features), keep)
 
@@ -139,7 +135,7 @@ class PastEncoder(nn.Module):
     def forward(
         self, past: Float[Tensor, "batch past"], bones_keep: Float[Tensor, "batch"] | None = None
     ) -> Float[Tensor, "batch code"]:
-        """``bones_keep`` is for training: 0 hides the bones of a sample (they take their mean)."""
+        """``bones_keep`` is for training: 0 replaces the bones of a sample by their mean."""
         past = (past.unflatten(1, (self.frames, -1)) - self.mean) / self.std
         bones = past[:, :, 9:].flatten(1)
         if bones_keep is not None:

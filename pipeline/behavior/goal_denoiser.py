@@ -1,10 +1,9 @@
-"""The denoiser of goals (Eq. 7): a multilayer perceptron that also reads the map where a goal may yet come to
-lie.
+"""The denoiser of goals (Eq. 7): a multilayer perceptron that also attends to the scene map.
 
-A code of the whole scene hardly holds where things stand. `MapAttention` looks up the map around the noisy
-goal, as far off as the noise lets it be, and elsewhere wherever the perception code asks it to look;
-`RestLikelihood` measures how well the noisy goal agrees with none, for animals mostly stay. Both on two kept
-homes of the behaviour benchmark, see `docs/behavior.md`.
+A global scene code hardly retains where things are. `MapAttention` has heads that attend around the noisy
+goal, as far as its noise level allows, and heads that attend where the perception code directs them;
+`RestLikelihood` is the likelihood of the noisy goal if the animal rests, as it mostly does. Both were
+evaluated on two held-out homes of the behaviour benchmark, see `docs/behavior.md`.
 """
 
 from itertools import pairwise
@@ -24,12 +23,11 @@ HORIZON_CHANNELS = 8
 
 
 class GoalMLP(nn.Module):
-    """Six layers of 128 (appendix A.2) per member, whose answers are averaged.
+    """An ensemble of MLPs, six layers of 128 each (appendix A.2), whose predictions are averaged.
 
-    The condition holds the maps of all members (of ``map_cells`` squared each, or none), their codes, and
-    more that goals do not read. Training may ask where the animal is at another part of the 5.6 s
-    (``horizon`` below 1), which teaches it more from as many minutes. All members are asked in one product
-    per layer: a plan for one animal is made of small products.
+    The condition holds the maps of all members (``map_cells`` squared each, or none), their codes, and more
+    that goals do not read. Training may also predict positions at earlier times (``horizon`` below 1, as a
+    share of the 5.6 s), which uses the data better. Members are batched in one product per layer, for speed.
     """
 
     def __init__(
@@ -69,25 +67,25 @@ class GoalMLP(nn.Module):
         condition: Float[Tensor, "batch condition"],
         horizon: Float[Tensor, "draw"],
     ) -> Float[Tensor, "member draw 3"]:
-        """Return what each member makes of it. A batch has its draws together."""
+        """Return the noise predicted by each member; the draws of a batch row are consecutive."""
         angle = horizon[:, None] * torch.tensor([1.0, 2.0, 4.0, 8.0], device=x.device)
-        asked = torch.cat([time_embedding(t), angle.sin(), angle.cos()], dim=-1)
+        step_embedding = torch.cat([time_embedding(t), angle.sin(), angle.cos()], dim=-1)
         each = [self.ensemble_size * self.map_numbers, self.ensemble_size * self.code]
         parts = condition[:, : sum(each)].split(each, dim=1)
         maps, codes = (part.unflatten(1, (self.ensemble_size, -1)) for part in parts)
         draws = 1 if x.shape[0] == condition.shape[0] else x.shape[0] // condition.shape[0]
         code = codes.transpose(0, 1)[:, :, None].expand(-1, -1, draws, -1).flatten(1, 2)
-        code_channels = torch.cat([asked.expand(self.ensemble_size, -1, -1), code], dim=-1)
+        code_channels = torch.cat([step_embedding.expand(self.ensemble_size, -1, -1), code], dim=-1)
         clean = self.clean(x, t)
         point = torch.cat([x, self.staying(*clean)], dim=-1)
-        seen = [point.expand(self.ensemble_size, -1, -1), code_channels]
+        inputs = [point.expand(self.ensemble_size, -1, -1), code_channels]
         if self.map is not None:
-            seen.append(self.map(*clean, code_channels, maps, draws))
-        return self.noise(x, self.layers(torch.cat(seen, dim=-1)), t)
+            inputs.append(self.map(*clean, code_channels, maps, draws))
+        return self.noise(x, self.layers(torch.cat(inputs, dim=-1)), t)
 
 
 class EnsembleLinear(nn.Module):
-    """A linear layer per member."""
+    """A linear layer for each member, evaluated as one batched product."""
 
     def __init__(self, ensemble_size: int, inner: int, outer: int):
         super().__init__()
@@ -100,29 +98,29 @@ class EnsembleLinear(nn.Module):
 
 
 class CleanGoalEstimate(nn.Module):
-    """Where the clean goal lies if nothing is known but the noisy one: mean and variance, in scaled units."""
+    """Mean and variance of the clean goal given only the noisy one, in scaled units."""
 
-    root: Tensor
+    sqrt_alpha_bar: Tensor
     variance: Tensor
 
     def __init__(self, schedule: Schedule):
         super().__init__()
-        share = torch.from_numpy(schedule.alpha_bar).float()
-        self.register_buffer("root", share.sqrt(), persistent=False)
-        self.register_buffer("variance", (1 - share) / share, persistent=False)
+        alpha_bar = torch.from_numpy(schedule.alpha_bar).float()
+        self.register_buffer("sqrt_alpha_bar", alpha_bar.sqrt(), persistent=False)
+        self.register_buffer("variance", (1 - alpha_bar) / alpha_bar, persistent=False)
 
     def forward(
         self, x: Float[Tensor, "batch 3"], t: Float[Tensor, "batch"]
     ) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch 1"]]:
         step = t.long()[:, None]
-        return x / self.root[step], self.variance[step]
+        return x / self.sqrt_alpha_bar[step], self.variance[step]
 
 
 class RestLikelihood(nn.Module):
-    """How well a noisy goal agrees with where the animal is, for several spreads about it."""
+    """Likelihood of a noisy goal under Gaussian priors of several spreads about the current position."""
 
     SPREADS = (0.0, 0.05, 0.2, 0.6)
-    """standard deviations of goals that count as staying, in scaled units"""
+    """standard deviations of the goals of resting animals, in scaled units"""
     NUMBERS = 5 * len(SPREADS)
     MIN, MAX = -4.0, 5.0
     """bounds of its outputs"""
@@ -135,30 +133,29 @@ class RestLikelihood(nn.Module):
     def forward(
         self, mean: Float[Tensor, "batch 3"], variance: Float[Tensor, "batch 1"]
     ) -> Float[Tensor, "batch 20"]:
-        """Return likelihoods (not normalised), their logarithms, and where the goal would be expected."""
-        odds = -mean.square().sum(-1, keepdim=True) / (2 * (variance + self.spread))
-        shrunk = mean[:, None] * (odds.exp() * self.spread / (variance + self.spread))[..., None]
-        likelihood, logarithm = odds.exp(), (odds / 5).clamp_min(self.MIN)
+        """Return unnormalised likelihoods, their logarithms, and likelihood-weighted posterior means."""
+        log_likelihood = -mean.square().sum(-1, keepdim=True) / (2 * (variance + self.spread))
+        likelihood = log_likelihood.exp()
+        shrunk = mean[:, None] * (likelihood * self.spread / (variance + self.spread))[..., None]
+        logarithm = (log_likelihood / 5).clamp_min(self.MIN)
         return torch.cat([likelihood, logarithm, shrunk.flatten(1).clamp(-self.MAX, self.MAX)], dim=-1)
 
 
 class MapAttention(nn.Module):
-    """Attention over the cells of a map, whose keys and values are its channels, in place of a code of the
-    whole.
+    """Attention over the cells of a map, whose channels are keys and values.
 
-    Two heads keep to where the clean goal may lie, given the noisy one, as a Bayesian would; two look
-    anywhere.
+    Two local heads have the log-likelihood of the clean goal given the noisy one as a bias; two are global.
     """
 
     LOCAL, HEADS = 2, 4
     PLACE = 5
-    """numbers of a cell for its position: twice x and z, in parts of the map and as goals are diffused,
-    and the latter's square"""
+    """position channels of a cell: x and z relative to the map, x and z in goal units, squared norm of the
+    latter"""
     NUMBERS = HEADS * (MAP_KEY_CHANNELS + 2) + LOCAL * 2
     FAR = 8.0
     """bound of the noisy goal, in scaled units"""
     FIRST_LOG_VARIANCE = (0.0, -3.0)
-    """logarithms of the first share of the noise's variance in a head's, and of what is added to it"""
+    """initial logarithms of the factor on the noise variance, and of the added variance, of local heads"""
     place: Tensor
     power: Tensor
     goal_std: Tensor
@@ -185,26 +182,26 @@ class MapAttention(nn.Module):
         variance: Float[Tensor, "draw 1"],
         code_channels: Float[Tensor, "member draw code"],
         maps: Float[Tensor, "batch member map"],
-        draws: int,  # noisy goals of each of the batch
+        draws: int,  # noisy goals per batch row
     ) -> Float[Tensor, "member draw 44"]:
-        """Return what each head reads, where it looks on average, and how far that is from the noisy goal."""
+        """Return each head's values and mean attended position, of local heads also relative to ``mean``."""
         key, value = maps.transpose(0, 1).unflatten(-1, (2, MAP_KEY_CHANNELS, -1)).unbind(2)
         scaled = self.power / self.goal_std[::2]
         cells = torch.cat([self.place, scaled, scaled.square().sum(-1, keepdim=True)], dim=-1)
         mean = mean[:, None, ::2].clamp(-self.FAR, self.FAR)
-        share = self.log_variance.exp()
-        narrow = 1 / (variance * share[..., 0] + share[..., 1])[..., None]
+        factor = self.log_variance.exp()
+        precision = 1 / (variance * factor[..., 0] + factor[..., 1])[..., None]
         query = self.query(code_channels).unflatten(-1, (self.HEADS, -1))
-        near = torch.cat([torch.zeros_like(mean * narrow), mean * narrow, -narrow / 2], dim=-1)
-        where = query[..., MAP_KEY_CHANNELS:] + nn.functional.pad(near, (0, 0, 0, self.HEADS - self.LOCAL))
-        asked, where = (
+        bias = torch.cat([torch.zeros_like(mean * precision), mean * precision, -precision / 2], dim=-1)
+        position = query[..., MAP_KEY_CHANNELS:] + nn.functional.pad(bias, (0, 0, 0, self.HEADS - self.LOCAL))
+        content, position = (
             part.reshape(part.shape[0], -1, draws * self.HEADS, part.shape[-1])
-            for part in (query[..., :MAP_KEY_CHANNELS] * MAP_KEY_CHANNELS**-0.5, where)
+            for part in (query[..., :MAP_KEY_CHANNELS] * MAP_KEY_CHANNELS**-0.5, position)
         )
-        weight = (asked @ key + where @ cells.transpose(-1, -2)).softmax(-1)
-        read, looked = (
+        weight = (content @ key + position @ cells.transpose(-1, -2)).softmax(-1)
+        read, attended = (
             (weight @ rows).flatten(1, 2).unflatten(1, (-1, self.HEADS))
             for rows in (value.transpose(-1, -2), scaled)
         )
-        read, place = read.flatten(2), looked.flatten(2)
-        return torch.cat([read, place, (looked[:, :, : self.LOCAL] - mean).flatten(2)], dim=-1)
+        offset = attended[:, :, : self.LOCAL] - mean
+        return torch.cat([read.flatten(2), attended.flatten(2), offset.flatten(2)], dim=-1)

@@ -1,8 +1,7 @@
-"""The behaviour model as a whole: what its channels mean, its networks, its files.
+"""The behaviour model: its architecture, channels, networks and files.
 
-`Architecture` fixes shapes, `BehaviorNets` holds the weights, `contract` and `load` write and read them as
-files; the functions between define the channels of body and past. Plans are drawn by
-`pipeline.behavior.planning`.
+`Architecture` fixes shapes, `BehaviorNets` holds the networks, `contract` and `load` write and read
+`behavior.json`; other functions define the channels of body and past. `pipeline.behavior.planning` samples.
 """
 
 import json
@@ -64,7 +63,7 @@ from pipeline.geometry import rigid
 
 @dataclass(frozen=True)
 class Architecture:
-    """Everything that fixes the shape of the networks and the meaning of their channels."""
+    """All that determines the shapes of the networks and the meaning of their channels."""
 
     bones: int
     ego: Ego = "yaw"
@@ -91,12 +90,12 @@ class Architecture:
 
     @property
     def body_channels(self) -> int:
-        """Root rotation and 6 numbers per bone."""
+        """Channels of a body: root rotation and 6 per bone."""
         return ROOT_CHANNELS + 6 * self.bones
 
     @property
     def scene_stride(self) -> int:
-        """Cells of the ego grid that are averaged along each axis before encoding; all of a height unread."""
+        """Cells of the ego grid that are averaged along each axis before encoding."""
         match self.scene:
             case "pillars":
                 return self.scene_block
@@ -109,17 +108,17 @@ class Architecture:
 
     @property
     def map_cells(self) -> int:
-        """Cells along each side of the map in which goals look things up; 0 without one."""
+        """Cells along each side of the map that goals read; 0 without a map."""
         return GRID_SHAPE[0] // self.scene_block if self.scene == "pillars" else 0
 
     @property
     def code_length(self) -> int:
-        """Length of the perception code of all members, of the pace and of the posture that is held now."""
+        """Length of the perception codes of all members, velocity and posture together."""
         return 3 * self.code * self.ensemble_size + VELOCITY_CHANNELS + self.body_channels
 
     @property
     def condition_length(self) -> int:
-        """Length of all that is perceived: the maps of all members, and what conditions path and body."""
+        """Length of the whole condition: maps of all members, then what conditions path and body."""
         return 2 * MAP_KEY_CHANNELS * self.map_cells**2 * self.ensemble_size + self.code_length
 
     @property
@@ -132,20 +131,20 @@ class Architecture:
 
 @dataclass(frozen=True)
 class Scaling:
-    """What turns ego-frame metres and radians into the unit-variance numbers that are diffused, and back."""
+    """Conversion between ego-frame metres and radians and the unit-variance channels that are diffused."""
 
     goal_std: Float[np.ndarray, "3"]
     velocity_std: Float[np.ndarray, "*each 4"]
-    """of strides, see `pipeline.behavior.path_encoding`: of all frames alike, or of each on its own"""
+    """of strides (`pipeline.behavior.path_encoding`), shared by all frames or for each frame"""
     path_std: Float[np.ndarray, "3 frame"]
-    """of places, as they condition the body, metres"""
+    """of positions, as they control the body, metres"""
     body_mean: Float[np.ndarray, "channel"]
     body_std: Float[np.ndarray, "channel"]
     rate_hz: float = RATE_HZ
     """frames per second"""
 
     def scaled_goal(self, goal: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
-        """Return goals in metres as they are diffused, and as they control a path."""
+        """Convert goals in metres to the units of diffusion and of the control of paths."""
         return (with_powered_length(goal, GOAL_LENGTH_POWER) / self.goal_std).astype(np.float32)
 
     def goal(self, scaled: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
@@ -155,7 +154,7 @@ class Scaling:
     def path(
         self, scaled: Float[np.ndarray, "plan 4 frame"], start: Float[np.ndarray, "plan 3"]
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Return the paths in metres, from ``start`` on, that scaled strides lead along."""
+        """Integrate scaled strides from ``start`` to paths in metres."""
         return path_from_velocity_channels(np.swapaxes(scaled, 1, 2) * self.velocity_std, start, self.rate_hz)
 
     def warped_path(
@@ -164,12 +163,12 @@ class Scaling:
         start: Float[np.ndarray, "plan 3"],
         path: Float[np.ndarray, "plan frame 3"],
     ) -> Float[np.ndarray, "plan 4 frame"]:
-        """Return scaled strides that lead along other paths."""
+        """Return scaled strides that follow other paths in metres."""
         strides = np.swapaxes(scaled, 1, 2) * self.velocity_std
         return np.swapaxes(warped_path(strides, start, path, self.rate_hz) / self.velocity_std, 1, 2)
 
     def scaled_path(self, path: Float[np.ndarray, "plan frame 3"]) -> Float[np.ndarray, "plan 3 frame"]:
-        """Return paths in metres as they control a body."""
+        """Convert paths in metres to the control of bodies."""
         return (np.swapaxes(path, 1, 2) / self.path_std).astype(np.float32)
 
 
@@ -197,24 +196,24 @@ class BehaviorNets(nn.Module):
                     self.path = WaypointUNet(*maps, 3, *sizes, rate_hz=a.rate_hz)
                 else:
                     self.path = ControlUNet(PATH_CHANNELS, 3, *sizes)
-                along = ControlUNet(a.body_channels, CONTROL_CHANNELS, *sizes)
+                body = ControlUNet(a.body_channels, CONTROL_CHANNELS, *sizes)
             case "concatenation":
                 self.path = ConcatenationUNet(PATH_CHANNELS, 3, *sizes)
-                along = ConcatenationUNet(a.body_channels, CONTROL_CHANNELS * a.future, *sizes)
+                body = ConcatenationUNet(a.body_channels, CONTROL_CHANNELS * a.future, *sizes)
             case _:
                 assert_never(a.control)
-        if a.family == "one_stage":  # one network for path and body, which nothing steers
+        if a.family == "one_stage":  # one network for path and body, without control
             read = TrailingLinear(a.code_length, EMBEDDING)
-            along = UncontrolledUNet(PATH_CHANNELS + a.body_channels, read, *sizes[1:])
-            self.body = OneStageDenoiser(along, a.body_channels, a.future, schedule, a.rate_hz)
+            body = UncontrolledUNet(PATH_CHANNELS + a.body_channels, read, *sizes[1:])
+            self.body = OneStageDenoiser(body, a.body_channels, a.future, schedule, a.rate_hz)
         else:
-            self.body = BodyDenoiser(along, a.body_channels, a.future, schedule, a.rate_hz)
+            self.body = BodyDenoiser(body, a.body_channels, a.future, schedule, a.rate_hz)
 
 
 def channels_from_bones(
     agent_from_bone: Float[np.ndarray, "*batch bone 4 4"], rest: Float[np.ndarray, "bone 4 4"]
 ) -> Float[np.ndarray, "*batch channel"]:
-    """Return per bone the rotation vector of ``agent_from_bone rest^-1`` and its origin's shift."""
+    """Return per bone the rotation vector of ``agent_from_bone rest^-1`` and the shift of its origin."""
     turn = agent_from_bone[..., :3, :3] @ np.swapaxes(rest[..., :3, :3], -1, -2)
     shift = agent_from_bone[..., :3, 3] - rest[..., :3, 3]
     return np.concatenate([rigid.vector_from_rotation(turn), shift], axis=-1).reshape(*turn.shape[:-3], -1)
@@ -233,10 +232,7 @@ def other_channels(
     ego_from_observer: Float[np.ndarray, "batch past_frame 4 4"],
     companions_ego: Float[np.ndarray, "batch companion past_frame 4"] | None = None,
 ) -> Float[np.ndarray, "batch other past_frame 10"]:
-    """Return position, rotation (6) and kind of observer and companions, oldest frame first (Eq. 12).
-
-    Of companions (position, kind) no rotation is known: zeros.
-    """
+    """Return position, 6D rotation (0 for companions) and kind of others, oldest frame first (Eq. 12)."""
     position, rotation = ego_from_observer[..., :3, 3], ego_from_observer[..., :3, :3]
     kind = np.zeros((*position.shape[:2], 1))
     others = np.concatenate([position, rigid.rotation_to_6d(rotation), kind], axis=-1)[:, None]
@@ -263,7 +259,7 @@ def past_channels(
 def contract(
     architecture: Architecture, scaling: Scaling, schedule: Schedule, rest: Float[np.ndarray, "bone 4 4"]
 ) -> dict:
-    """Return the content of `behavior.json`: all that a sampler in another language must know."""
+    """Return the content of `behavior.json`, for samplers in other languages."""
     bone = ["rotation_x", "rotation_y", "rotation_z", "shift_x", "shift_y", "shift_z"]
     root = ["right_x", "right_y", "right_z", "up_x", "up_y", "up_z"]
     return {
@@ -315,7 +311,7 @@ def contract(
 
 
 def refuse_unplayable(architecture: Architecture, where: str) -> None:
-    """Raise InputError SIM-006 for models whose plans cannot be chained, or not at the players' rate."""
+    """Raise InputError SIM-006 for models whose plans cannot be chained or have another rate than players."""
     if architecture.family != "diffusion":
         what = f"plans of the family {architecture.family} cannot be chained"
         raise InputError("SIM-006", what, where, "give a model of the family diffusion")
@@ -325,7 +321,7 @@ def refuse_unplayable(architecture: Architecture, where: str) -> None:
 
 
 def load(folder: Path) -> tuple[Architecture, BehaviorNets, Scaling, Schedule, Float[np.ndarray, "bone 4 4"]]:
-    """Read a trained model: its shape, networks, scaling, schedule, and the bones at rest.
+    """Read a trained model: architecture, networks, scaling, schedule, and the bones at rest.
 
     Raises InputError ART-007 for files or a contract of another version.
     """
@@ -341,7 +337,7 @@ def load(folder: Path) -> tuple[Architecture, BehaviorNets, Scaling, Schedule, F
         expected = json.loads(json.dumps(contract(architecture, scaling, schedule, rest)))
         other = sorted(
             name
-            for name in (expected.keys() | document.keys()) - {"sampling"}  # decided by who samples
+            for name in (expected.keys() | document.keys()) - {"sampling"}  # the caller decides
             if expected.get(name) != document.get(name)
         )
         if other:

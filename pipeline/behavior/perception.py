@@ -1,9 +1,8 @@
-"""What the agent perceives (omega of the paper): scene, others' and own past, as one code.
+"""Perception (omega of the paper): scene, others' past and own past as one code.
 
 `world_from_ego` gives the frame of all inputs, `FeatureVolume.around` samples the scene in it, and
-`Perception` turns the three raw inputs (metres, ego frame) into a code of 3 x 64 numbers. Normalisation
-happens inside the network. `PerceptionEnsemble` holds several perceptions, each with weights of its own, side
-by side.
+`Perception` encodes the three raw inputs (metres, ego frame) as 3 x 64 channels, normalised inside the
+network. `PerceptionEnsemble` is an ensemble of such networks with weights of their own.
 """
 
 from collections.abc import Iterable, Iterator
@@ -26,24 +25,22 @@ CONDITIONS: tuple[AblatedInput, ...] = ("scene", "observer", "past")
 GRID_SHAPE = (64, 8, 64)
 GRID_CELL_M = 0.1
 MAP_KEY_CHANNELS = 8
-"""channels of a map's keys, and as many of its values"""
+"""key channels of a map cell; it has as many value channels"""
 POSITION = 3
 """leading channels of a past frame, the root's position; root rotation and bones follow"""
 VELOCITY_CHANNELS = 3
-"""numbers of a code for the velocity"""
+"""channels of the condition for the velocity"""
 MIN_HORIZONTAL = 0.2
-"""shortest horizontal part of the head's direction that still defines the heading"""
+"""minimum horizontal length of the unit head direction that defines a heading"""
 
 
 def world_from_ego(
     world_from_agent: Float[np.ndarray, "*batch 4 4"], ego: Ego
 ) -> Float[np.ndarray, "*batch 4 4"]:
-    """Return the ego frame at the agent's root: its full rotation, or only its heading about world +y
-    (``yaw``).
+    """Return the ego frame at the agent's root, with its heading about world +y (``yaw``) or full rotation.
 
-    A head that points straight up or down has no heading: the belly's, or the back's, direction takes its
-    place. The ablation ``world`` keeps the world's axes and horizontal origin, and takes only the height from
-    the root.
+    If the head points straight up or down, belly or back direction defines the heading instead. The ablation
+    ``world`` keeps the world's axes and horizontal origin, and takes only the height from the root.
     """
     if ego == "full":
         return np.asarray(world_from_agent, float)
@@ -63,7 +60,7 @@ def world_from_ego(
 
 @dataclass(frozen=True)
 class FeatureVolume:
-    """The scene's features and occupancy on voxels of the world (Psi of the paper)."""
+    """Voxel grid of scene features and occupancy in the world frame (Psi of the paper)."""
 
     features: Float[np.ndarray, "channel x y z"]
     occupancy: UInt8[np.ndarray, "x y z"]
@@ -106,16 +103,16 @@ def grid_points_ego(stride: int = 1) -> Float[np.ndarray, "width height length 3
 
 
 SceneEncoding = tuple[Float[Tensor, "batch map"], Float[Tensor, "batch code"]]
-"""A map's channels, cell after cell (z, then x; none where there is no map), and a code"""
+"""Flattened map channels over cells (z, then x; empty without a map), and a code"""
 PerceptionCode = tuple[Float[Tensor, "batch map"], Float[Tensor, "batch code_of_all"]]
-"""The same of scene, others and past together"""
+"""Flattened map, and the codes of scene, others and past concatenated"""
 
 
 class PillarScene(nn.Module):
-    """A 2.5-D encoder: blocks of cells averaged, height folded into channels, 2-D convolutions down to 4 x 4.
+    """A 2.5-D encoder: average pooling, height folded into channels, 2-D convolutions down to 4 x 4.
 
-    Beside the code it makes a map for goals to look things up in, where cells are blocks. Measured on minutes
-    of data, blocks of 0.4 m predict as well as blocks of 0.2 m at a quarter of the time.
+    It also returns a map of the pooled blocks, for goals to attend to. Measured on minutes of data, blocks
+    of 0.4 m predict as well as blocks of 0.2 m at a quarter of the time.
     """
 
     def __init__(self, channels: int, width: int, code: int, block: int):
@@ -137,7 +134,7 @@ class PillarScene(nn.Module):
         return self.encode(self.pool(grid))
 
     def encode(self, pooled: Float[Tensor, "batch channel x y z"]) -> SceneEncoding:
-        """Encode a grid that is already averaged over blocks of cells."""
+        """Encode a grid that is already pooled over blocks of cells."""
         blocks = self.enter(pooled.transpose(2, 3).flatten(1, 2).transpose(2, 3))
         return self.map(blocks).flatten(1), self.out(self.convolutions(blocks).flatten(1))
 
@@ -163,7 +160,7 @@ class VolumeScene(nn.Module):
 
 
 class NoScene(nn.Module):
-    """No encoder: no map, and a code of zeros."""
+    """No scene: an empty map and a code of zeros."""
 
     def __init__(self, code: int):
         super().__init__()
@@ -195,7 +192,7 @@ class PerceptionConfig:
 
 
 class Perception(nn.Module):
-    """The code of scene, others and past, each of which ``keep`` can replace by its learned null."""
+    """Encoder of scene, others and past; ``keep`` 0 replaces one by its learned null (condition dropout)."""
 
     condition_mask: Tensor
 
@@ -243,30 +240,30 @@ class Perception(nn.Module):
         keep: Float[Tensor, "batch 3"],
         bones_keep: Float[Tensor, "batch"],
     ) -> PerceptionCode:
-        """Encode a scene already averaged over blocks; ``bones_keep`` 0 hides remembered bones."""
+        """Encode a scene already pooled over blocks; ``bones_keep`` 0 hides past bones."""
         return self.join(self.scene.encode(pooled), others, self.past(past, bones_keep), keep)
 
     def join(
         self,
-        map_lookup: SceneEncoding,
+        scene_encoding: SceneEncoding,
         others: Float[Tensor, "batch other past_frame 10"],
         past: Float[Tensor, "batch code"],
         keep: Float[Tensor, "batch 3"],
     ) -> PerceptionCode:
-        """Put the codes side by side, nulls where ``keep`` is 0 or the model is blind; a map's null is 0."""
-        chart, scene = map_lookup
+        """Concatenate the codes, with nulls where ``keep`` is 0 or an input is ablated; a map's null is 0."""
+        scene_map, scene = scene_encoding
         keep = keep * self.condition_mask
         set_code = self.others(others, keep[:, 1])
         scene = torch.where(keep[:, :1] > 0.5, scene, self.scene_null)
         past = torch.where(keep[:, 2:] > 0.5, past, self.past_null)
-        return chart * keep[:, :1], torch.cat([scene, set_code, past], dim=-1)
+        return scene_map * keep[:, :1], torch.cat([scene, set_code, past], dim=-1)
 
 
 class PerceptionEnsemble(nn.Module):
-    """Several perceptions; the code of the whole is all maps, their codes, velocity and posture."""
+    """An ensemble of perceptions; the condition is all maps, all codes, velocity and posture."""
 
     POSTURE_FRAMES = 3
-    """last frames, which give the velocity and whose mean is the posture"""
+    """last frames of the past, which give velocity and mean posture"""
 
     def __init__(self, size: PerceptionConfig, count: int):
         super().__init__()
@@ -277,7 +274,7 @@ class PerceptionEnsemble(nn.Module):
 
     @property
     def first(self) -> Perception:
-        """The first member: sizes and scaling of past and others are the same in all."""
+        """The first member; sizes and scaling of past and others are the same in all."""
         return next(iter(self))
 
     def forward(
@@ -289,20 +286,20 @@ class PerceptionEnsemble(nn.Module):
     ) -> Float[Tensor, "batch condition"]:
         """``keep`` holds 1 or 0 for scene, others and past."""
         frames = past.unflatten(1, (self.first.past.frames, -1))[:, -self.POSTURE_FRAMES :]
-        readings = [member(scene_grid, others, past, keep) for member in self]
-        return self.condition(readings, self.now(frames, keep[:, 2]))
+        encodings = [member(scene_grid, others, past, keep) for member in self]
+        return self.condition(encodings, self.now(frames, keep[:, 2]))
 
     def condition(
-        self, readings: list[PerceptionCode], now: Float[Tensor, "batch state"]
+        self, encodings: list[PerceptionCode], now: Float[Tensor, "batch state"]
     ) -> Float[Tensor, "batch condition"]:
-        """Put the encodings of all members and the current state side by side (omega, Eq. 11-13)."""
-        maps, codes = zip(*readings, strict=True)
+        """Concatenate the encodings of all members and the current state (omega, Eq. 11-13)."""
+        maps, codes = zip(*encodings, strict=True)
         return torch.cat([*maps, *codes, now], dim=-1)
 
     def now(
         self, frames: Float[Tensor, "batch frame channel"], keep: Float[Tensor, "batch"]
     ) -> Float[Tensor, "batch state"]:
-        """Return velocity, encoded as paths are, and scaled posture; zeros where the past is dropped."""
+        """Return velocity (as channels of paths) and scaled posture; zeros where the past is dropped."""
         member = self.first
         per_frame = member.rate_hz / (self.POSTURE_FRAMES - 1)
         velocity = (frames[:, -1, :POSITION] - frames[:, 0, :POSITION]) * per_frame

@@ -1,8 +1,7 @@
-"""Sampled plans: what the agent perceives goes in, goal, then path, then body come out (Fig. 3).
+"""Hierarchical sampling of plans from an observation: goal, then path, then body (Fig. 3).
 
-`observe` turns a context into network inputs, `Sampler.plan` draws plans from them,
-`SampledPlan.world_from_agent` puts them into the world. Networks are met through `Networks`, which torch
-modules and ONNX sessions can satisfy.
+`observe` encodes a context as network inputs, `Sampler.plan` samples plans, `SampledPlan.world_from_agent`
+transforms them to the world. The protocol `Networks` is implemented by torch modules and ONNX sessions.
 """
 
 from collections.abc import Callable
@@ -33,7 +32,7 @@ from pipeline.geometry import rigid
 
 Array = np.ndarray
 Denoise = Callable[[Array, float], Array]
-"""from noisy samples and a step to the noise in them"""
+"""maps noisy samples and a step to the predicted noise"""
 
 
 class Networks(Protocol):
@@ -44,7 +43,7 @@ class Networks(Protocol):
         ...
 
     def goal(self, x: Array, t: Array, condition: Array) -> Array:
-        """Return the noise in x; a row of the condition is for as many rows of x as it takes."""
+        """Return the noise in x; each row of the condition is repeated to match the rows of x."""
         ...
 
     def path(self, x: Array, t: Array, condition: Array, control: Array, keep: Array) -> Array:
@@ -57,7 +56,7 @@ class Networks(Protocol):
 
 
 class TorchNetworks:
-    """`Networks` by torch modules on any device."""
+    """`Networks` as torch modules on any device."""
 
     def __init__(self, nets: BehaviorNets, device: str = "cpu"):
         self.nets, self.device = nets.eval().to(device), device
@@ -89,7 +88,7 @@ class Observation:
     """poses and kinds; the observer first"""
     past: Float[np.ndarray, "batch past"]
     constraint: SceneConstraint | None = None
-    """where the agents may be, for samplers that keep to it"""
+    """where the agents may be, for samplers with constraints"""
 
     def __getitem__(self, index: slice | np.ndarray) -> "Observation":
         """Return some of the batch."""
@@ -100,13 +99,13 @@ class Observation:
         return len(self.past)
 
     def without_observer(self) -> "Observation":
-        """Return the same with the observer, the first of the others, out of sight."""
+        """Return a copy without the observer, who is the first of the others."""
         others = self.others.copy()
         others[:, 0, :, 0] = ABSENT_M
         return replace(self, others=others)
 
     def boneless(self, mean: Float[np.ndarray, "body"]) -> "Observation":
-        """Return the same with the bones of a mean body, which goals and paths take for hidden ones."""
+        """Return a copy with bones of the mean body, which for goals and paths are hidden ones."""
         past = self.past.reshape(len(self), self.others.shape[2], -1).copy()
         past[..., POSITION + ROOT_CHANNELS :] = mean[ROOT_CHANNELS:]
         return replace(self, past=past.reshape(len(self), -1))
@@ -123,7 +122,7 @@ class SampledPlan:
     def world_from_agent(
         self, world_from_ego: Float[np.ndarray, "batch 4 4"]
     ) -> Float[np.ndarray, "batch frame 4 4"]:
-        """Return the root's poses."""
+        """Return the root's poses in the world."""
         ego_from_agent = rigid.make(rigid.rotation_from_6d(self.body[..., :ROOT_CHANNELS]), self.path)
         return world_from_ego[:, None] @ ego_from_agent
 
@@ -148,24 +147,24 @@ def observe(
 
 @dataclass(frozen=True)
 class PlanCondition:
-    """Perception codes, one row per plan."""
+    """Conditions of plans, and the references of classifier-free guidance; one row per plan."""
 
     full: Float[np.ndarray, "plan condition"]
-    """of everything that is kept"""
-    less: tuple[Float[np.ndarray, "plan condition"], ...]
-    """of the same without the observer, then without anybody where companions are guided; or of nothing"""
+    """condition with everything that is kept"""
+    references: tuple[Float[np.ndarray, "plan condition"], ...]
+    """conditions without the observer, then without all others if companions are guided; or unconditional"""
     start: Float[np.ndarray, "plan 3"]
-    """where the animal is now, in the ego frame"""
+    """current position, ego frame"""
     constraint: SceneConstraint | None
-    """where goals and paths are kept to"""
+    """constraint of goals and paths"""
     count: int = 1
-    """plans of what is perceived once, whose rows are alike and stand together"""
+    """plans per observation; their rows are equal and consecutive"""
 
     def __getitem__(self, some: Int[np.ndarray, "some"]) -> "PlanCondition":
-        """Return some of the rows, each on its own."""
+        """Return some of the rows, one plan each."""
         constraint = None if self.constraint is None else self.constraint[some // self.count]
-        less = tuple(code[some] for code in self.less)
-        return PlanCondition(self.full[some], less, self.start[some], constraint)
+        references = tuple(code[some] for code in self.references)
+        return PlanCondition(self.full[some], references, self.start[some], constraint)
 
     def on_support(self, goal: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
         """Move goals in metres to where the agent may rest."""
@@ -174,14 +173,14 @@ class PlanCondition:
     def constrained(
         self, path: Float[np.ndarray, "plan frame 3"], rate_hz: float
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Keep paths in metres where the agent may be, and on what carries it."""
+        """Keep paths in metres out of solid space and on the supporting surface."""
         limit = self.constraint
         return path if limit is None else limit.on_support(limit.out_of_solid(path), self.start, rate_hz)
 
 
 @dataclass(frozen=True)
 class Sampler:
-    """Draws plans: networks, schedule and scaling together."""
+    """Samples plans with networks, schedule and scaling."""
 
     networks: Networks
     schedule: Schedule
@@ -197,10 +196,10 @@ class Sampler:
         goal: Float[np.ndarray, "plan 3"] | None = None,
         path: Float[np.ndarray, "plan frame 3"] | None = None,
     ) -> SampledPlan:
-        """Draw ``count`` plans for each row, together; a given goal or path replaces its level."""
+        """Draw ``count`` plans per observation in one batch; a given goal or path is not sampled."""
         return self.draw_plans(self.codes(observation, sampling, count), sampling, rng, goal, path)
 
-    def course(
+    def plan_paths(
         self,
         observation: Observation,
         sampling: PlanSamplingConfig,
@@ -208,8 +207,8 @@ class Sampler:
         *,
         count: int = 1,
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw goals and paths as `plan` does, metres in the ego frame, and spare the body."""
-        return self.draw_courses(self.codes(observation, sampling, count), sampling, rng)
+        """Draw goals and paths as `plan` does, without bodies; metres, ego frame."""
+        return self.draw_plan_paths(self.codes(observation, sampling, count), sampling, rng)
 
     def draw_plans(
         self,
@@ -219,35 +218,36 @@ class Sampler:
         goal: Array | None,
         path: Array | None,
     ) -> SampledPlan:
-        """Draw one plan per code, each level on its own where it is not given."""
+        """Draw one plan per row, sampling the levels that are not given."""
         goal = self.goals(codes, sampling, rng) if goal is None else goal
         path = self.paths(codes, goal, sampling, rng) if path is None else path
         return SampledPlan(goal, path, self.bodies(codes, path, sampling, rng))
 
-    def draw_courses(
+    def draw_plan_paths(
         self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw one path per code, towards a goal of its own."""
+        """Draw one path per row, to a goal of its own."""
         return self.paths(codes, self.goals(codes, sampling, rng), sampling, rng)
 
     def codes(self, observation: Observation, sampling: PlanSamplingConfig, count: int = 1) -> PlanCondition:
-        """Encode what ``sampling`` keeps of it, and the references of guidance, ``count`` times."""
+        """Encode the kept conditions and the references of guidance, repeating rows ``count`` times."""
         conditions = [[sampling.scene, sampling.observer, sampling.past]]
         keep = np.repeat(np.array(conditions, np.float32), len(observation), axis=0)
 
         def code(seen: Observation) -> Array:
             return self.networks.perceive(seen.scene_grid, seen.others, seen.past, keep).repeat(count, axis=0)
 
-        full, less, each = code(observation), [], sampling.guided == "observer"
-        accompanied = each and observation.others.shape[1] > 1 and sampling.companions_guidance != 1
-        if each and (sampling.guidance != 1 or accompanied):
-            less.append(code(observation.without_observer()))
-        keep[:, 1 if each else slice(None)] = 0
-        less += [code(observation)] if accompanied or (not each and sampling.guidance != 1) else []
+        full, references, by_observer = code(observation), [], sampling.guided == "observer"
+        accompanied = by_observer and observation.others.shape[1] > 1 and sampling.companions_guidance != 1
+        if by_observer and (sampling.guidance != 1 or accompanied):
+            references.append(code(observation.without_observer()))
+        keep[:, 1 if by_observer else slice(None)] = 0
+        if accompanied or (not by_observer and sampling.guidance != 1):
+            references.append(code(observation))
         past = observation.past.reshape(len(observation), observation.others.shape[2], -1)
         start = np.repeat(past[:, -1, :3], count, axis=0)
         constraint = observation.constraint if sampling.avoid_solid and sampling.scene else None
-        return PlanCondition(full, tuple(less), start, constraint, count)
+        return PlanCondition(full, tuple(references), start, constraint, count)
 
     def goals(
         self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
@@ -257,8 +257,8 @@ class Sampler:
         def denoise(code: Array) -> Denoise:
             return lambda x, t: self.networks.goal(x, _filled(len(x), t), code)
 
-        denoisers = [denoise(code[:: codes.count]) for code in (codes.full, *codes.less)]
-        x = self._drawn(denoisers, (len(codes.full), 3), sampling, sampling.goal_steps, rng)
+        denoisers = [denoise(code[:: codes.count]) for code in (codes.full, *codes.references)]
+        x = self._denoised(denoisers, (len(codes.full), 3), sampling, sampling.goal_steps, rng)
         return codes.on_support(self.scaling.goal(x))
 
     def paths(
@@ -268,7 +268,7 @@ class Sampler:
         sampling: PlanSamplingConfig,
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw paths to goals, again where they miss although guidance follows the goal alone."""
+        """Draw paths to goals; paths that miss their goals are drawn again."""
         path = self.draw_paths(codes, goal, sampling, rng)
         for _ in range(sampling.max_path_draws - 1 if sampling.goal and sampling.guidance >= 1 else 0):
             off = goal_error(path, codes.start, goal)
@@ -287,7 +287,7 @@ class Sampler:
         sampling: PlanSamplingConfig,
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw a path towards each goal (Eq. 8), metres, ego frame; guidance acts on it."""
+        """Draw a path to each goal (Eq. 8) with guidance; metres, ego frame."""
         control = self.scaling.scaled_goal(goal)
 
         def denoise(code: Array, keep: float = 0.0) -> Denoise:
@@ -295,14 +295,12 @@ class Sampler:
                 x, _filled(len(x), t), code, control, _filled((len(x), 1), keep)
             )
 
-        towards = [denoise(codes.full, float(sampling.goal)), *map(denoise, codes.less)]
+        denoisers = [denoise(codes.full, float(sampling.goal)), *map(denoise, codes.references)]
         correct, spread = partial(self.paths_out_of_solid, codes), sampling.path_noise_std
-        shape, drawn = (
-            (len(goal), PATH_CHANNELS, self.scaling.path_std.shape[1]),
-            replace(sampling, method="ddim"),
-        )
-        path = self._drawn(towards, shape, drawn, sampling.sequence_steps, rng, correct, spread)
-        return self.finished_paths(codes, path, goal, sampling)
+        shape = (len(goal), PATH_CHANNELS, self.scaling.path_std.shape[1])
+        ddim = replace(sampling, method="ddim")
+        path = self._denoised(denoisers, shape, ddim, sampling.sequence_steps, rng, correct, spread)
+        return self.decode_paths(codes, path, goal, sampling)
 
     def bodies(
         self,
@@ -311,7 +309,7 @@ class Sampler:
         sampling: PlanSamplingConfig,
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan frame channel"]:
-        """Draw bodies along paths, which are among what is guided where all conditions are."""
+        """Draw bodies along paths; if all conditions are guided, the path is one of them."""
         control = self.scaling.scaled_path(path)
 
         def denoise(code: Array, keep: float = float(sampling.guided == "observer")) -> Denoise:
@@ -320,33 +318,34 @@ class Sampler:
             )
 
         shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
-        along = [denoise(codes.full, 1.0), *map(denoise, codes.less)]
-        drawn = replace(sampling, method="ddim", guidance=min(sampling.guidance, 1.0))
-        body = self._drawn(along, shape, drawn, sampling.sequence_steps, rng, spread=sampling.body_noise_std)
+        denoisers = [denoise(codes.full, 1.0), *map(denoise, codes.references)]
+        ddim = replace(sampling, method="ddim", guidance=min(sampling.guidance, 1.0))
+        steps, spread = sampling.sequence_steps, sampling.body_noise_std
+        body = self._denoised(denoisers, shape, ddim, steps, rng, spread=spread)
         return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
 
     def paths_out_of_solid(
         self, codes: PlanCondition, scaled: Float[np.ndarray, "plan 4 frame"]
     ) -> Float[np.ndarray, "plan 4 frame"]:
-        """Move scaled paths to where the agent may be."""
+        """Project scaled paths out of solid space."""
         if codes.constraint is None:
             return scaled
         path = codes.constraint.out_of_solid(self.scaling.path(scaled, codes.start))
         return self.scaling.warped_path(scaled, codes.start, path)
 
-    def finished_paths(
+    def decode_paths(
         self,
         codes: PlanCondition,
         scaled: Float[np.ndarray, "plan 4 frame"],
         goal: Float[np.ndarray, "plan 3"],
         sampling: PlanSamplingConfig,
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Return paths in metres, snapped to their goals as far as these condition, and constrained."""
+        """Convert scaled paths to metres, snap them to the goals that condition them, and constrain them."""
         pull = float(sampling.goal) * min(sampling.guidance, 1.0)
         path = self.scaling.path(scaled, codes.start)
         return codes.constrained(snapped_to_goal(path, codes.start, goal, pull), self.scaling.rate_hz)
 
-    def _drawn(
+    def _denoised(
         self,
         denoisers: list[Denoise],
         shape: tuple[int, ...],

@@ -1,8 +1,7 @@
-"""Reading the map at noisy points, as the released code does: a goal at where it may lie, a path at each of
-its waypoints.
+"""Sampling of the map at noisy goals and at each noisy waypoint of a path, as in the released code.
 
-A variant beside `goal_denoiser.MapAttention`, which looks where it wants to. Points are read where they are
-expected, given the noisy sample and nothing else: at the noisiest steps all are near the animal.
+An alternative to `goal_denoiser.MapAttention`. The map is sampled at the expected clean point given the noisy
+one alone: at the noisiest steps all are near the animal.
 """
 
 import math
@@ -22,27 +21,27 @@ from pipeline.behavior.path_encoding import (
 from pipeline.behavior.perception import GRID_CELL_M, GRID_SHAPE, MAP_KEY_CHANNELS
 from pipeline.behavior.trajectories import RATE_HZ
 
-HALF_M = GRID_SHAPE[0] * GRID_CELL_M / 2
-"""from the middle of a map to its edge"""
-READ = 2 * MAP_KEY_CHANNELS
+HALF_MAP_M = GRID_SHAPE[0] * GRID_CELL_M / 2
+"""distance from the centre of a map to its edge"""
+MAP_CHANNELS = 2 * MAP_KEY_CHANNELS
 """channels of a map"""
 
 
-def read_at(
+def sample_maps(
     maps: Float[Tensor, "batch member map"], points: Float[Tensor, "batch point 3"]
 ) -> Float[Tensor, "batch member channel point"]:
-    """Return what maps say, bilinear, at points in metres of the ego frame; zeros beyond the edge."""
-    cells = math.isqrt(int(maps.shape[-1]) // READ)
-    chart = maps.flatten(0, 1).unflatten(1, (READ, cells, cells))
-    where = (points[:, None, :, None, ::2] / HALF_M).expand(-1, maps.shape[1], -1, -1, -1).flatten(0, 1)
-    read = nn.functional.grid_sample(chart, where, align_corners=False)[..., 0]
+    """Sample maps bilinearly at points in metres of the ego frame; zeros beyond the edge."""
+    cells = math.isqrt(int(maps.shape[-1]) // MAP_CHANNELS)
+    images = maps.flatten(0, 1).unflatten(1, (MAP_CHANNELS, cells, cells))
+    where = (points[:, None, :, None, ::2] / HALF_MAP_M).expand(-1, maps.shape[1], -1, -1, -1).flatten(0, 1)
+    read = nn.functional.grid_sample(images, where, align_corners=False)[..., 0]
     return read.unflatten(0, (-1, maps.shape[1]))
 
 
 class MapAtGoal(nn.Module):
-    """The map where a noisy goal is expected; called as `MapAttention` is."""
+    """The map at the expected clean goal; same signature as `MapAttention`."""
 
-    NUMBERS = READ
+    NUMBERS = MAP_CHANNELS
     goal_std: Tensor
 
     def __init__(self):
@@ -57,16 +56,16 @@ class MapAtGoal(nn.Module):
         maps: Float[Tensor, "batch member map"],
         draws: int,
     ) -> Float[Tensor, "member draw 16"]:
-        """Return the map's channels there."""
+        """Return the map's channels at the expected goals."""
         del code
         goal = with_powered_length(mean / (1 + variance) * self.goal_std, 1 / GOAL_LENGTH_POWER)
-        return read_at(maps, goal.unflatten(0, (-1, draws))).permute(1, 0, 3, 2).flatten(1, 2)
+        return sample_maps(maps, goal.unflatten(0, (-1, draws))).permute(1, 0, 3, 2).flatten(1, 2)
 
 
 class WaypointUNet(ControlUNet):
-    """A `ControlUNet` of velocity channels that reads the maps of all members at each noisy waypoint."""
+    """A `ControlUNet` of paths that also reads all members' maps at each expected waypoint."""
 
-    share: Tensor
+    sqrt_alpha_bar: Tensor
     velocity_std: Tensor
 
     def __init__(
@@ -82,10 +81,12 @@ class WaypointUNet(ControlUNet):
         rate_hz: float = RATE_HZ,
     ):
         super().__init__(PATH_CHANNELS, control, condition, width, multipliers, schedule)
-        self.ensemble_size, self.map_numbers = ensemble_size, READ * map_cells**2
+        self.ensemble_size, self.map_numbers = ensemble_size, MAP_CHANNELS * map_cells**2
         self.rate_hz = rate_hz
-        self.main.enter = nn.Conv1d(PATH_CHANNELS + ensemble_size * READ, self.main.block_widths[0], 1)
-        self.register_buffer("share", torch.from_numpy(schedule.alpha_bar).float().sqrt(), persistent=False)
+        channels = PATH_CHANNELS + ensemble_size * MAP_CHANNELS
+        self.main.enter = nn.Conv1d(channels, self.main.block_widths[0], 1)
+        sqrt_alpha_bar = torch.from_numpy(schedule.alpha_bar).float().sqrt()
+        self.register_buffer("sqrt_alpha_bar", sqrt_alpha_bar, persistent=False)
         self.register_buffer("velocity_std", torch.ones(frames, PATH_CHANNELS))
 
     def unet_input(
@@ -94,13 +95,13 @@ class WaypointUNet(ControlUNet):
         t: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
     ) -> Float[Tensor, "batch channel frame"]:
-        """Return the noisy strides and, beside each, what the maps say where it is expected to lead."""
+        """Return the noisy strides and the maps' channels at the expected waypoints, concatenated."""
         maps = condition[:, : self.ensemble_size * self.map_numbers].unflatten(1, (self.ensemble_size, -1))
-        return torch.cat([x, read_at(maps, self.waypoints(x, t)).flatten(1, 2)], dim=1)
+        return torch.cat([x, sample_maps(maps, self.waypoints(x, t)).flatten(1, 2)], dim=1)
 
     def waypoints(
         self, x: Float[Tensor, "batch 4 frame"], t: Float[Tensor, "batch"]
     ) -> Float[Tensor, "batch frame 3"]:
-        """Return where noisy strides are expected to lead, metres from the animal."""
-        strides = (self.share[t.long()][:, None, None] * x).transpose(-1, -2) * self.velocity_std
+        """Return the expected waypoints given noisy strides, metres from the animal."""
+        strides = (self.sqrt_alpha_bar[t.long()][:, None, None] * x).transpose(-1, -2) * self.velocity_std
         return expected_steps(strides, self.rate_hz).cumsum(1)

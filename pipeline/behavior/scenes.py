@@ -1,7 +1,7 @@
-"""The scenes of all recordings: one home for all of them, or another one for each.
+"""The scenes of all recordings: a shared one, or one for each.
 
-`Scenes.load` reads what `slice_behavior` wrote; `around` samples the ego grid of each window in its own
-scene, which the window's `Context.scene` names.
+`Scenes.load` reads what `slice_behavior` wrote; `around` samples the ego grid of each window in the scene of
+its recording (`Context.video`).
 """
 
 from dataclasses import dataclass, replace
@@ -20,14 +20,14 @@ from pipeline.data import npz
 from pipeline.geometry import rigid
 
 INSET_SHARE = 0.01
-"""how far inside an allowed voxel a point is put, in edges of the voxel"""
+"""distance of projected points from the faces of an allowed voxel, in voxels"""
 TURNS_RAD = np.arange(1, 18) // 2 * (-1) ** np.arange(1, 18) * np.pi / 16
-"""turns by which a goal gets out of something solid, the least first, up to a right angle either way"""
+"""rotations tried to move a goal out of solid space, smallest first, up to a right angle either way"""
 
 
 @dataclass(frozen=True)
 class Scenes:
-    """Feature volumes, and which one each recording was made in."""
+    """Feature volumes and the volume of each recording."""
 
     volumes: tuple[FeatureVolume, ...]
     allowed: tuple[Bool[np.ndarray, "x y z"], ...]
@@ -35,7 +35,7 @@ class Scenes:
     of_video: Int[np.ndarray, "video"]
     """Index into ``volumes`` of every recording."""
     supports: tuple[Support | None, ...] = ()
-    """Per volume, what carries an agent, where that is known."""
+    """Per volume, the supporting surfaces, if known."""
 
     @classmethod
     def load(cls, folder: Path, videos: tuple[str, ...]) -> "Scenes":
@@ -53,11 +53,11 @@ class Scenes:
 
     @classmethod
     def of(cls, volume: FeatureVolume) -> "Scenes":
-        """Return the one scene of all recordings, with all that is free allowed."""
+        """Return a scene shared by all recordings; all that is not solid is allowed."""
         return cls((volume,), (volume.occupancy != 1,), np.zeros(1, int))
 
     def without_features(self) -> "Scenes":
-        """Return the same scenes for a model that encodes none: they only limit where an agent may be."""
+        """Return the scenes without features, for models without scene encoder: as constraints only."""
         volumes = tuple(replace(volume, features=volume.features[:0]) for volume in self.volumes)
         return replace(self, volumes=volumes)
 
@@ -67,7 +67,7 @@ class Scenes:
         return len(self.volumes[0].features)
 
     def number(self, video: Int[np.ndarray, "window"] | None, windows: int) -> Int[np.ndarray, "window"]:
-        """Return the volume of each window, given the numbers of their recordings (None: one volume)."""
+        """Return the volume of each window given its recording (None: there is one volume)."""
         if len(self.volumes) == 1 or video is None:
             assert len(self.volumes) == 1, "windows of several scenes must name their recording"
             return np.zeros(windows, int)
@@ -90,7 +90,7 @@ class Scenes:
     def inside_solid(
         self, points_world: Float[np.ndarray, "window *some 3"], video: Int[np.ndarray, "window"] | None
     ) -> Bool[np.ndarray, "window *some"]:
-        """Return which points are in something solid or outside the mapped space; none without a map."""
+        """Return which points are inside solid or unmapped space; none if there is no map."""
         number = self.number(video, len(points_world))
         solid = np.zeros(points_world.shape[:-1], bool)
         for scene in np.unique(number):
@@ -102,7 +102,7 @@ class Scenes:
 
     @cached_property
     def nearest_allowed(self) -> tuple[Int[np.ndarray, "3 x y z"] | None, ...]:
-        """Per volume, the allowed voxel nearest to each voxel; None where there is none, or no map."""
+        """Per volume, the allowed voxel nearest to each voxel; None without allowed voxels or map."""
         return tuple(
             np.asarray(distance_transform_edt(~allowed, return_distances=False, return_indices=True))
             if allowed.any() and not (volume.occupancy == 2).all()
@@ -113,7 +113,7 @@ class Scenes:
     def out_of_solid(
         self, points_world: Float[np.ndarray, "window *some 3"], video: Int[np.ndarray, "window"] | None
     ) -> Float[np.ndarray, "window *some 3"]:
-        """Move points that `inside_solid` finds to the nearest voxel where the agent's root may be."""
+        """Project points `inside_solid` to the nearest voxel where the agent's root may be."""
         number, moved = self.number(video, len(points_world)), np.array(points_world)
         for scene in np.unique(number):
             nearest, volume, mine = self.nearest_allowed[scene], self.volumes[scene], number == scene
@@ -133,7 +133,7 @@ class Scenes:
         moves: Bool[np.ndarray, "window *some"],
         video: Int[np.ndarray, "window"] | None,
     ) -> Float[np.ndarray, "window *some"]:
-        """Return the heights, nearest to the points', at which something carries the agent's root."""
+        """Return the supported root heights nearest to those of the points."""
         number, height = self.number(video, len(points_world)), np.array(points_world[..., 1])
         for scene, support in enumerate(self.supports):
             if support is not None:
@@ -144,7 +144,7 @@ class Scenes:
 
 @dataclass(frozen=True)
 class SceneConstraint:
-    """Where some agents may be, each in its own ego frame."""
+    """Constraints on goals and paths of some agents, each in its own ego frame."""
 
     scenes: Scenes
     world_from_ego: Float[np.ndarray, "agent 4 4"]
@@ -158,7 +158,7 @@ class SceneConstraint:
     def out_of_solid(
         self, points_ego: Float[np.ndarray, "plan point 3"]
     ) -> Float[np.ndarray, "plan point 3"]:
-        """Move points out of what is solid; the plans of one agent are consecutive."""
+        """Project points out of solid space; the plans of one agent are consecutive."""
         frame, video = self._of_plans(len(points_ego))
         moved = self.scenes.out_of_solid(rigid.apply(frame, points_ego), video)
         return rigid.apply(rigid.inverse(frame), moved)
@@ -166,8 +166,8 @@ class SceneConstraint:
     def goals_on_support(
         self, goals_ego: Float[np.ndarray, "plan 3"], start_ego: Float[np.ndarray, "plan 3"]
     ) -> Float[np.ndarray, "plan 3"]:
-        """Put goals on what carries an agent that rests there, those in something solid out of it: turned
-        about ``start_ego`` as little as possible, for moved to the nearest place flights come to nothing.
+        """Put goals on supporting surfaces, and rotate those in solid space about ``start_ego`` as little as
+        possible: projecting to the nearest free voxel instead would cancel flights.
         """
         frame, video = self._of_plans(len(goals_ego))
         start, goals = rigid.apply(frame, start_ego[:, None]), rigid.apply(frame, goals_ego[:, None])
@@ -187,7 +187,7 @@ class SceneConstraint:
         start_ego: Float[np.ndarray, "plan 3"],
         rate_hz: float = RATE_HZ,
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Put paths, which begin a frame after ``start_ego``, on what carries the agent; steps are jumps."""
+        """Put paths, which begin a frame after ``start_ego``, on supporting surfaces, smoothing jumps."""
         frame, video = self._of_plans(len(path_ego))
         start, path = rigid.apply(frame, start_ego[:, None]), rigid.apply(frame, path_ego)
         step = np.diff(path[..., [0, 2]], axis=1, prepend=start[..., [0, 2]])

@@ -1,11 +1,11 @@
 """The behaviour model as an environment: `reset(seed)`, then `step(observer)` ten times a second.
 
 Each step plays one frame of the current plan. A plan is followed until it ends or the observer has moved
-noticeably; the next one is sampled from the last 8 frames and faded in. An animal that was asked anew all the
-time would switch goals in the middle of every walk and put off the next one. Goals and paths do not see
-its bones: sampled bones walk less distinctly than recorded ones do, and it would stop. Where a plan leaves
-the allowed voxels, others are drawn and the best is taken, so that chaining does not drift through walls.
-`AnimalBatch` lets many animals live at once, `Simulator` one.
+noticeably; the next one is sampled from the last 8 frames and blended in. Replanning at every step would
+switch goals in the middle of walks and delay the next one. Goals and paths are not conditioned on bones:
+sampled gaits are less distinct than recorded ones, and the animal would stop. Where a plan leaves the allowed
+voxels, further candidates are drawn and the best is taken, so that chained plans do not drift through walls.
+`AnimalBatch` simulates many animals in one batch, `Simulator` one.
 """
 
 from collections import deque
@@ -50,15 +50,15 @@ class PoseFrames:
 
 
 GOAL_CHANGE_M = 0.3
-"""How far a commanded goal must be from the planned one for a steered animal to plan again."""
+"""Distance between commanded and planned goal from which a steered animal replans."""
 
 
 class AnimalBatch:
-    """Animals that live at once, each in the scene of its recording.
+    """Animals simulated together, each in the scene of its recording.
 
-    Those of one life, and companions from outside of the batch, are perceived and kept clear of. Plans are
-    drawn for all animals that need one in one batch, and followed until they end, somebody who is perceived
-    moves, or a commanded goal changes. ``plans_drawn`` counts them.
+    Animals of the same ``life``, and companions from outside of the batch, are perceived and avoided. All
+    animals that need a plan share one batch of sampling. A plan is followed until it ends, a perceived being
+    moves, or the commanded goal changes. ``plans_drawn`` counts the plans.
     """
 
     def __init__(
@@ -82,9 +82,10 @@ class AnimalBatch:
         life: Int[np.ndarray, "animal"] | None = None,
         companions: Float[np.ndarray, "animal companion past_frame 4"] | None = None,
     ) -> None:
-        """Continue from these windows, one animal per window; animals of the same ``life`` are together, and
-        each is alone where none is given. ``companions`` are those who are not of the batch, as in a
-        `Context`.
+        """Start from these windows, one animal per window.
+
+        Animals of the same ``life`` share a scene; without it each is alone. ``companions`` are others from
+        outside of the batch, as in a `Context`.
         """
         bones = channels_from_bones(context.agent_from_bone, self.rest)
         self.video = None if context.video is None else np.array(context.video)
@@ -95,11 +96,11 @@ class AnimalBatch:
         self.past = deque((PoseFrames(root[:, each], bones[:, each]) for each in frames), count)
         self.observer = deque((observer[:, frame] for frame in range(count)), count)
         self.goal_command = np.full((len(root), 3), np.nan)
-        self.plan, self.goal, self.blocked = self._planned(np.arange(len(root)))
+        self.plan, self.goal, self.blocked = self._draw_plans(np.arange(len(root)))
         self.played, self.planned_others = np.zeros(len(root), int), self._others_now()
 
     def restart(self, some: Int[np.ndarray, "some"], context: Context) -> None:
-        """Let some of the animals begin again, each from a window of its own."""
+        """Restart some of the animals, each from a window of its own."""
         bones = channels_from_bones(context.agent_from_bone, self.rest)
         if self.video is not None and context.video is not None:
             self.video[some] = context.video
@@ -108,12 +109,12 @@ class AnimalBatch:
             self.past[frame].bones[some] = bones[:, frame : frame + 1]
             self.observer[frame][some] = context.observer_world[:, frame]
         self.goal_command[some] = np.nan
-        plan, self.goal[some], self.blocked[some] = self._planned(some)
+        plan, self.goal[some], self.blocked[some] = self._draw_plans(some)
         self.plan.root[some], self.plan.bones[some] = plan.root, plan.bones
         self.played[some], self.planned_others[some] = 0, self._others_now()[some]
 
     def command(self, goal_world: Float[np.ndarray, "animal 3"]) -> None:
-        """Steer animals to goals (metres, world); rows of NaN leave an animal to its own goals."""
+        """Set commanded goals (metres, world); NaN lets an animal choose its own."""
         self.goal_command = np.array(goal_world, float)
 
     def step(
@@ -121,14 +122,15 @@ class AnimalBatch:
         observer: Float[np.ndarray, "animal 3"],
         companions: Float[np.ndarray, "animal companion past_frame 4"] | None = None,
     ) -> PoseFrames:
-        """Let 0.1 s pass with the observers at these positions (metres, world), and return the frame that
-        comes of it. ``companions`` are where those from outside have been, as many as at the beginning.
+        """Advance by 0.1 s with the observers at these positions (metres, world) and return the new frame.
+
+        ``companions`` are the past tracks of those from outside, as many as in `begin`.
         """
         self.observer.append(np.asarray(observer, float))
         self.companions = companions
-        due = np.flatnonzero(self._due())
+        due = np.flatnonzero(self._must_replan())
         if len(due):
-            self._follow(due)
+            self._replan(due)
         now = np.arange(len(self.played)), self.played
         self.past.append(PoseFrames(self.plan.root[now][:, None], self.plan.bones[now][:, None]))
         self.played += 1
@@ -136,15 +138,15 @@ class AnimalBatch:
 
     @property
     def plan_frames(self) -> int:
-        """Return how many frames a plan has."""
+        """Number of frames of a plan."""
         return self.plan.root.shape[1]
 
     def invalidate_plans(self) -> None:
-        """Let every plan be dropped as soon as another one may follow it."""
+        """Make every animal replan as soon as it may."""
         self.planned_others = np.full_like(self.planned_others, np.inf)
 
     def _together(self, some: Int[np.ndarray, "some"]) -> Bool[np.ndarray, "some animal"] | None:
-        """Return which animals are in the life of ``some``, but themselves; None where each is alone."""
+        """Return which other animals share the life of ``some``; None if each is alone."""
         if self.life is None:
             return None
         return (self.life[some][:, None] == self.life) & (some[:, None] != np.arange(len(self.life)))
@@ -152,7 +154,7 @@ class AnimalBatch:
     def _companions(
         self, some: Int[np.ndarray, "some"]
     ) -> Float[np.ndarray, "some companion past_frame 4"] | None:
-        """Return past positions and kinds of all but the observer; NaN outside of the life of ``some``."""
+        """Return past positions and kinds of all others but the observer; NaN if of another life."""
         found = [] if self.companions is None else [self.companions[some]]
         together = self._together(some)
         if together is not None:
@@ -161,42 +163,42 @@ class AnimalBatch:
         return np.concatenate(found, axis=1) if found else None
 
     def _others_now(self) -> Float[np.ndarray, "animal other 3"]:
-        """Return where the others are, the observer first; NaN those that are not there."""
+        """Return the current positions of the others, the observer first; NaN if absent."""
         observer = self.observer[-1][:, None]
         companions = self._companions(np.arange(len(observer)))
         if companions is None:
             return observer
         return np.concatenate([observer, companions[:, :, -1, :3]], axis=1)
 
-    def _due(self) -> Bool[np.ndarray, "animal"]:
-        """Return whose plan ends, or was made before somebody who is perceived moved noticeably."""
+    def _must_replan(self) -> Bool[np.ndarray, "animal"]:
+        """Return which animals must replan: their plan ends, another moved, or their command changed."""
         others = self._others_now()
         moved = np.linalg.norm(others - self.planned_others, axis=-1)
         away = np.linalg.norm(others - self.past[-1].root[:, :1, :3, 3], axis=-1)
-        dropped = (
+        outdated = (
             self.sampling.observer
             & (self.played >= self.chaining.reaction_frames)
             & (moved > self.chaining.observer_motion_ratio * away).any(1)
         )
         changed = np.linalg.norm(np.nan_to_num(self.goal_command - self.goal), axis=-1) > GOAL_CHANGE_M
         redirected = changed & (self.played >= self.chaining.reaction_frames)
-        return dropped | redirected | (self.played >= self.plan_frames - self.chaining.blend_frames)
+        return outdated | redirected | (self.played >= self.plan_frames - self.chaining.blend_frames)
 
-    def _follow(self, some: Int[np.ndarray, "some"]) -> None:
-        """Let some of the animals go over to a new plan."""
-        plan, self.goal[some], self.blocked[some] = self._planned(some)
+    def _replan(self, some: Int[np.ndarray, "some"]) -> None:
+        """Replan for some of the animals and blend their new plans in."""
+        plan, self.goal[some], self.blocked[some] = self._draw_plans(some)
         for mine, animal in enumerate(some):
-            rest = animal, slice(self.played[animal], None)
-            left = PoseFrames(self.plan.root[rest], self.plan.bones[rest])
-            begun = PoseFrames(plan.root[mine], plan.bones[mine])
-            new = blended_frames(left, begun, self.chaining.blend_frames)
+            remaining = animal, slice(self.played[animal], None)
+            old = PoseFrames(self.plan.root[remaining], self.plan.bones[remaining])
+            new = PoseFrames(plan.root[mine], plan.bones[mine])
+            new = blended_frames(old, new, self.chaining.blend_frames)
             self.plan.root[animal], self.plan.bones[animal] = new.root, new.bones
         self.played[some], self.planned_others[some] = 0, self._others_now()[some]
 
-    def _planned(
+    def _draw_plans(
         self, some: Int[np.ndarray, "some"]
     ) -> tuple[PoseFrames, Float[np.ndarray, "some 3"], Float[np.ndarray, "some"]]:
-        """Draw plans for some of the animals, and others where they are blocked; the least blocked count."""
+        """Draw plans for some of the animals; of blocked ones, the least blocked of several candidates."""
         root, channels = (
             np.concatenate([getattr(frame, name) for frame in self.past], axis=1)[some]
             for name in ("root", "bones")
@@ -209,11 +211,11 @@ class AnimalBatch:
         boneless = observation.boneless(self.sampler.scaling.body_mean)
         self.plans_drawn += len(some)
         commanded = rigid.apply(rigid.inverse(frame), self.goal_command[some][:, None])[:, 0]
-        goal, path, blocked = self._courses(boneless, frame, video, 1, commanded)
+        goal, path, blocked = self._least_blocked(boneless, frame, video, 1, commanded)
         again = np.flatnonzero(blocked)
         if len(again) and self.chaining.candidates > 1:
             count, where = self.chaining.candidates - 1, None if video is None else video[again]
-            others = self._courses(boneless[again], frame[again], where, count, commanded[again])
+            others = self._least_blocked(boneless[again], frame[again], where, count, commanded[again])
             better = others[2] < blocked[again]
             for mine, other in zip((goal, path, blocked), others, strict=True):
                 mine[again[better]] = other[better]
@@ -232,7 +234,7 @@ class AnimalBatch:
         start_world: Float[np.ndarray, "some 3"],
         some: Int[np.ndarray, "some"],
     ) -> Float[np.ndarray, "some frame 3"]:
-        """Lead paths in ego frames around the bodies of the others, the observer's last."""
+        """Deform paths (ego frames) around the bodies of the others, the observer's last."""
         video = None if self.video is None else self.video[some]
 
         def clear(points: Float[np.ndarray, "some 3"]) -> Float[np.ndarray, "some 3"]:
@@ -248,7 +250,7 @@ class AnimalBatch:
                 clear_world = around_person(clear_world, start_world, there, self.clearance_m, clear)
         return rigid.apply(rigid.inverse(frame), clear_world)
 
-    def _courses(
+    def _least_blocked(
         self,
         observation: Observation,
         frame: Float[np.ndarray, "some 4 4"],
@@ -256,8 +258,7 @@ class AnimalBatch:
         count: int,
         commanded: Float[np.ndarray, "some 3"],
     ) -> tuple[Float[np.ndarray, "some 3"], Float[np.ndarray, "some frame 3"], Float[np.ndarray, "some"]]:
-        """Return the least blocked of ``count`` goals and paths for each observation, and how much of it is
-        blocked.
+        """Return goal, path and blocked share of the least blocked of ``count`` candidates per observation.
 
         ``commanded`` goals (metres, ego frame) replace sampled ones where they are not NaN.
         """
@@ -286,10 +287,10 @@ class Simulator:
         chaining: ReplanningConfig,
     ):
         self.data, self.rest = data, data.agent_from_bone_rest
-        self.flock = AnimalBatch(sampler, scenes, self.rest, ego, sampling=sampling, chaining=chaining)
+        self.animals = AnimalBatch(sampler, scenes, self.rest, ego, sampling=sampling, chaining=chaining)
 
     def reset(self, seed: int, observer: Float[np.ndarray, "3"] | None = None) -> SimulatorState:
-        """Begin at a random training window, with its observer or one that has stood at ``observer``."""
+        """Start from a random training window, with its observer or a static one at ``observer``."""
         rng = np.random.default_rng(seed)
         return self.begin(rng.choice(self.data.indices(TRAIN), 1), rng, observer)
 
@@ -300,53 +301,53 @@ class Simulator:
         observer: Float[np.ndarray, "3"] | None = None,
         companions: Float[np.ndarray, "companion past_frame 4"] | None = None,
     ) -> SimulatorState:
-        """Begin at this window, beside ``companions`` where there are others."""
+        """Start from this window, with ``companions`` if there are others."""
         context, _ = self.data.windows(window)
         seen = context.observer_world
         if observer is not None:
             seen = np.tile(np.asarray(observer, float), (1, self.data.past, 1))
         context = replace(context, observer_world=seen, observer_rotation=None)
-        self.flock.begin(context, rng, companions=None if companions is None else companions[None])
+        self.animals.begin(context, rng, companions=None if companions is None else companions[None])
         self.frame = 0
-        return self._state(self.flock.past[-1])
+        return self._state(self.animals.past[-1])
 
     @property
     def recording(self) -> Trajectory:
-        """Return the recording that this life began in."""
-        assert self.flock.video is not None, "windows of recordings name them"
-        return self.data.trajectories[self.data.videos[self.flock.video[0]]]
+        """The recording of the initial window."""
+        assert self.animals.video is not None, "windows of recordings name them"
+        return self.data.trajectories[self.data.videos[self.animals.video[0]]]
 
     @property
     def past_world(self) -> Float[np.ndarray, "past_frame 3"]:
-        """Return where the animal has been, now last; metres."""
-        return np.stack([frame.root[0, 0, :3, 3] for frame in self.flock.past])
+        """Past positions of the animal, the current one last; metres."""
+        return np.stack([frame.root[0, 0, :3, 3] for frame in self.animals.past])
 
     def step(
         self,
         observer: Float[np.ndarray, "3"],
         companions: Float[np.ndarray, "companion past_frame 4"] | None = None,
     ) -> SimulatorState:
-        """Let 0.1 s pass with the observer at this position (metres, world), and ``companions`` there."""
+        """Advance by 0.1 s with the observer at this position (metres, world) and these ``companions``."""
         others = None if companions is None else companions[None]
-        now = self.flock.step(np.asarray(observer, float)[None], others)
+        now = self.animals.step(np.asarray(observer, float)[None], others)
         self.frame += 1
         return self._state(now)
 
     def _state(self, now: PoseFrames) -> SimulatorState:
         bones = bones_from_channels(now.bones[0, 0], self.rest)
-        time_s, goal = self.frame / self.data.rate_hz, self.flock.goal[0].copy()
-        return SimulatorState(time_s, now.root[0, 0], bones, goal, float(self.flock.blocked[0]))
+        time_s, goal = self.frame / self.data.rate_hz, self.animals.goal[0].copy()
+        return SimulatorState(time_s, now.root[0, 0], bones, goal, float(self.animals.blocked[0]))
 
 
 def as_companions(
     positions_world: Float[np.ndarray, "animal past_frame 3"],
 ) -> Float[np.ndarray, "animal past_frame 4"]:
-    """Return animals as others perceive them: positions and kind."""
+    """Return the tracks of animals as companions: positions and kind."""
     return np.pad(positions_world, ((0, 0), (0, 0), (0, 1)), constant_values=KINDS.index("animal"))
 
 
 def blended_frames(old: PoseFrames, new: PoseFrames, frames: int) -> PoseFrames:
-    """Blend the beginning of a new plan with the continuation of the old one, which it leaves smoothly."""
+    """Cross-fade the first frames of a new plan with the remaining ones of the old plan."""
     count = min(frames, old.root.shape[-3], new.root.shape[-3])
     if count <= 0:
         return new

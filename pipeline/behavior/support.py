@@ -1,8 +1,7 @@
-"""What carries an animal: the tops of what is solid, and how high above them its root is.
+"""Supporting surfaces: tops of solid voxels, and the height of an animal's root above them.
 
-A sampler that is off by a tenth of a metre lets an animal float or sink. `Support.heights` puts roots where
-recorded ones are above the top that they are nearest to; `smoothed_jumps` makes jumps of the steps between
-tops.
+If samples are off by a tenth of a metre, an animal floats or sinks. `Support.heights` clamps roots to the
+recorded height range above the nearest top; `smoothed_jumps` turns steps between tops into jumps.
 """
 
 from dataclasses import dataclass
@@ -13,47 +12,46 @@ from jaxtyping import Bool, Float, UInt8
 from pipeline.behavior.perception import FeatureVolume
 
 SUPPORTED = 2
-"""mark of an allowed voxel right above a solid one, 3 of one above filled floor; other allowed ones have 1"""
+"""mark of allowed voxels right above solid ones; 3 above filled floor, 1 for other allowed voxels"""
 HEIGHT_TAIL_PERCENT = (1.0, 5.0)
-"""percent of frames at rest, and in motion, where jumps are among them, that may be lower, and higher, than
-the range of heights"""
+"""percentage of frames below, and above, the height range: at rest, and in motion, which includes jumps"""
 MIN_SUPPORTED_SHARE = 0.5
-"""share of frames that must be above something solid"""
+"""minimum share of frames above something solid"""
 FLOOR_SHARE = 0.25
 """The floor is the lowest level with this share of the columns of the level that most columns have."""
 JUMP_KERNEL = np.array([1.0, 2.0, 3.0, 2.0, 1.0]) / 9
-"""weights over 0.5 s that make a jump of a step"""
+"""smoothing kernel over 0.5 s that turns a step into a jump"""
 
 
 @dataclass(frozen=True)
 class Support:
-    """The tops in one scene, and the range of the root's height above them."""
+    """Supporting surfaces of one scene, and the range of the root's height above them."""
 
     tops: Float[np.ndarray, "x z level"]
-    """world heights of each column, ascending, infinite where there are fewer"""
+    """world heights of the tops of each column, ascending, padded with infinity"""
     corner: Float[np.ndarray, "2"]
     """world x and z where column 0 begins"""
     voxel_m: float
     range_m: Float[np.ndarray, "2 2"]
-    """lowest and highest root above a top, of an animal that rests (0) and moves (1)"""
+    """lowest and highest root above a top, at rest (0) and in motion (1)"""
 
     @classmethod
     def of(
         cls, volume: FeatureVolume, marks: UInt8[np.ndarray, "x y z"], range_m: Float[np.ndarray, "2 2"]
     ) -> "Support | None":
-        """Gather the tops of a scene, or none where it is not known what carries."""
-        carries = marks >= SUPPORTED
-        if not carries.any() or not np.isfinite(range_m).all():
+        """Find the tops of a scene; None if supports or heights are unknown."""
+        supported = marks >= SUPPORTED
+        if not supported.any() or not np.isfinite(range_m).all():
             return None
-        level = np.where(carries, np.arange(marks.shape[1])[:, None], np.inf)
-        levels = np.sort(level, axis=1)[:, : int(carries.sum(1).max())]
+        level = np.where(supported, np.arange(marks.shape[1])[:, None], np.inf)
+        levels = np.sort(level, axis=1)[:, : int(supported.sum(1).max())]
         tops = volume.origin[1] + np.swapaxes(levels, 1, 2) * volume.voxel_m
         return cls(tops, np.asarray(volume.origin)[[0, 2]], volume.voxel_m, np.asarray(range_m, float))
 
     def heights(
         self, points_world: Float[np.ndarray, "*batch 3"], moves: Bool[np.ndarray, "*batch"]
     ) -> Float[np.ndarray, "*batch"]:
-        """Return the nearest heights at which roots are found; the points' own where nothing carries."""
+        """Return the nearest heights within the range above a top; unchanged where nothing supports."""
         column = np.floor((points_world[..., [0, 2]] - self.corner) / self.voxel_m).astype(int)
         inside = ((column >= 0) & (column < self.tops.shape[:2])).all(-1)
         column = np.clip(column, 0, np.array(self.tops.shape[:2]) - 1)
@@ -74,16 +72,16 @@ def mark_supported(
     return allowed.astype(np.uint8) + (allowed & beneath & (occupancy != 1))
 
 
-def floor_level(carries: Bool[np.ndarray, "x y z"]) -> int | None:
-    """Return the index along y of the voxels right above the floor; None where nothing carries."""
-    count = carries.sum((0, 2))
+def floor_level(supported: Bool[np.ndarray, "x y z"]) -> int | None:
+    """Return the index along y of the voxels right above the floor; None without supports."""
+    count = supported.sum((0, 2))
     return int(np.flatnonzero(count >= FLOOR_SHARE * count.max())[0]) if count.any() else None
 
 
 def height_ranges(
     scenes: list[tuple[FeatureVolume, Float[np.ndarray, "frame 3"], Bool[np.ndarray, "frame"]]],
 ) -> Float[np.ndarray, "2 2"]:
-    """Return `Support.range_m` given, per scene, root positions and whether it moved; NaN: unknown."""
+    """Return `Support.range_m` given root positions and motion flags per scene; NaN if unknown."""
     above, moved = [np.zeros(0)], [np.zeros(0, bool)]
     for volume, points, moves in scenes:
         voxel, inside = volume.voxel(points)
@@ -104,7 +102,7 @@ def height_ranges(
 def smoothed_jumps(
     height: Float[np.ndarray, "*batch frame"], before: Float[np.ndarray, "*batch"]
 ) -> Float[np.ndarray, "*batch frame"]:
-    """Make jumps of steps: heights averaged over half a second where that is higher."""
+    """Turn steps into jumps: the maximum of heights and their average over half a second."""
     reach = len(JUMP_KERNEL) // 2
     first, last = np.repeat(before[..., None], reach, -1), np.repeat(height[..., -1:], reach, -1)
     padded = np.concatenate([first, height, last], axis=-1)

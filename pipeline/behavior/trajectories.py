@@ -1,7 +1,7 @@
-"""Trajectories of agent and observer on one time grid, and the windows that behaviour models learn from.
+"""Trajectories of agent and observer on a regular time grid, and the windows of behaviour models.
 
-`slice_behavior` writes them; `BehaviorData.load` reads them back; `BehaviorData.windows` gathers any set of
-windows as a `Context` (the past, all that a predictor may see) and a `Future` (what it must predict).
+`slice_behavior` writes them, `BehaviorData.load` reads them, and `BehaviorData.windows` returns windows as a
+`Context` (the past, all that a predictor may see) and a `Future` (what it must predict).
 """
 
 from dataclasses import dataclass, fields, replace
@@ -23,19 +23,18 @@ FUTURE = 56
 TRAIN, TEST = 0, 1
 UP = np.array([0.0, 1.0, 0.0])
 KINDS = ("person", "animal")
-"""what the last of the four numbers of a companion counts; the first three are its position"""
+"""kinds that the fourth channel of a companion indexes; the first three are its position"""
 ABSENT_M = 1000.0
-"""where somebody is put of whom nothing is known, metres"""
+"""distance at which absent others are placed, metres"""
 MAX_COMPANIONS = 15
-"""companions that are perceived at most, the nearest ones: more hardly fit into the radius, and crowds would
-not fit into memory"""
+"""maximum number of companions, the nearest: more hardly fit into the radius, nor crowds into memory"""
 WINDOWS_AT_ONCE = 8192
-"""bounds the memory of companions who are far"""
+"""bounds the memory of distant companions"""
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """One recording on an even grid of times; transforms hold finite numbers wherever ``valid``."""
+    """One recording on a regular time grid; transforms are finite wherever ``valid``."""
 
     timestamp_s: Float[np.ndarray, "frame"]
     world_from_agent: Float[np.ndarray, "frame 4 4"]
@@ -43,19 +42,18 @@ class Trajectory:
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     valid: Bool[np.ndarray, "frame"]
     companions: Float[np.ndarray, "frame companion 4"] | None = None
-    """others beside the one who films: world position, and kind as a number of `KINDS`; NaN in frames without
-    them"""
+    """others beside the observer: world position and index into `KINDS`; NaN in frames without them"""
 
 
 @dataclass(frozen=True)
 class Context:
-    """The past frames of windows (8 at first), the current one last, in the world frame."""
+    """The past frames of windows (8 by default), the current one last, in the world frame."""
 
     world_from_agent: Float[np.ndarray, "window past_frame 4 4"]
     agent_from_bone: Float[np.ndarray, "window past_frame bone 4 4"]
     observer_world: Float[np.ndarray, "window past_frame 3"]
     video: Int[np.ndarray, "window"] | None = None
-    """number of the recording, which names the scene; None where there is one scene"""
+    """index of the recording, which determines the scene; None if there is one scene"""
     observer_rotation: Float[np.ndarray, "window past_frame 3 3"] | None = None
     """of ``world_from_camera``; None where only positions are known"""
     companions: Float[np.ndarray, "window companion past_frame 4"] | None = None
@@ -71,7 +69,7 @@ class Context:
 
     @property
     def world_from_observer(self) -> Float[np.ndarray, "window 8 4 4"]:
-        """The observer's poses (OpenCV axes); one whose rotation is not known looks at the agent, upright."""
+        """The observer's poses (OpenCV axes); if rotations are unknown, it looks at the agent, upright."""
         if self.observer_rotation is not None:
             return rigid.make(self.observer_rotation, self.observer_world)
         return rigid.look_at(self.observer_world, self.world_from_agent[..., :3, 3], UP)
@@ -96,7 +94,7 @@ class Future:
 
 
 def frames_from_seconds(seconds: float, rate_hz: float = RATE_HZ) -> int:
-    """Return the frames of a horizon. Raises InputError BEH-003 where the UNets could not halve it twice."""
+    """Return the frames of a horizon. Raises InputError BEH-003 unless the UNets can halve it twice."""
     frames = round(seconds * rate_hz)
     if frames <= 0 or frames % 4:
         remedy = f"take a multiple of four frames: {4 / rate_hz:g} s"
@@ -116,21 +114,21 @@ def window_starts(
 
 @dataclass(frozen=True)
 class BehaviorData:
-    """Everything in `behavior_data/`: trajectories per recording and the exact list of windows."""
+    """The content of `behavior_data/`: trajectories per recording and the list of windows."""
 
     trajectories: dict[str, Trajectory]
     agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
     video: Int[np.ndarray, "window"]
     """index into ``videos``"""
     start: Int[np.ndarray, "window"]
-    """its first frame"""
+    """first frame"""
     split: Integer[np.ndarray, "window"]
     """0 train, 1 test"""
     videos: tuple[str, ...]
     future: int = FUTURE
-    """frames that are predicted"""
+    """predicted frames"""
     past: int = PAST
-    """frames that are known"""
+    """known frames"""
     rate_hz: float = RATE_HZ
     """frames per second"""
 
@@ -173,7 +171,7 @@ class BehaviorData:
 
     @property
     def accompanied(self) -> bool:
-        """Return whether others than the observer were recorded beside the animal."""
+        """Whether any recording has companions."""
         return any(track.companions is not None for track in self.trajectories.values())
 
     def indices(self, split: int) -> Int[np.ndarray, "window"]:
@@ -181,10 +179,9 @@ class BehaviorData:
         return np.flatnonzero(self.split == split)
 
     def with_horizon(self, future: int) -> "BehaviorData":
-        """Return the same recordings cut into windows of another horizon, in frames, all that are valid
-        throughout.
+        """Return all valid windows of the same recordings with another horizon, in frames.
 
-        Recordings without any window, of which nobody knows whether they are for the test, stay without.
+        Recordings without any window, whose split is unknown, stay without.
         """
         if future == self.future:
             return self
@@ -200,12 +197,10 @@ class BehaviorData:
         )
 
     def windows(self, index: Int[np.ndarray, "window"], *, bones: bool = True) -> tuple[Context, Future]:
-        """Gather windows by their number in the list; without ``bones``, which take most of the memory, there
-        are none.
-        """
+        """Return windows by index; without ``bones``, which take most of the memory, these are empty."""
         frames = self.start[index][:, None] + np.arange(self.past + self.future)
 
-        def gathered(name: str, part: slice = slice(None)) -> np.ndarray:
+        def gather(name: str, part: slice = slice(None)) -> np.ndarray:
             first = getattr(self.trajectories[self.videos[0]], name)[0][part]
             whole = np.empty((*frames.shape, *first.shape), first.dtype)
             for video in np.unique(self.video[index]):
@@ -213,8 +208,8 @@ class BehaviorData:
                 whole[mine] = getattr(self.trajectories[self.videos[video]], name)[frames[mine]][:, :, part]
             return whole
 
-        agent, camera = gathered("world_from_agent"), gathered("world_from_camera")
-        bone = gathered("agent_from_bone", slice(None) if bones else slice(0, 0))
+        agent, camera = gather("world_from_agent"), gather("world_from_camera")
+        bone = gather("agent_from_bone", slice(None) if bones else slice(0, 0))
         observer, companions = camera[:, : self.past], self._companions(index, frames[:, : self.past])
         past, others = (agent[:, : self.past], bone[:, : self.past]), (observer[..., :3, :3], companions)
         context = Context(*past, observer[..., :3, 3], self.video[index], *others)
@@ -237,7 +232,7 @@ class BehaviorData:
     def nearest_companions(
         self, index: Int[np.ndarray, "window"], agent: Float[np.ndarray, "window 3"]
     ) -> Float[np.ndarray, "window some past_frame 4"]:
-        """Return the companions that are perceived in some windows; ``agent`` is where the animal is then."""
+        """Return the `nearest` companions in some windows; ``agent`` is its current position."""
         parts = []
         for begin in range(0, len(index), WINDOWS_AT_ONCE):
             some = slice(begin, begin + WINDOWS_AT_ONCE)
@@ -256,10 +251,10 @@ class BehaviorData:
 def nearest(
     companions: Float[np.ndarray, "window companion past_frame 4"], agent: Float[np.ndarray, "window 3"]
 ) -> Float[np.ndarray, "window some past_frame 4"]:
-    """Return the companions that the agent, now at ``agent``, perceives: the nearest, as many as there are.
+    """Return the companions nearest to the agent's current position, at most `MAX_COMPANIONS`.
 
-    Positions are metres in one frame. Somebody who is not there now (NaN in the last frame) is absent; who
-    came during the past has been where it was first seen, so that nothing of the future is needed.
+    Positions are metres in one frame. Companions with NaN in the last frame are absent; earlier frames that
+    are unknown take the first known position, so that nothing of the future is needed.
     """
     level = [0, 2]
     distance = np.linalg.norm(companions[:, :, -1, level] - agent[:, None, level], axis=-1)

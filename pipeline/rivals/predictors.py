@@ -171,7 +171,7 @@ class Ats:
             goals.append(rigid.apply(world_from_ego(chunk.world_from_agent[:, -1], self.ego), goal))
         return Samples(np.concatenate(goals))
 
-    def courses(
+    def paths(
         self, context: Context, count: int, rng: np.random.Generator, *, at_once: int = WINDOWS_AT_ONCE
     ) -> Samples:
         """Draw goals and the paths to them, and spare the bodies; goals are where the paths end.
@@ -181,7 +181,7 @@ class Ats:
         parts = []
         for start in range(0, len(context), at_once):
             chunk = context[start : start + at_once]
-            path = self.sampler.course(self._observe(chunk), self.sampling, rng, count=count)
+            path = self.sampler.plan_paths(self._observe(chunk), self.sampling, rng, count=count)
             frame = np.repeat(world_from_ego(chunk.world_from_agent[:, -1], self.ego), count, axis=0)
             path = rigid.apply(frame, path)
             parts.append(path.reshape(len(chunk), count, *path.shape[1:]))

@@ -60,7 +60,7 @@ class GaussianSampler(Sampler):
         path = self.paths(codes, towards, sampling, rng) if path is None else path
         return SampledPlan(goal, path, self.bodies(codes, along, sampling, rng))
 
-    def draw_courses(
+    def draw_plan_paths(
         self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw paths to the mean goal, metres, ego frame."""
@@ -81,7 +81,7 @@ class GaussianSampler(Sampler):
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw a path towards each goal, metres, ego frame."""
         scaled = self._drawn_from(self._path(codes, goal, sampling), rng, sampling.path_noise_std)
-        return self.finished_paths(codes, scaled, goal, sampling)
+        return self.decode_paths(codes, scaled, goal, sampling)
 
     def bodies(
         self,
@@ -140,7 +140,7 @@ class OneStageSampler(Sampler):
         body = np.swapaxes(whole[:, PATH_CHANNELS:], 1, 2) * self.scaling.body_std + self.scaling.body_mean
         return SampledPlan(path[:, -1], path, body)
 
-    def draw_courses(
+    def draw_plan_paths(
         self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw whole plans and keep the paths, metres, ego frame."""
@@ -171,8 +171,8 @@ class OneStageSampler(Sampler):
         shape, steps = (len(codes.full), PATH_CHANNELS + body, frames), sampling.sequence_steps
         stds = sampling.path_noise_std, sampling.body_noise_std
         spread = np.repeat(stds, (PATH_CHANNELS, body))[:, None]
-        denoisers = [denoise(code) for code in (codes.full, *codes.less)]
-        return self._drawn(denoisers, shape, sampling, steps, rng, correct, spread)
+        denoisers = [denoise(code) for code in (codes.full, *codes.references)]
+        return self._denoised(denoisers, shape, sampling, steps, rng, correct, spread)
 
 
 def _step(x: Array, t: float) -> Array:

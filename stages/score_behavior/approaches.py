@@ -90,8 +90,8 @@ def _fled(
         frame = np.repeat(world_from_ego(some.world_from_agent[:, -1], ats.ego), count, axis=0)
         now, person = some.world_from_agent[:, -1:, :3, 3], some.observer_world[:, -1:]
         for name, sampling in samplings.items():
-            course = ats.sampler.course(observation, sampling, rngs[name], count=count)
-            path = rigid.apply(frame, course).reshape(len(some), count, -1, 3)
+            sampled = ats.sampler.plan_paths(observation, sampling, rngs[name], count=count)
+            path = rigid.apply(frame, sampled).reshape(len(some), count, -1, 3)
             parts[name].append(
                 flees(path, np.repeat(now, count, axis=1), np.repeat(person, count, axis=1)).mean(1)
             )

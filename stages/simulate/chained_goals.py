@@ -15,10 +15,10 @@ def chained_goals(simulator: Simulator, observer: Observer, count: int, seed: in
     """Return the start and ``count`` goals, a plan's length apart; the simulator must play each plan to its
     end.
     """
-    chaining = simulator.flock.chaining
+    chaining = simulator.animals.chaining
     assert np.isinf(chaining.observer_motion_ratio) and not chaining.blend_frames, chaining
     state = simulator.reset(seed)
-    frames = simulator.flock.plan_frames
+    frames = simulator.animals.plan_frames
     found = [Subgoal(state.world_from_agent[:3, 3], float(rigid.yaw(state.world_from_agent)), 0.0)]
     for number in range(1, count + 1):
         found.append(Subgoal(np.asarray(state.goal_world), None, number * frames / RATE_HZ))

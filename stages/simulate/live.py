@@ -106,10 +106,10 @@ class LiveView:
 
     def step(self) -> None:
         """Let 0.1 s pass with the person where the visitor has put it."""
-        flock, guidance = self.simulator.flock, float(self.interactivity.value)
-        if guidance != flock.sampling.guidance:
-            flock.sampling = replace(flock.sampling, guidance=guidance)
-            flock.invalidate_plans()
+        animals, guidance = self.simulator.animals, float(self.interactivity.value)
+        if guidance != animals.sampling.guidance:
+            animals.sampling = replace(animals.sampling, guidance=guidance)
+            animals.invalidate_plans()
         position = np.array(self.person.position, float)
         self.states.append(self.simulator.step(position))
         self.seen.append(position)
@@ -142,7 +142,7 @@ class LiveView:
 
     def _add_controls(self) -> None:
         gui = self.server.gui
-        scale = min(self.simulator.flock.sampling.guidance, MAX_GUIDANCE)
+        scale = min(self.simulator.animals.sampling.guidance, MAX_GUIDANCE)
         self.interactivity = gui.add_slider("interactivity", 0.0, MAX_GUIDANCE, SLIDER_STEP, scale)
         self.playing = gui.add_checkbox("time passes", True)
         self.again = Event()  # clicks come on another thread, perhaps in the middle of a step

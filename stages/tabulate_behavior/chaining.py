@@ -72,7 +72,7 @@ def rollouts(
     """Let the model go on from some windows, in their homes, with their observers walking as recorded, over
     and over.
     """
-    flock = AnimalBatch(
+    animals = AnimalBatch(
         ats.sampler,
         scenes,
         data.agent_from_bone_rest,
@@ -84,14 +84,14 @@ def rollouts(
     walks = [
         data.trajectories[data.videos[video]].world_from_camera[:, :3, 3] for video in data.video[window]
     ]
-    flock.begin(context, rng)
+    animals.begin(context, rng)
     root = [context.world_from_agent[:, -1]]
     for step in range(round(seconds * data.rate_hz)):
         seen = [
             walk[(start + data.past + step) % len(walk)]
             for walk, start in zip(walks, data.start[window], strict=True)
         ]
-        root.append(flock.step(np.array(seen)).root[:, 0])
+        root.append(animals.step(np.array(seen)).root[:, 0])
     return np.stack(root, axis=1)
 
 

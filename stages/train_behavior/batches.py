@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from pipeline.behavior.diffusion import STANDARD
-from pipeline.behavior.encoders import beings
+from pipeline.behavior.encoders import other_channels_torch
 from pipeline.behavior.model import Architecture, Scaling, channels_from_bones
 from pipeline.behavior.path_encoding import (
     GOAL_LENGTH_POWER,
@@ -322,7 +322,7 @@ def draw_batch(
     strides = strides / torch.from_numpy(scaling.velocity_std).float()
     return TrainingBatch(
         scene(ego.to(device), side.to(device), windows.scene[index].to(device)),
-        beings(observer, facing, tracks.companions, new_from_old),
+        other_channels_torch(observer, facing, tracks.companions, new_from_old),
         past.flatten(1),
         held,
         ((torch.rand(size, generator=generator) >= augmentation.hide_bones) & bones_known).float(),

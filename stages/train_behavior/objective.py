@@ -120,12 +120,13 @@ def perceive(
     keep = keep_mask(len(batch.goal), 3, generator).to(batch.goal.device) * joint
     keep[:, 1] = torch.maximum(keep[:, 1], batch.oversampled.float())
     others = with_some_absent(batch.others, batch.oversampled, generator)
-    readings = [
+    encodings = [
         member.encode_training(batch.scene, others, batch.past, keep, batch.bones_keep)
         for member in nets.perception
     ]
-    readings = [(chart, nn.functional.dropout(code, objective.code_dropout)) for chart, code in readings]
-    return nets.perception.condition(readings, nets.perception.now(batch.held, keep[:, 2]))
+    dropout = objective.code_dropout
+    encodings = [(scene_map, nn.functional.dropout(code, dropout)) for scene_map, code in encodings]
+    return nets.perception.condition(encodings, nets.perception.now(batch.held, keep[:, 2]))
 
 
 def with_some_absent(

@@ -159,29 +159,29 @@ def test_animals_of_one_life_perceive_each_other_and_keep_clear(sampler):
     volume = room()
     scenes = Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int))
     sampling = PlanSamplingConfig(goal_steps=4, sequence_steps=2)
-    flock = AnimalBatch(sampler, scenes, REST, "yaw", sampling=sampling, chaining=ReplanningConfig())
+    animals = AnimalBatch(sampler, scenes, REST, "yaw", sampling=sampling, chaining=ReplanningConfig())
     context, _ = wandering().windows(np.array([0, 40, 0, 40]))
     context = replace(context, video=None)
     far = np.full((4, 3), ABSENT_M)
     context = replace(context, observer_world=np.repeat(far[:, None], PAST, 1))
     plans = []
     for life in (None, np.array([0, 1, 2, 3]), np.array([0, 0, 1, 1])):
-        flock.begin(context, np.random.default_rng(0), life)
-        plans.append(flock.plan.root.copy())
+        animals.begin(context, np.random.default_rng(0), life)
+        plans.append(animals.plan.root.copy())
     np.testing.assert_array_equal(plans[0], plans[1])
     assert np.abs(plans[0] - plans[2]).max() > 1e-3
     start = np.linalg.norm(context.world_from_agent[0, -1, :3, 3] - context.world_from_agent[1, -1, :3, 3])
     assert start > 0.4
     for _ in range(60):
-        flock.step(far)
-    assert flock.plans_drawn > 4
+        animals.step(far)
+    assert animals.plans_drawn > 4
 
 
 def test_companions_from_outside_of_the_batch_are_perceived_and_kept_clear_of(sampler):
     volume = room()
     scenes = Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int))
     sampling = PlanSamplingConfig(goal_steps=4, sequence_steps=2)
-    flock = AnimalBatch(sampler, scenes, REST, "yaw", sampling=sampling, chaining=ReplanningConfig())
+    animals = AnimalBatch(sampler, scenes, REST, "yaw", sampling=sampling, chaining=ReplanningConfig())
     context, _ = wandering().windows(np.array([0]))
     context = replace(context, video=None, observer_world=np.full((1, PAST, 3), ABSENT_M))
     here, far = context.world_from_agent[:, -1, :3, 3], np.full((1, 3), ABSENT_M)
@@ -191,18 +191,18 @@ def test_companions_from_outside_of_the_batch_are_perceived_and_kept_clear_of(sa
 
     plans = {}
     for name, beside in {"alone": None, "far": standing(far), "near": standing(here + 0.6)}.items():
-        flock.begin(context, np.random.default_rng(0), companions=beside)
-        plans[name] = flock.plan.root.copy()
+        animals.begin(context, np.random.default_rng(0), companions=beside)
+        plans[name] = animals.plan.root.copy()
     np.testing.assert_allclose(plans["alone"], plans["far"], atol=1e-4)
     assert np.abs(plans["alone"] - plans["near"]).max() > 1e-2, "metres"
     obstacle = here + np.array([[0.5, 0.0, 0.0]])
-    flock.begin(context, np.random.default_rng(0), companions=standing(obstacle))
-    lives = np.stack([flock.step(far, standing(obstacle)).root[0, 0, :3, 3] for _ in range(60)])
+    animals.begin(context, np.random.default_rng(0), companions=standing(obstacle))
+    lives = np.stack([animals.step(far, standing(obstacle)).root[0, 0, :3, 3] for _ in range(60)])
     assert np.linalg.norm((lives - obstacle)[:, [0, 2]], axis=-1).min() > 0.36, "metres: a body's 0.4"
     drawn = []
     for moved_m in (0.0, 1.0):
-        flock.begin(context, np.random.default_rng(0), companions=standing(obstacle))
+        animals.begin(context, np.random.default_rng(0), companions=standing(obstacle))
         for _ in range(20):
-            flock.step(far, standing(obstacle + np.array([moved_m, 0.0, 0.0])))
-        drawn.append(flock.plans_drawn)
+            animals.step(far, standing(obstacle + np.array([moved_m, 0.0, 0.0])))
+        drawn.append(animals.plans_drawn)
     assert drawn == [1, 2], "who has moved is planned for anew"

@@ -10,23 +10,23 @@ from pipeline.behavior.path_encoding import (
     with_powered_length,
 )
 from pipeline.behavior.perception import MAP_KEY_CHANNELS
-from pipeline.behavior.pointwise import HALF_M, READ, MapAtGoal, WaypointUNet, read_at
+from pipeline.behavior.pointwise import HALF_MAP_M, MAP_CHANNELS, MapAtGoal, WaypointUNet, sample_maps
 
 CELLS = 8
-CELL_M = 2 * HALF_M / CELLS
+CELL_M = 2 * HALF_MAP_M / CELLS
 
 
 def numbered() -> torch.Tensor:
     """A map whose first channel tells x and whose second tells z of each cell's centre, in metres."""
-    centre = (torch.arange(CELLS) + 0.5) * CELL_M - HALF_M
-    chart = torch.zeros(1, 1, READ, CELLS, CELLS)
+    centre = (torch.arange(CELLS) + 0.5) * CELL_M - HALF_MAP_M
+    chart = torch.zeros(1, 1, MAP_CHANNELS, CELLS, CELLS)
     chart[:, :, 0], chart[:, :, 1] = centre, centre[:, None]
     return chart.flatten(2)
 
 
 def test_points_read_what_the_map_says_there():
-    points = torch.tensor([[[0.3, 5.0, -1.1], [-1.4, 0.0, 0.9], [2 * HALF_M, 0.0, 0.0]]])
-    read = read_at(numbered(), points)[0, 0]
+    points = torch.tensor([[[0.3, 5.0, -1.1], [-1.4, 0.0, 0.9], [2 * HALF_MAP_M, 0.0, 0.0]]])
+    read = sample_maps(numbered(), points)[0, 0]
     torch.testing.assert_close(read[:2, :2].T, points[0, :2, ::2], atol=1e-5, rtol=0)
     assert not read[:, 2].any(), "nothing lies beyond the edge"
     assert read.shape == (2 * MAP_KEY_CHANNELS, 3)

@@ -136,10 +136,10 @@ def test_a_gaussian_draws_what_its_networks_tell():
     goals = sampler.goals(codes, PlanSamplingConfig(), np.random.default_rng(0))
     drawn = scaling.scaled_goal(goals)
     np.testing.assert_allclose([drawn.mean(), drawn.std()], [2, 0.5], rtol=0.03)
-    course = sampler.course(behavior_observation(), PlanSamplingConfig(), np.random.default_rng(0), count=8)
-    np.testing.assert_allclose(course[:, -1], scaling.goal(np.full((8, 3), 2.0)), atol=1e-5)
+    path = sampler.plan_paths(behavior_observation(), PlanSamplingConfig(), np.random.default_rng(0), count=8)
+    np.testing.assert_allclose(path[:, -1], scaling.goal(np.full((8, 3), 2.0)), atol=1e-5)
     np.testing.assert_allclose(
-        np.diff(course, axis=1), np.broadcast_to(course[:, -1:] / 56, (8, 55, 3)), atol=0.01
+        np.diff(path, axis=1), np.broadcast_to(path[:, -1:] / 56, (8, 55, 3)), atol=0.01
     )
 
 

@@ -77,10 +77,10 @@ def test_states_keep_the_goals_that_they_had(simulator):
 
 def test_animals_of_a_flock_go_on_from_their_own_windows(simulator):
     context, _ = simulator.data.windows(np.array([0, 40, 80]))
-    flock = simulator.flock
-    flock.begin(replace(context, video=None), np.random.default_rng(0))
-    lives = np.concatenate([flock.step(context.observer_world[:, -1]).root for _ in range(10)], axis=1)
-    assert lives.shape == (3, 10, 4, 4) and flock.blocked.shape == (3,)
+    animals = simulator.animals
+    animals.begin(replace(context, video=None), np.random.default_rng(0))
+    lives = np.concatenate([animals.step(context.observer_world[:, -1]).root for _ in range(10)], axis=1)
+    assert lives.shape == (3, 10, 4, 4) and animals.blocked.shape == (3,)
     start = context.world_from_agent[:, -1, :3, 3]
     assert (np.linalg.norm(lives[:, 0, :3, 3] - start, axis=-1) < 0.3).all()
     assert np.linalg.norm(start[:, None] - start, axis=-1)[~np.eye(3, dtype=bool)].min() > 0.1
@@ -88,37 +88,37 @@ def test_animals_of_a_flock_go_on_from_their_own_windows(simulator):
 
 def test_plans_are_followed_until_they_end_or_the_observer_moves(simulator):
     context, _ = simulator.data.windows(np.array([0, 40]))
-    flock, person = simulator.flock, np.array([[0.5, 1.3, 0.5], [0.5, 1.3, 0.5]])
+    animals, person = simulator.animals, np.array([[0.5, 1.3, 0.5], [0.5, 1.3, 0.5]])
 
     def begin():
-        flock.begin(
+        animals.begin(
             replace(context, video=None, observer_world=np.repeat(person[:, None], 8, 1)),
             np.random.default_rng(0),
         )
-        return flock.goal.copy()
+        return animals.goal.copy()
 
     first, changed = begin(), []
     for _ in range(60):
-        flock.step(person)
-        changed.append((flock.goal != first).any(1))
+        animals.step(person)
+        changed.append((animals.goal != first).any(1))
     assert [int(np.argmax(of_one)) for of_one in np.array(changed).T] == [52, 52], (
         "56 frames, of which 4 fade"
     )
     first, near = begin(), person + np.array([[0.9, 0.0, 0.0], [0.0, 0.0, 0.0]])
     for frame in range(12):
-        flock.step(near)
-        assert (flock.goal != first).any(1).tolist() == [frame >= 8, False], frame
+        animals.step(near)
+        assert (animals.goal != first).any(1).tolist() == [frame >= 8, False], frame
     begin()
-    flock.invalidate_plans()
+    animals.invalidate_plans()
     for _ in range(9):
-        flock.step(person)
-    assert (flock.goal != first).any(1).all()
+        animals.step(person)
+    assert (animals.goal != first).any(1).all()
     blind = AnimalBatch(
-        flock.sampler,
-        flock.scenes,
-        flock.rest,
+        animals.sampler,
+        animals.scenes,
+        animals.rest,
         "yaw",
-        sampling=replace(flock.sampling, observer=False),
+        sampling=replace(animals.sampling, observer=False),
         chaining=ReplanningConfig(),
     )
     blind.begin(replace(context, video=None), np.random.default_rng(0))
@@ -135,8 +135,8 @@ def test_goals_and_paths_are_not_told_sampled_bones(simulator):
         bones = context.agent_from_bone @ rigid.make(
             rigid.rotation_from_vector(np.array([bend, 0, 0])), np.zeros(3)
         )
-        simulator.flock.begin(replace(context, video=None, agent_from_bone=bones), np.random.default_rng(0))
-        lives.append(simulator.flock.plan)
+        simulator.animals.begin(replace(context, video=None, agent_from_bone=bones), np.random.default_rng(0))
+        lives.append(simulator.animals.plan)
     np.testing.assert_array_equal(lives[0].root[..., :3, 3], lives[1].root[..., :3, 3])
     assert np.abs(lives[0].bones - lives[1].bones).max() > 0.01, "the body goes on from the bones that it has"
 
@@ -254,7 +254,7 @@ def test_live_view_answers_and_keeps_its_take(simulator):
     here.interactivity.value = 0.25
     here.person.position = (0.4, 1.3, 0.2)
     take = here.run(stopped=lambda: len(here.states) >= 4)
-    assert len(take.timestamp_s) == 4 and simulator.flock.sampling.guidance == 0.25
+    assert len(take.timestamp_s) == 4 and simulator.animals.sampling.guidance == 0.25
     np.testing.assert_allclose(take.observer_world[-1], [0.4, 1.3, 0.2], atol=1e-6)
     np.testing.assert_allclose(here.animal.position, take.world_from_agent[-1, :3, 3], atol=1e-6)
 
