@@ -1,6 +1,6 @@
-"""Judge the metrics of `metrics.json` against the bars that this project sets itself.
+"""Comparison of the metrics of `metrics.json` with the targets of this project.
 
-A bar is a limit, or another metric that must be beaten. Metrics that were not measured say why.
+A bar is a limit, or another metric to beat. Metrics that were not measured have a reason.
 """
 
 import math
@@ -18,7 +18,7 @@ RIVALS = (
 
 @dataclass(frozen=True)
 class Bar:
-    """One promise."""
+    """One target."""
 
     metric: str
     words: str
@@ -27,18 +27,18 @@ class Bar:
     """a number, or the name of the metric to beat or reach"""
     unit: str = ""
     factor: float = 1.0
-    """how many times that metric is the limit"""
+    """factor on that metric"""
 
     @property
     def sign(self) -> str:
-        """How a value must compare: a rival is to be beaten, a limit and a total may be met."""
+        """Required comparison: strict against a baseline, else with equality."""
         rival = isinstance(self.limit, str) and self.factor == 1.0
         return "≥" if self.better == "higher" else "<" if rival else "≤"
 
 
 @dataclass(frozen=True)
 class Judged:
-    """One promise and what was measured."""
+    """The result of one bar."""
 
     bar: Bar
     value: float | None
@@ -49,7 +49,7 @@ class Judged:
 
 
 def beaten(metric: str, words: str) -> list[Bar]:
-    """Promise that our metric is below that of every simple rival."""
+    """Return bars for our metric to be below that of every simple baseline."""
     return [
         Bar(metric, f"{words}: below {rival}", "lower", metric.replace("/ats/", f"/{key}/"), "m")
         for key, rival in RIVALS
@@ -92,12 +92,12 @@ def _judged(bar: Bar, metrics: Mapping[str, float | None], reasons: Mapping[str,
 
 
 def worst(judged: Sequence[Judged]) -> Literal["ok", "fail"]:
-    """Return the light of all bars together; one that could not be measured does not count."""
+    """Return the verdict on all bars together, ignoring those not measured."""
     return "fail" if any(row.verdict == "fail" for row in judged) else "ok"
 
 
 def grouped(metrics: Mapping[str, float | None]) -> dict[str, dict[str, float | None]]:
-    """Sort metrics by the first part of their names."""
+    """Group metrics by the first part of their names."""
     groups: dict[str, dict[str, float | None]] = {}
     for name, value in sorted(metrics.items()):
         group, _, rest = name.partition("/")

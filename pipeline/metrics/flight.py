@@ -1,4 +1,4 @@
-"""Does the animal run from a person? One definition for what it did and for what a model says it will do."""
+"""The criterion of flight from a person, for recorded and predicted paths alike."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -15,7 +15,7 @@ def flees(
     person_world: Float[np.ndarray, "*batch 3"],
     rate_hz: float = RATE_HZ,
 ) -> Bool[np.ndarray, "*batch"]:
-    """Return whether within 3 s the root gets 0.8 m further from where the person is now, over the floor."""
+    """Return whether the root gets 0.8 m further from the person's current position in 3 s, horizontally."""
 
     def away(points: Float[np.ndarray, "*batch frame 3"]) -> Float[np.ndarray, "*batch frame"]:
         return np.linalg.norm((points - person_world[..., None, :])[..., [0, 2]], axis=-1)

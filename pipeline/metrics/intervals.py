@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 BOOTSTRAP_DRAWS = 2000
-"""Resamples of an interval: its ends then move by a hundredth of its width between seeds."""
+"""Bootstrap resamples: bounds then vary by 1 % of the width between seeds."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Interval:
     high: float
 
     def as_figures(self, name: str) -> dict[str, float | None]:
-        """Return it as three figures of a table; None for bounds that are not known."""
+        """Return mean and bounds as entries of a table; None if not finite."""
         values = (self.mean, self.low, self.high)
         return {
             each: value if np.isfinite(value) else None
@@ -28,14 +28,14 @@ class Interval:
 
 
 def names_of(name: str) -> tuple[str, str, str]:
-    """Return the names under which a mean and its interval stand in a table of figures."""
+    """Return the keys of a mean and its interval in a table of figures."""
     return name, f"{name}_ci95_low", f"{name}_ci95_high"
 
 
 def formatted_interval(
     figures: Mapping[str, float | None], name: str, form: str = ".4g", scale: float = 1.0
 ) -> str:
-    """Write ``scale`` times a figure with its interval, where it has one; ``-`` for no figure."""
+    """Format ``scale`` times a figure with its interval, if known; ``-`` if there is none."""
     mean, *ends = (None if (v := figures.get(each)) is None else scale * v for each in names_of(name))
     if mean is None:
         return "-"
@@ -44,7 +44,7 @@ def formatted_interval(
 
 
 def aligned(title: str, rows: Sequence[Sequence[str]]) -> str:
-    """Write a table: its title, then the rows in columns as wide as their widest cell."""
+    """Format a table with aligned columns under its title."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     cells = (zip(row, widths, strict=True) for row in rows)
     return "\n".join(
@@ -55,7 +55,7 @@ def aligned(title: str, rows: Sequence[Sequence[str]]) -> str:
 def episodes(
     start: Int[np.ndarray, "window"], video: Int[np.ndarray, "window"], frames: int
 ) -> Int[np.ndarray, "window"]:
-    """Number stretches of ``frames`` frames, so that windows of different episodes hardly overlap."""
+    """Assign windows to episodes, blocks of ``frames`` frames, which are resampled as a whole."""
     return np.unique(np.stack([video, start // frames], axis=1), axis=0, return_inverse=True)[1].ravel()
 
 

@@ -1,4 +1,4 @@
-"""Named metrics, each a number or nothing with its reason."""
+"""Named metrics, each a number, or None with a reason."""
 
 import json
 import math
@@ -15,7 +15,7 @@ from pipeline.metrics.intervals import Interval, names_of
 
 @dataclass(frozen=True)
 class Metrics:
-    """What `metrics.json` and `reasons.json` will hold, and pictures beside them."""
+    """The content of `metrics.json` and `reasons.json`, with pictures."""
 
     values: dict[str, float | None] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
@@ -25,7 +25,7 @@ class Metrics:
     """drawn from numbers alone, by caption"""
 
     def put(self, name: str, value: float, why_unknown: str = "too few frames could be measured") -> None:
-        """Record a figure; what is not finite becomes nothing with the reason given."""
+        """Record a metric; if it is not finite, None with the given reason."""
         if math.isfinite(value):
             self.values[name] = float(value)
         else:
@@ -48,7 +48,7 @@ class Metrics:
         self.reasons.update({name.replace(stage, variant, 1): why for name, why in other.reasons.items()})
 
     def add(self, other: "Metrics") -> None:
-        """Take over another room's metrics; what is measured there needs no reason any more."""
+        """Merge other metrics; those measured there lose their reasons."""
         for name, value in other.values.items():
             if value is not None:
                 self.reasons.pop(name, None)
@@ -58,7 +58,7 @@ class Metrics:
         self.charts.update(other.charts)
 
     def judged(self, limits: Iterable[Check]) -> list[Check]:
-        """Return the checks with the figures that they are named by; without those not measured."""
+        """Return the checks with their metrics as values, without those not measured."""
         known = [limit for limit in limits if self.values.get(limit.name) is not None]
         return [replace(limit, value=self.values[limit.name]) for limit in known]
 
@@ -89,5 +89,5 @@ def median(errors: Float[np.ndarray, "error"]) -> float:
 
 
 def percentile(errors: Float[np.ndarray, "error"], share: float) -> float:
-    """Return a percentile (0..100) without interpolation, so that infinite failures stay what they are."""
+    """Return a percentile (0..100) without interpolation, so that infinite failures stay infinite."""
     return float(np.percentile(errors, share, method="higher")) if len(errors) else math.nan

@@ -1,4 +1,4 @@
-"""Bring truth into our frames by one constant rigid motion, and measure what is left."""
+"""Rigid alignment of true poses to ours, and the remaining pose errors."""
 
 from dataclasses import dataclass
 
@@ -15,8 +15,7 @@ def constant_between(
 ) -> Float[np.ndarray, "4 4"]:
     """Fit ``ours_from_truth`` such that ``ours = ours_from_truth @ truth`` over all frames; no scale.
 
-    Frames far beyond the median residual are left out of a second fit. Frames of ours that are NaN do not
-    count.
+    Frames far beyond the median residual are excluded from a second fit; NaN poses are ignored.
     """
     known = np.isfinite(ours).all((1, 2)) & np.isfinite(truth).all((1, 2))
     ours, truth = ours[known], truth[known]
@@ -45,7 +44,7 @@ class PoseErrors:
 
 
 def pose_errors(ours: Float[np.ndarray, "frame 4 4"], truth: Float[np.ndarray, "frame 4 4"]) -> PoseErrors:
-    """Compare poses in one frame of reference: geodesic angle, distance of the origins."""
+    """Return geodesic angles and distances of the origins between poses in one frame of reference."""
     known = np.isfinite(ours).all((1, 2))
     degrees, meters = np.full(len(ours), np.inf), np.full(len(ours), np.inf)
     degrees[known] = np.degrees(rigid.rotation_angle(ours[known, :3, :3], truth[known, :3, :3]))
@@ -54,7 +53,7 @@ def pose_errors(ours: Float[np.ndarray, "frame 4 4"], truth: Float[np.ndarray, "
 
 
 def joined(errors: list[PoseErrors]) -> PoseErrors:
-    """Put the frames of several videos one after the other."""
+    """Concatenate the errors of several videos."""
     empty = [PoseErrors(np.zeros(0), np.zeros(0))]
     return PoseErrors(
         *(np.concatenate([getattr(each, name) for each in errors or empty]) for name in ("degrees", "meters"))

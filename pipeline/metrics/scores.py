@@ -1,5 +1,4 @@
-"""How good sampled futures are: the best of K samples (minDE, minADE), and the energy score, which spread
-does not fool.
+"""Scores of sampled futures: best of K (minDE, minADE), and the energy score, a proper scoring rule.
 
 Each returns one number per window; the paper averages them over trials and all test windows.
 """
@@ -67,4 +66,4 @@ SCORES: dict[str, Callable[[Samples, Future], Float[np.ndarray, "window"]]] = {
     "orientation_minade_rad": orientation_minade,
     "joints_minade_rad": joints_minade,
 }
-"""All scores by the names of their figures."""
+"""All scores by name of the metric."""

@@ -1,4 +1,4 @@
-"""Exact distances between surfaces made of triangles, and their chamfer distance.
+"""Exact point-to-mesh distances, and the chamfer distance of triangle meshes.
 
 `TriangleSurface` splits large triangles, so that the piece nearest to a point is among those whose centres
 are not much farther than the nearest centre; trimesh does the geometry of single triangles.
@@ -11,11 +11,11 @@ from trimesh import triangles
 from trimesh.remesh import subdivide_to_size
 
 POINTS_AT_ONCE = 500
-"""Bounds the memory of pairs of points and triangles."""
+"""Bounds the memory of point-triangle pairs."""
 EDGE_FACTOR = 3.0
 """Triangles are split until no edge exceeds this many times the side of a square of their mean area."""
 HALVINGS = 20
-"""Most rounds of splitting: a million times finer than the mesh."""
+"""Maximum rounds of splitting: a million times finer than the mesh."""
 
 
 class TriangleSurface:
@@ -35,7 +35,7 @@ class TriangleSurface:
         return (rng.dirichlet((1, 1, 1), count)[..., None] * self.corners[face]).sum(1)
 
     def distance(self, points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point"]:
-        """Return how far each point is from the surface, metres."""
+        """Return the distance of each point from the surface, metres."""
         parts = [points[begin : begin + POINTS_AT_ONCE] for begin in range(0, len(points), POINTS_AT_ONCE)]
         return np.concatenate([self._distance(part) for part in parts])
 
@@ -65,5 +65,5 @@ def split(corners: Float[np.ndarray, "face 3 3"], longest_m: float) -> Float[np.
 def _to_triangles(
     points: Float[np.ndarray, "point 3"], corners: Float[np.ndarray, "point 3 3"]
 ) -> Float[np.ndarray, "point"]:
-    """Return how far each point is from its own triangle."""
+    """Return the distance of each point from its own triangle."""
     return np.linalg.norm(triangles.closest_point(corners, points) - points, axis=-1)

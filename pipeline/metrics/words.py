@@ -1,4 +1,4 @@
-"""Metrics in words: what a reader sees in place of the keys of `metrics.json`."""
+"""Descriptions of the metrics of `metrics.json` for readers."""
 
 import re
 from dataclasses import dataclass
@@ -74,7 +74,7 @@ METHODS = {
     "sift_only_": "SIFT and PnP",
     "agent_confidence_": "animal's root",
 }
-"""Beginnings of names that say what is measured."""
+"""Prefixes of metrics that name the method."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
-"""The networks that long-term motion is compared with (Table 1 of the paper), all with one face:
-`Ablated.between`.
+"""Ablated networks of long-term motion (Table 1 of the paper), with the interface `AblatedNetworks.between`.
 
-`ABLATIONS` names them; `build` makes one, `Ablated.load` reads one back.
+`ABLATIONS` lists them; `build` makes one, `load` reads one that `AblatedNetworks.save` wrote.
 """
 
 from dataclasses import dataclass
@@ -19,20 +18,19 @@ from pipeline.longterm.networks import ROOT_CHANNELS, BaseNet, PoseNet, RouteNet
 
 @dataclass(frozen=True)
 class AblationSpec:
-    """What one of them may do."""
+    """Options of an ablation."""
 
     with_scene: bool = True
-    """see the scene"""
+    """condition on the scene"""
     route_turns: bool = True
     """RouteNet predicts orientations; else PoseNet does"""
     paper: bool = False
-    """RouteNet makes no draft and sees positions, orientations and scene points only; PoseNet has no
-    `Strides` and learns along such routes
-    """
+    """RouteNet makes no draft and reads positions, orientations and scene points only; PoseNet has no
+    `Strides` and is trained along such routes"""
     follows_route: bool = True
-    """PoseNet is given the route"""
+    """PoseNet is conditioned on the route"""
     one: bool = False
-    """BaseNet: one network for everything"""
+    """BaseNet: one network for route and poses"""
 
 
 ABLATIONS: dict[str, AblationSpec] = {
@@ -47,11 +45,11 @@ ABLATIONS: dict[str, AblationSpec] = {
 }
 
 RIVALS = ("ours_no_scene", "base")
-"""Those that say whether the scene, and two networks instead of one, are worth it."""
+"""Ablations of the scene, and of two networks in place of one."""
 
 
 class AblatedNetworks(nn.Module):
-    """Short motions by other networks."""
+    """Generators of short motions by ablated networks."""
 
     def __init__(self, route: RouteNet | None, pose: PoseNet | None, base: BaseNet | None):
         super().__init__()
@@ -60,7 +58,7 @@ class AblatedNetworks(nn.Module):
     def between(
         self, start: Float[Tensor, "clip channel"], end: Float[Tensor, "clip channel"], seen: LocalScene
     ) -> Float[Tensor, "clip frame channel"]:
-        """Return t, r, p between first and last frames, in the clips' frames."""
+        """Return translation, rotation and pose between first and last frames, in the clips' frames."""
         with torch.no_grad():
             if self.base is not None:
                 return self.base(start, end, seen)
@@ -89,7 +87,7 @@ def build(kind: AblationSpec, sizes: LongTermSizes) -> AblatedNetworks:
 
 
 def load(path: Path, kind: AblationSpec, sizes: LongTermSizes) -> AblatedNetworks:
-    """Read networks that `Ablated.save` wrote."""
-    made = build(kind, sizes)
-    made.load_state_dict(load_file(path))
-    return made.eval()
+    """Read networks that `AblatedNetworks.save` wrote."""
+    networks = build(kind, sizes)
+    networks.load_state_dict(load_file(path))
+    return networks.eval()

@@ -1,7 +1,7 @@
-"""Predictors of goal, path and body, all met through one call: ``sample(context, count, rng) -> Samples``.
+"""Predictors of goal, path and body with a common interface, ``sample(context, count, rng) -> Samples``.
 
-`Ats` is the behaviour model; `LocationPrior`, `StandStill` and `ConstantVelocity` are the honest baselines,
-with noise fitted on the training windows.
+`Ats` is the behaviour model; `LocationPrior`, `StandStill` and `ConstantVelocity` are simple baselines with
+noise fitted to the training windows.
 """
 
 from dataclasses import dataclass, replace
@@ -28,7 +28,7 @@ WINDOWS_AT_ONCE = 32
 
 @dataclass(frozen=True)
 class Samples:
-    """Sampled futures in the world frame; None where a method does not predict it."""
+    """Sampled futures in the world frame; None for what a method does not predict."""
 
     goal: Float[np.ndarray, "window sample 3"]
     path: Float[np.ndarray, "window sample frame 3"] | None = None
@@ -38,7 +38,7 @@ class Samples:
 
 
 class Predictor(Protocol):
-    """Anything that predicts the frames up to the horizon."""
+    """A predictor of the frames up to the horizon."""
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw ``count`` futures for each window of the context."""
@@ -47,7 +47,7 @@ class Predictor(Protocol):
 
 @dataclass(frozen=True)
 class LocationPrior:
-    """A histogram of the goals in the ego frame (Ziebart et al. 2009), blind to scene, observer and past."""
+    """Unconditional histogram of the goals in the ego frame (Ziebart et al. 2009)."""
 
     cell: Int[np.ndarray, "cell 3"]
     probability: Float[np.ndarray, "cell"]
@@ -58,14 +58,14 @@ class LocationPrior:
     def fit(
         cls, context: Context, future: Future, *, cell_m: float = 0.1, ego: Ego = "yaw"
     ) -> "LocationPrior":
-        """Count the goals of training windows in cells."""
+        """Fit the histogram to the goals of training windows."""
         ego_from_world = rigid.inverse(world_from_ego(context.world_from_agent[:, -1], ego))
         goal = rigid.apply(ego_from_world, future.goal_world[:, None])[:, 0]
         cell, count = np.unique(np.floor(goal / cell_m).astype(np.int64), axis=0, return_counts=True)
         return cls(cell, count / count.sum(), cell_m, ego)
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
-        """Draw cells by their probability and points uniformly inside."""
+        """Draw cells by probability, and points uniformly inside."""
         chosen = rng.choice(len(self.cell), (len(context), count), p=self.probability)
         goal = (self.cell[chosen] + rng.random((*chosen.shape, 3))) * self.cell_m
         return Samples(rigid.apply(world_from_ego(context.world_from_agent[:, -1], self.ego), goal))
@@ -73,53 +73,53 @@ class LocationPrior:
 
 @dataclass(frozen=True)
 class StandStill:
-    """The animal stays where it is, in its posture, up to Gaussian noise that grows as it did in training."""
+    """The animal keeps position and posture, up to Gaussian noise that grows with time as in training."""
 
     std: Float[np.ndarray, "frame 3"]
 
     @classmethod
     def fit(cls, context: Context, future: Future) -> "StandStill":
         """Fit the noise to the displacements of training windows."""
-        return cls(_spread(future.path_world - _held(context, future.path_world.shape[1])))
+        return cls(_rms(future.path_world - _repeat_last(context, future.path_world.shape[1])))
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw one deviation per sample and let it grow with time."""
-        return _straight(context, _held(context, len(self.std)), self.std, count, rng)
+        return _gaussian_samples(context, _repeat_last(context, len(self.std)), self.std, count, rng)
 
 
 @dataclass(frozen=True)
 class ConstantVelocity:
-    """The animal goes on at the velocity of its past, in its posture, up to Gaussian noise."""
+    """The animal keeps velocity and posture, up to Gaussian noise that grows with time."""
 
     std: Float[np.ndarray, "frame 3"]
 
     @classmethod
     def fit(cls, context: Context, future: Future) -> "ConstantVelocity":
         """Fit the noise to the residuals of training windows."""
-        return cls(_spread(future.path_world - _coasting(context, future.path_world.shape[1])))
+        return cls(_rms(future.path_world - _extrapolate(context, future.path_world.shape[1])))
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw one deviation per sample and let it grow with time."""
-        return _straight(context, _coasting(context, len(self.std)), self.std, count, rng)
+        return _gaussian_samples(context, _extrapolate(context, len(self.std)), self.std, count, rng)
 
 
-def _held(context: Context, frames: int) -> Float[np.ndarray, "window frame 3"]:
+def _repeat_last(context: Context, frames: int) -> Float[np.ndarray, "window frame 3"]:
     return np.repeat(context.world_from_agent[:, -1:, :3, 3], frames, axis=1)
 
 
-def _coasting(context: Context, frames: int) -> Float[np.ndarray, "window frame 3"]:
+def _extrapolate(context: Context, frames: int) -> Float[np.ndarray, "window frame 3"]:
     position = context.world_from_agent[..., :3, 3]
     step = (position[:, -1] - position[:, 0]) / (position.shape[1] - 1)
-    return _held(context, frames) + step[:, None] * np.arange(1, frames + 1)[:, None]
+    return _repeat_last(context, frames) + step[:, None] * np.arange(1, frames + 1)[:, None]
 
 
-def _spread(residual: Float[np.ndarray, "window frame 3"]) -> Float[np.ndarray, "frame 3"]:
-    """Return the root mean square per frame: horizontal axes together, height apart."""
+def _rms(residual: Float[np.ndarray, "window frame 3"]) -> Float[np.ndarray, "frame 3"]:
+    """Return the root mean square per frame and axis, horizontal axes pooled."""
     level = np.sqrt((residual[..., ::2] ** 2).mean((0, 2)))
     return np.stack([level, np.sqrt((residual[..., 1] ** 2).mean(0)), level], axis=-1)
 
 
-def _straight(
+def _gaussian_samples(
     context: Context,
     mean: Float[np.ndarray, "window frame 3"],
     std: Float[np.ndarray, "frame 3"],
@@ -153,17 +153,17 @@ class Ats:
         if architecture.scene == "none":
             volume = (volume if isinstance(volume, Scenes) else Scenes.of(volume)).without_features()
         sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
-        knows = architecture.ablated_input != "scene" and architecture.scene != "none"
-        sampling = replace(sampling, avoid_solid=sampling.avoid_solid and knows)
+        uses_scene = architecture.ablated_input != "scene" and architecture.scene != "none"
+        sampling = replace(sampling, avoid_solid=sampling.avoid_solid and uses_scene)
         return cls(sampler, volume, rest, architecture.ego, sampling)
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
-        """Draw ``count`` plans for each window; goal and path are each as sampled."""
+        """Draw ``count`` plans for each window."""
         parts = [self._plans(chunk, count, rng) for chunk in _chunks(context)]
         return Samples(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
 
     def goals(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
-        """Draw goals only, which costs a hundredth of whole plans."""
+        """Draw goals only, at a hundredth of the cost of plans."""
         goals = []
         for chunk in _chunks(context):
             codes = self.sampler.codes(self._observe(chunk), self.sampling, count)
@@ -174,7 +174,7 @@ class Ats:
     def paths(
         self, context: Context, count: int, rng: np.random.Generator, *, at_once: int = WINDOWS_AT_ONCE
     ) -> Samples:
-        """Draw goals and the paths to them, and spare the bodies; goals are where the paths end.
+        """Draw goals and paths without bodies; the goals returned are the ends of the paths.
 
         ``at_once`` windows are encoded together: without a scene thousands fit into memory.
         """
@@ -199,7 +199,7 @@ class Ats:
 
     @cached_property
     def scenes(self) -> Scenes:
-        """The map as scenes, of which there may be one."""
+        """The scenes; a single map is shared by all recordings."""
         return self.volume if isinstance(self.volume, Scenes) else Scenes.of(self.volume)
 
     def _observe(self, context: Context) -> Observation:

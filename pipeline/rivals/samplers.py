@@ -1,8 +1,8 @@
-"""Samplers of the rival models of Table 4, which share networks, training and perception with ours.
+"""Samplers of the baselines of Table 4, which share networks, training and perception with ours.
 
-`GaussianSampler`: the networks predict mean and standard deviation, once each, of goal, path and body
-(Kendall & Gal 2017); the mean of one level steers the next. `OneStageSampler`: path and body are denoised as
-one sequence, with no goal before them (Tevet et al. 2022). `sampler_of` chooses by the architecture.
+`GaussianSampler`: the networks regress mean and standard deviation of goal, path and body (Kendall & Gal
+2017); each level is conditioned on the mean of the one above. `OneStageSampler`: path and body are denoised
+as one sequence without a goal (Tevet et al. 2022). `sampler_of` chooses by the architecture.
 """
 
 from dataclasses import dataclass
@@ -18,16 +18,15 @@ from pipeline.behavior.path_encoding import PATH_CHANNELS
 from pipeline.behavior.planning import Array, Networks, PlanCondition, SampledPlan, Sampler
 
 MEAN_STEP, LOG_STD_STEP = 0.0, 1.0
-"""Steps at which a Gaussian's networks, shown no sample, predict its mean and the logarithm of its standard
-deviation."""
+"""Steps at which the networks, given a zero sample, predict mean and log standard deviation."""
 LOG_STD_BOUNDS = (-5.0, 2.0)
-"""Bounds of that logarithm."""
+"""Bounds of the log standard deviation."""
 
 
 def sampler_of(
     architecture: Architecture, networks: Networks, schedule: Schedule, scaling: Scaling
 ) -> Sampler:
-    """Return the sampler that draws plans from networks of this kind."""
+    """Return the sampler for the architecture's family."""
     match architecture.family:
         case "diffusion":
             return Sampler(networks, schedule, scaling)
@@ -41,7 +40,7 @@ def sampler_of(
 
 @dataclass(frozen=True)
 class GaussianSampler(Sampler):
-    """Draws from Gaussians, each number on its own."""
+    """Samples from Gaussians with independent channels."""
 
     def draw_plans(
         self,
@@ -51,7 +50,7 @@ class GaussianSampler(Sampler):
         goal: Array | None,
         path: Array | None,
     ) -> SampledPlan:
-        """Draw plans; the means lead from level to level."""
+        """Draw plans; each level is conditioned on the mean of the one above."""
         towards = self.scaling.goal(self._goal(codes)[0]) if goal is None else goal
         along = path
         if along is None:
@@ -70,7 +69,7 @@ class GaussianSampler(Sampler):
         self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan 3"]:
         """Draw goals in the ego frame, metres."""
-        return codes.on_support(self.scaling.goal(self._drawn_from(self._goal(codes), rng)))
+        return codes.on_support(self.scaling.goal(self._sample_gaussian(self._goal(codes), rng)))
 
     def draw_paths(
         self,
@@ -80,7 +79,7 @@ class GaussianSampler(Sampler):
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw a path towards each goal, metres, ego frame."""
-        scaled = self._drawn_from(self._path(codes, goal, sampling), rng, sampling.path_noise_std)
+        scaled = self._sample_gaussian(self._path(codes, goal, sampling), rng, sampling.path_noise_std)
         return self.decode_paths(codes, scaled, goal, sampling)
 
     def bodies(
@@ -92,30 +91,30 @@ class GaussianSampler(Sampler):
     ) -> Float[np.ndarray, "plan frame channel"]:
         """Draw bodies along paths, metres and radians, ego frame."""
         control = self.scaling.scaled_path(path)
-        nothing = np.zeros((len(path), len(self.scaling.body_mean), path.shape[1]), np.float32)
+        zeros = np.zeros((len(path), len(self.scaling.body_mean), path.shape[1]), np.float32)
         outputs = [
-            self.networks.body(nothing, _step(nothing, t), codes.full, control, _keep_mask(nothing, 1.0))
+            self.networks.body(zeros, _step(zeros, t), codes.full, control, _keep_mask(zeros, 1.0))
             for t in (MEAN_STEP, LOG_STD_STEP)
         ]
-        scaled = np.swapaxes(self._drawn_from(outputs, rng, sampling.body_noise_std), 1, 2)
+        scaled = np.swapaxes(self._sample_gaussian(outputs, rng, sampling.body_noise_std), 1, 2)
         return scaled * self.scaling.body_std + self.scaling.body_mean
 
     def _goal(self, codes: PlanCondition) -> list[Array]:
-        nothing = np.zeros((len(codes.full), 3), np.float32)
-        return [self.networks.goal(nothing, _step(nothing, t), codes.full) for t in (MEAN_STEP, LOG_STD_STEP)]
+        zeros = np.zeros((len(codes.full), 3), np.float32)
+        return [self.networks.goal(zeros, _step(zeros, t), codes.full) for t in (MEAN_STEP, LOG_STD_STEP)]
 
     def _path(
         self, codes: PlanCondition, goal: Float[np.ndarray, "plan 3"], sampling: PlanSamplingConfig
     ) -> list[Array]:
         control = self.scaling.scaled_goal(goal)
-        nothing = np.zeros((len(goal), PATH_CHANNELS, self.scaling.path_std.shape[1]), np.float32)
-        keep = _keep_mask(nothing, float(sampling.goal))
+        zeros = np.zeros((len(goal), PATH_CHANNELS, self.scaling.path_std.shape[1]), np.float32)
+        keep = _keep_mask(zeros, float(sampling.goal))
         return [
-            self.networks.path(nothing, _step(nothing, t), codes.full, control, keep)
+            self.networks.path(zeros, _step(zeros, t), codes.full, control, keep)
             for t in (MEAN_STEP, LOG_STD_STEP)
         ]
 
-    def _drawn_from(self, outputs: list[Array], rng: np.random.Generator, spread: float = 1.0) -> Array:
+    def _sample_gaussian(self, outputs: list[Array], rng: np.random.Generator, spread: float = 1.0) -> Array:
         mean, log_std = outputs
         noise = rng.standard_normal(mean.shape, dtype=np.float32)
         return mean + spread * np.exp(np.clip(log_std, *LOG_STD_BOUNDS)) * noise
@@ -123,7 +122,7 @@ class GaussianSampler(Sampler):
 
 @dataclass(frozen=True)
 class OneStageSampler(Sampler):
-    """Draws path and body together; the goal is where the path ends."""
+    """Samples path and body together; the goal is the end of the path."""
 
     def draw_plans(
         self,
@@ -133,11 +132,11 @@ class OneStageSampler(Sampler):
         goal: Array | None,
         path: Array | None,
     ) -> SampledPlan:
-        """Draw plans. A given goal or path cannot steer a model without stages."""
+        """Draw plans, which cannot be conditioned on a goal or path."""
         assert goal is None and path is None, "a one-stage model takes no goal and no path"
-        whole = self._whole(codes, sampling, rng)
-        path = self._path(codes, whole)
-        body = np.swapaxes(whole[:, PATH_CHANNELS:], 1, 2) * self.scaling.body_std + self.scaling.body_mean
+        sequence = self._sequence(codes, sampling, rng)
+        path = self._path(codes, sequence)
+        body = np.swapaxes(sequence[:, PATH_CHANNELS:], 1, 2) * self.scaling.body_std + self.scaling.body_mean
         return SampledPlan(path[:, -1], path, body)
 
     def draw_plan_paths(
@@ -149,14 +148,16 @@ class OneStageSampler(Sampler):
     def goals(
         self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan 3"]:
-        """Draw whole plans and keep where they end."""
-        return self._path(codes, self._whole(codes, sampling, rng))[:, -1]
+        """Draw whole plans and keep the ends of their paths."""
+        return self._path(codes, self._sequence(codes, sampling, rng))[:, -1]
 
-    def _path(self, codes: PlanCondition, whole: Array) -> Float[np.ndarray, "plan frame 3"]:
-        path = self.scaling.path(whole[:, :PATH_CHANNELS], codes.start)
+    def _path(self, codes: PlanCondition, sequence: Array) -> Float[np.ndarray, "plan frame 3"]:
+        path = self.scaling.path(sequence[:, :PATH_CHANNELS], codes.start)
         return codes.constrained(path, self.scaling.rate_hz)
 
-    def _whole(self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator) -> Array:
+    def _sequence(
+        self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
+    ) -> Array:
         frames = self.scaling.path_std.shape[1]
         control = np.zeros((len(codes.full), 3, frames), np.float32)
 

@@ -1,9 +1,8 @@
-"""Predict the next 5.6 s on the test video: ours, a location prior, standing still, constant velocity.
+"""Predictions of the next 5.6 s on the test video: ours, location prior, standing still, constant velocity.
 
-Each method draws 16 samples a window in several trials; the best of 16 counts (minADE), and the energy score
-rewards the whole distribution. Truth is the reconstructed future of the test video, as in the paper. Every
-method is met through `predictors.Predictor`; goals are judged on all windows, paths and bodies on some,
-spread evenly.
+Each method draws 16 samples per window in several trials; scores are the best of 16 (minDE, minADE), and the
+energy score for the whole distribution. Truth is the reconstructed future of the test video, as in the paper.
+Goals are scored on all windows, paths and bodies on some, evenly spread.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,20 +29,20 @@ from stages.evaluate.config import Config
 OURS = "ats"
 RIVALS = ("location_prior", "stand_still", "constant_velocity")
 MOVING_M = 0.1
-"""An animal that gets further than this in 5.6 s moves."""
+"""Displacement in 5.6 s above which an animal moves."""
 Scores = dict[str, Float[np.ndarray, "window"]]
-"""Of one method, by the names of `SCORES`."""
+"""Scores of one method by the names of `SCORES`"""
 
 
 def rivals(data: BehaviorData) -> dict[str, Predictor]:
-    """Fit the simple predictors to the training windows."""
+    """Fit the simple baselines to the training windows."""
     context, future = data.windows(data.indices(TRAIN), bones=False)
     methods = (LocationPrior, StandStill, ConstantVelocity)
     return {name: method.fit(context, future) for name, method in zip(RIVALS, methods, strict=True)}
 
 
 def behavior_metrics(data: BehaviorData, ours: Predictor, config: Config) -> Metrics:
-    """Judge all methods on the test windows, with intervals and paired intervals of the differences."""
+    """Score all methods on the test windows, with intervals, and intervals of paired differences."""
     metrics, test = Metrics(), data.indices(TEST)
     every = np.concatenate([test, data.indices(TRAIN)])
     metrics.put("behavior/moving_windows_share", moving_share(data, every), "no windows")
@@ -67,7 +66,7 @@ def behavior_metrics(data: BehaviorData, ours: Predictor, config: Config) -> Met
 
 
 def moving_share(data: BehaviorData, index: Int[np.ndarray, "window"]) -> float:
-    """Return the share of windows in whose future the animal gets further than 0.1 m from where it is."""
+    """Return the share of windows in whose future the animal moves further than 0.1 m away."""
     if len(index) == 0:
         return float("nan")
     context, future = data.windows(index, bones=False)
@@ -82,9 +81,7 @@ def _scores(
     chosen: Int[np.ndarray, "chosen"],
     config: Config,
 ) -> Scores:
-    """Judge one method: its goals on all test windows, mean over trials, and one trial of its plans, where it
-    makes any, on the chosen ones.
-    """
+    """Score goals on all test windows, mean over trials, and one trial of plans, if any, on chosen ones."""
     rng, goals, plans = np.random.default_rng(config.seed), [], []
     drawn = _goals(method, data, test, config.samples * config.trials, rng)
     for window, sampled in zip(_chunks(test), _chunks(drawn), strict=True):
@@ -109,16 +106,14 @@ def _goals(
     count: int,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "window sample 3"]:
-    """Draw goals only where a method can, which spares the networks of path and body; others a chunk at a
-    time, for their paths are large.
+    """Draw goals, without paths and bodies if the method can, in chunks to bound memory.
 
-    What is drawn must not hang on the chunks: the location prior, which draws all cells before the places in
-    them, gets one.
+    Samples must not depend on the chunks: the location prior, which draws all cells first, has a single one.
     """
     at_once = isinstance(method, LocationPrior)
     draw = method.goals if isinstance(method, Ats) else method.sample
     parts = [test] if at_once else _chunks(test)
-    # Goals may be the ends of paths: without a copy these would stay.
+    # Goals may be views of paths: copies free these.
     return np.concatenate(
         [draw(data.windows(part, bones=not at_once)[0], count, rng).goal.copy() for part in parts]
     )
@@ -129,7 +124,7 @@ def _chunks(array: np.ndarray) -> list[np.ndarray]:
 
 
 def _joined(parts: Sequence[Scores]) -> Scores:
-    """Put the windows of several chunks one after the other."""
+    """Concatenate the scores of several chunks."""
     return {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
 
 

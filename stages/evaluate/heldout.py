@@ -33,7 +33,7 @@ NAMES = (
 
 @dataclass(frozen=True)
 class HeldoutShot:
-    """What the held-out phone truly saw at one time."""
+    """The true picture and depth of the held-out phone at one time."""
 
     world_from_camera: Float[np.ndarray, "4 4"]
     """in our world"""
@@ -68,7 +68,7 @@ class HeldoutView:
 
     @classmethod
     def empty(cls, true: HeldoutShot) -> "HeldoutView":
-        """Draw nothing: what a session that was refused has to show."""
+        """Return an empty rendering, for refused sessions."""
         return cls(np.zeros_like(true.color), np.zeros_like(true.depth), true)
 
 
@@ -132,7 +132,7 @@ def picture_metrics(name: str, views: Sequence[HeldoutView]) -> Metrics:
 
 
 def side_by_side(views: Sequence[HeldoutView], count: int = 6) -> UInt8[np.ndarray, "height width 3"]:
-    """Put some views beside each other: truth, ours, true depth, our depth."""
+    """Tile some views: truth, ours, true depth, our depth."""
     chosen = [views[index] for index in subsampling.evenly(len(views), count)]
     columns = [(view.true.color, view.color, _gray(view.true.depth), _gray(view.depth)) for view in chosen]
     height = max(len(column[0]) for column in columns)

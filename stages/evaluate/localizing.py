@@ -20,7 +20,7 @@ from pipeline.metrics.metrics import Metrics, mean, median
 from pipeline.metrics.pose_errors import PoseErrors
 
 WITHIN_DEG, WITHIN_M = 5, 0.2
-"""The bounds that the metric is named by."""
+"""Error bounds in the metric's name."""
 RETRIEVAL_STRIDE_PX = 40
 REPROJECTION_PX, PNP_ITERATIONS = 4.0, 2000
 FAILED = "more than half of the frames were not placed"
@@ -28,7 +28,7 @@ FAILED = "more than half of the frames were not placed"
 
 @dataclass(frozen=True)
 class SiftMap:
-    """SIFT descriptors of the walk-through and the points under them."""
+    """SIFT descriptors of the walk-through and their 3-D points."""
 
     descriptors: Float[np.ndarray, "point 128"]
     points_world: Float[np.ndarray, "point 3"]
@@ -36,14 +36,14 @@ class SiftMap:
 
 @dataclass(frozen=True)
 class Gallery:
-    """Walk-through pictures described as a whole, with their cameras."""
+    """Global descriptors of walk-through frames, with their cameras."""
 
     descriptors: Float[np.ndarray, "picture channel"]
     world_from_camera: Float[np.ndarray, "picture 4 4"]
 
 
 def metrics_of(name: str, errors: PoseErrors) -> Metrics:
-    """Summarise errors of single frames; frames that were not placed count as failures."""
+    """Summarise errors of single frames; frames without a pose count as failures."""
     metrics = Metrics()
     metrics.put(f"{name}rotation_deg_median", median(errors.degrees), FAILED)
     metrics.put(f"{name}translation_m_median", median(errors.meters), FAILED)
@@ -103,7 +103,7 @@ def placed_by_sift(known: SiftMap, clip: Clip, frames: Sequence[int]) -> Float[n
 
 
 def gallery(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], frames: Sequence[int]) -> Gallery:
-    """Describe walk-through frames as a whole."""
+    """Compute the global descriptors of walk-through frames."""
     descriptors = np.stack([_whole(clip.color(frame)) for frame in frames])
     return Gallery(descriptors, world_from_camera[np.array(frames)])
 

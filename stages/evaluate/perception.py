@@ -13,9 +13,9 @@ from stages.evaluate.reliability import reliability_metrics
 from stages.evaluate.truth import RecordingTruth, TrueFlow
 
 RIGHT_IOU = 0.75
-"""A mask that overlaps this much with truth is right: the bar of the report."""
+"""IoU from which a mask is right, as in the report."""
 SEEN_SHARE = 0.001
-"""share of the picture that must be agent, in truth or in ours, for a frame to count"""
+"""minimum share of the picture that is agent, in truth or ours, of counted frames"""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def overlaps(masks: Masks, truth: RecordingTruth) -> Overlaps:
 
 
 def mask_metrics(sessions: Sequence[Overlaps], turnaround: Overlaps | None) -> Metrics:
-    """Summarise overlaps of all sessions; the turnaround stands apart, it is the easy one."""
+    """Summarise overlaps of all sessions; the turnaround, which is easier, is separate."""
     metrics = Metrics()
     iou = np.concatenate([each.iou for each in sessions]) if sessions else np.zeros(0)
     resting = np.concatenate([each.resting for each in sessions]) if sessions else np.zeros(0, bool)
@@ -64,7 +64,7 @@ def mask_metrics(sessions: Sequence[Overlaps], turnaround: Overlaps | None) -> M
 
 
 PERSON_SEEN = 0.01
-"""share of the picture that must show a person for a frame to count"""
+"""minimum share of the picture that shows a person, of counted frames"""
 
 
 def people_metrics(sessions: Sequence[tuple[RecordingTruth, Float[np.ndarray, "frame person 3"]]]) -> Metrics:

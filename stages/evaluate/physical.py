@@ -21,7 +21,7 @@ from pipeline.metrics.metrics import Metrics, median
 from pipeline.rivals.predictors import Predictor, Samples
 
 WINDOWS = 16
-"""Test windows in which motion is judged; each costs a second."""
+"""Test windows that are scored; each costs a second."""
 MEASURES = ("penetration_m", "foot_slide_m_s", "non_collision_share", "contact_share")
 NAMES = (
     "behavior/physical_windows",
@@ -32,7 +32,7 @@ NAMES = (
 def physical_metrics(
     data: BehaviorData, ours: Predictor, reconstruction: Path, *, seed: int, windows: int = WINDOWS
 ) -> Metrics:
-    """Judge some test windows, evenly spread: what was recorded, and one plan of ours in each."""
+    """Score recorded motion and one plan of ours on some evenly spread test windows."""
     metrics, test = Metrics(), data.indices(TEST)
     sessions = sorted({data.videos[video] for video in data.video[data.split == TRAIN]})
     learned = [part for session in sessions for part in stretches(data.trajectories[session])]
@@ -54,7 +54,7 @@ def physical_metrics(
 
 
 def _sampled(made: Samples) -> list[BodyMotion]:
-    """Put the one sampled plan of each window together."""
+    """Return the sampled plan of each window as body motion."""
     rotation, path, bones = made.rotation, made.path, made.agent_from_bone
     assert rotation is not None and path is not None and bones is not None, "whole plans are judged"
     return [

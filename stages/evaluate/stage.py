@@ -18,7 +18,7 @@ LIMITS = (
     qa.Check("behavior/ats_minus_location_prior/goal_minde_m", None, "m", 0.0),
     qa.Check("behavior/ats_minus_constant_velocity/goal_minde_m", None, "m", 0.0),
 )
-"""What the quality page judges, without values."""
+"""Checks of the quality page, without values."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
-"""Judge one trained behaviour model, window by window: a method with a seed.
+"""Score one trained behaviour model, a method with a seed, on every test window.
 
-`protocols` predicts end to end (Table 4) and fed with the truth (Table 5), `approaches` asks whether the
-model runs from people as the animal does. `tabulate_behavior` makes tables of many of these.
+`protocols` predicts end to end (Table 4) and from the true goal and path (Table 5), `approaches` compares how
+often model and animal flee from people. `tabulate_behavior` makes tables of many of these.
 """

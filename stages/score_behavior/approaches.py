@@ -1,8 +1,7 @@
-"""Scripted approaches in a home that training never saw: does the model's animal flee as often as the true
-one?
+"""Flight from scripted approaches in a held-out home: frequencies of the model and of the true animal.
 
-Each approach has a twin in which the person stands still, from the same start; and the model is asked once
-more with the person taken out of its perception.
+Each approach has a twin from the same start in which the person stands still; the model also samples plans
+without perceiving the person.
 """
 
 from dataclasses import dataclass, replace
@@ -23,12 +22,12 @@ from pipeline.metrics.flight import flees
 from pipeline.rivals.predictors import WINDOWS_AT_ONCE, Ats
 
 TRUE = ("true", "true_standing")
-"""names of what the animal itself did, by twin"""
+"""names of the scores of the true animal, by twin"""
 
 
 @dataclass(frozen=True)
 class RecordedApproaches:
-    """What animal and person did; twin 0: the person walks up, twin 1: it stands."""
+    """Recorded motion of animal and person; twin 0: the person approaches, twin 1: it stands."""
 
     world_from_agent: Float[np.ndarray, "twin approach frame 4 4"]
     agent_from_bone: Float[np.ndarray, "twin approach past bone 4 4"]
@@ -45,9 +44,9 @@ def read(folder: Path) -> RecordedApproaches:
     )
 
 
-def check_rate(met: RecordedApproaches, data: BehaviorData, where: str) -> None:
-    """Raise REC-002 for a model of another rate or past than the scripted approaches have."""
-    past = met.observer.shape[2]
+def check_rate(recorded: RecordedApproaches, data: BehaviorData, where: str) -> None:
+    """Raise REC-002 if the model has another rate or past than the scripted approaches."""
+    past = recorded.observer.shape[2]
     if data.rate_hz != RATE_HZ or data.past != past:
         what = (
             f"approaches of {past} known frames at {RATE_HZ} Hz cannot be shown to a model of {data.past} "
@@ -57,31 +56,29 @@ def check_rate(met: RecordedApproaches, data: BehaviorData, where: str) -> None:
         raise InputError("REC-002", what, where, remedy)
 
 
-def shares(
-    ats: Ats, met: RecordedApproaches, count: int, seed: int
+def flight_shares(
+    ats: Ats, recorded: RecordedApproaches, count: int, seed: int
 ) -> dict[str, Float[np.ndarray, "approach"]]:
-    """Return per approach the share of ``count`` plans that flee, by what is perceived, and whether the
-    animal fled.
-    """
-    ats = replace(ats, volume=met.scene)
+    """Return per approach the share of ``count`` plans that flee, and whether the animal fled."""
+    ats = replace(ats, volume=recorded.scene)
     unaware = replace(ats.sampling, observer=False)
-    asked = ({"seen": ats.sampling, "unseen": unaware}, {"standing": ats.sampling})
-    found, past = {}, met.observer.shape[2]
-    for twin, samplings in enumerate(asked):
-        context = Context(met.world_from_agent[twin, :, :past], met.agent_from_bone[twin], met.observer[twin])
-        fled = _fled(ats, context, samplings, count, seed)
-        root = met.world_from_agent[twin, :, :, :3, 3]
-        true = flees(root[:, past:], root[:, past - 1], met.observer[twin, :, -1]).astype(float)
+    conditions = ({"seen": ats.sampling, "unseen": unaware}, {"standing": ats.sampling})
+    found, past = {}, recorded.observer.shape[2]
+    for twin, samplings in enumerate(conditions):
+        context = Context(
+            recorded.world_from_agent[twin, :, :past], recorded.agent_from_bone[twin], recorded.observer[twin]
+        )
+        fled = _flight_shares(ats, context, samplings, count, seed)
+        root = recorded.world_from_agent[twin, :, :, :3, 3]
+        true = flees(root[:, past:], root[:, past - 1], recorded.observer[twin, :, -1]).astype(float)
         found |= {f"flees/{name}": share for name, share in fled.items()} | {f"flees/{TRUE[twin]}": true}
     return found
 
 
-def _fled(
+def _flight_shares(
     ats: Ats, context: Context, samplings: dict[str, PlanSamplingConfig], count: int, seed: int
 ) -> dict[str, Float[np.ndarray, "approach"]]:
-    """Return per approach the share of plans that flee, for several ways of sampling that begin with the same
-    noise.
-    """
+    """Return per approach the share of plans that flee, by sampling settings, with the same noise."""
     rngs = {name: np.random.default_rng(seed) for name in samplings}
     parts: dict[str, list[np.ndarray]] = {name: [] for name in samplings}
     for begin in range(0, len(context), WINDOWS_AT_ONCE):

@@ -5,18 +5,18 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Config:
-    """How many samples are drawn, and on which windows."""
+    """Numbers of samples and windows."""
 
     seed: int = 0
-    """Of the samples; the same for every method."""
+    """Seed of the samples, the same for all methods."""
     samples: int = 16
     """Samples per window, the best of which counts (K)."""
     trials: int = 12
     """Trials of goals (L)."""
     stride: int = 1
-    """Every how many test windows goals are scored."""
+    """Stride over the test windows that goals are scored on."""
     plan_stride: int = 16
-    """Every how many test windows paths and bodies are scored; they are sampled once, at a hundred times the
-    cost."""
+    """Stride over the test windows that paths and bodies are scored on; one trial, at a hundred times the
+    cost of goals."""
     approach_samples: int = 4
     """Plans per scripted approach."""

@@ -1,6 +1,4 @@
-"""The two protocols of the paper: end to end, where each level feeds the next (Table 4), and fed with the
-truth (Table 5).
-"""
+"""The two protocols of the paper: end to end (Table 4), and given the true goal or path (Table 5)."""
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
@@ -21,11 +19,11 @@ WINDOWS_AT_ONCE = 32
 def scores(
     ats: Ats, data: BehaviorData, family: str, scoring: Config
 ) -> dict[str, Shaped[np.ndarray, "..."]]:
-    """Return per protocol and score one number per window, averaged over trials, and the windows themselves.
+    """Return one value per window for each protocol and score, averaged over trials, and the windows.
 
-    ``goal_window``, ``plan_window``: recording and first frame of the windows on which goals, and plans, are
-    judged; ``window_frames``: their known and predicted frames. ``end_to_end/solid``: share of each window's
-    sampled positions inside something solid or outside the room.
+    ``goal_window``, ``plan_window``: recording and first frame of the windows that goals, and plans, are
+    scored on; ``window_frames``: numbers of past and future frames. ``end_to_end/solid``: share of each
+    window's sampled positions inside solid or unmapped space.
     """
     scenes = ats.volume
     assert isinstance(scenes, Scenes), "the model is opened with the windows' own scenes"
@@ -42,7 +40,7 @@ def scores(
         assert samples.path is not None, "a behaviour model samples whole plans"
         solid = scenes.inside_solid(samples.path, context.video).mean((1, 2))
         found.setdefault("end_to_end/solid", []).append(solid)
-        if family != "one_stage":  # it has no level that could be fed
+        if family != "one_stage":  # has no levels to condition on the truth
             _add(found, "truth_fed", fed_with_truth(ats, context, future, scoring.samples, rng), future)
     listed = {
         "goal_window": _listed(data, many),
@@ -59,24 +57,21 @@ def scores(
 def fed_with_truth(
     ats: Ats, context: Context, future: Future, count: int, rng: np.random.Generator
 ) -> Samples:
-    """Sample paths to the true goal, and bodies along the true path."""
+    """Sample paths to the true goals, and bodies along the true paths."""
     parts = [slice(begin, begin + WINDOWS_AT_ONCE) for begin in range(0, len(context), WINDOWS_AT_ONCE)]
-    fed = [
-        _fed(
-            ats,
-            context[part],
-            Future(future.world_from_agent[part], future.agent_from_bone[part]),
-            count,
-            rng,
-        )
-        for part in parts
-    ]
+    fed = [_fed(ats, context[part], future.path_world[part], count, rng) for part in parts]
     return Samples(*(np.concatenate([getattr(each, name) for each in fed]) for name in vars(fed[0])))
 
 
-def _fed(ats: Ats, context: Context, future: Future, count: int, rng: np.random.Generator) -> Samples:
+def _fed(
+    ats: Ats,
+    context: Context,
+    path_world: Float[np.ndarray, "window frame 3"],
+    count: int,
+    rng: np.random.Generator,
+) -> Samples:
     frame = world_from_ego(context.world_from_agent[:, -1], ats.ego)
-    true = rigid.apply(rigid.inverse(frame), future.path_world)
+    true = rigid.apply(rigid.inverse(frame), path_world)
     codes = ats.sampler.codes(
         observe(context, ats.volume, ats.agent_from_bone_rest, ats.ego), ats.sampling, count
     )

@@ -46,7 +46,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
     if inputs.approaches is not None and (inputs.approaches / "approaches.npz").is_file():
         recorded = approaches.read(inputs.approaches)
         approaches.check_rate(recorded, data, str(inputs.approaches))
-        scores |= approaches.shares(ats, recorded, config.approach_samples, config.seed)
+        scores |= approaches.flight_shares(ats, recorded, config.approach_samples, config.seed)
     means = (f"{name} {scores[name].mean():.3f}" for name in REPORTED if name in scores)
     progress.log(", ".join(means))
     npz.save(out / "scores.npz", compress=False, **scores)

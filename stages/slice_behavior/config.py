@@ -5,20 +5,20 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Config:
-    """Which motion is trusted, and how densely it is cut into windows."""
+    """Filtering, resampling and windowing of motion."""
 
     min_confidence: float = 0.3
-    """Frames whose motion has less confidence (0..1) count as missing."""
+    """Minimum confidence (0..1) of frames; others count as missing."""
     max_gap_s: float = 0.6
-    """Longest gap in seconds that is interpolated."""
+    """Longest interpolated gap, seconds."""
     smooth_s: float = 0.08
-    """Standard deviation in seconds of the smoothing of the agent's root; 0 for none."""
+    """Standard deviation of the Gaussian that smooths the agent's root, seconds; 0: none."""
     past_s: float = 0.8
-    """Seconds that the model knows of agent and others."""
+    """Length of the past of agent and others that the model sees, seconds."""
     rate_hz: float = 10.0
-    """Frames per second that it learns; page, simulator and environments play 10. `horizon_s` of
-    [train_behavior] sets how far it sees ahead."""
+    """Frames per second of the model; page, simulator and environments need 10. `horizon_s` of
+    [train_behavior] sets the horizon."""
     stride: int = 1
-    """Frames between starts of training windows."""
+    """Stride between training windows, frames."""
     others: tuple[str, ...] = ()
-    """Names of the home's other animals, whose motion is read as companions; the planner sets it."""
+    """Names of the home's other animals, which become companions; set by the planner."""

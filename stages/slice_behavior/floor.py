@@ -1,4 +1,4 @@
-"""Keep the animal at home and on something: fill floor that nobody recorded, cut what lies beyond."""
+"""Supporting floor of the home: fill unseen floor, remove voxels outside of the home."""
 
 from typing import cast
 
@@ -12,9 +12,9 @@ from pipeline.behavior.support import SUPPORTED, floor_level
 FILLED = 3
 """Mark of allowed voxels right above floor that was filled."""
 JOINS_VOXELS = 3
-"""Gaps in the seen floor that are no wider than twice this belong to the same home."""
+"""Gaps in the seen floor up to twice this wide are closed."""
 MARGIN_VOXELS = 1
-"""The home goes on this far beyond the outermost seen floor: half a voxel and the error of the map."""
+"""Margin of the home around the seen floor: half a voxel and the error of the map."""
 
 
 def with_filled_floor(
@@ -22,13 +22,11 @@ def with_filled_floor(
     occupancy: UInt8[np.ndarray, "x y z"],
     visited: Bool[np.ndarray, "x y z"],
 ) -> UInt8[np.ndarray, "x y z"]:
-    """Return the marks of where the root may be with a floor beneath all of them, and none outside of the
-    home.
+    """Return the marks of allowed voxels with floor beneath all of them, and none outside of the home.
 
-    ``marks`` has 1 where the root may be and 2 right above something solid. The home is the convex hull of
-    the largest connected part of the seen floor and of all places that were visited. Columns in it that the
-    root may be in and that nothing carries get `FILLED` at the level of the floor; those where furniture
-    stands instead are left out. Unchanged where no floor was seen.
+    ``marks`` is 1 where the root may be and 2 right above solid voxels. The home is the convex hull of the
+    largest connected part of the seen floor and of all visited places. Its allowed columns without support
+    get `FILLED` at floor level, unless furniture is there. Unchanged if no floor was seen.
     """
     level = floor_level(marks == SUPPORTED)
     if level is None:
@@ -36,18 +34,18 @@ def with_filled_floor(
     floor = (marks == SUPPORTED)[:, max(level - 1, 0) : level + 2].any(1)
     home = hull(connected(floor) | visited.any(1))
     masked = np.where(home[:, None], marks, 0)
-    carried, solid = masked >= SUPPORTED, occupancy == 1
-    unsupported = (masked > 0).any(1) & ~carried[:, : level + 2].any(1) & ~solid[:, : level + 2].any(1)
-    # under a seat that nobody saw from below there is no floor
-    unsupported &= (masked[:, level] > 0) | ~carried.any(1)
+    supported, solid = masked >= SUPPORTED, occupancy == 1
+    unsupported = (masked > 0).any(1) & ~supported[:, : level + 2].any(1) & ~solid[:, : level + 2].any(1)
+    # no floor is filled in under seats whose space below was not seen
+    unsupported &= (masked[:, level] > 0) | ~supported.any(1)
     masked[:, level][unsupported] = FILLED
-    carried = np.any(masked >= SUPPORTED, axis=1, keepdims=True)
-    masked[np.broadcast_to(~carried, masked.shape)] = 0
+    supported = np.any(masked >= SUPPORTED, axis=1, keepdims=True)
+    masked[np.broadcast_to(~supported, masked.shape)] = 0
     return masked
 
 
 def connected(floor: Bool[np.ndarray, "x z"]) -> Bool[np.ndarray, "x z"]:
-    """Return the largest part of the floor that hangs together, over gaps of twice `JOINS_VOXELS`."""
+    """Return the largest connected component of the floor, across gaps of twice `JOINS_VOXELS`."""
     grown = binary_dilation(floor, iterations=JOINS_VOXELS)
     part, _ = cast("tuple[np.ndarray, int]", label(grown))
     largest = np.bincount(part[floor], minlength=1)
@@ -55,11 +53,11 @@ def connected(floor: Bool[np.ndarray, "x z"]) -> Bool[np.ndarray, "x z"]:
 
 
 def hull(columns: Bool[np.ndarray, "x z"]) -> Bool[np.ndarray, "x z"]:
-    """Return the columns within the convex hull of some, and `MARGIN_VOXELS` around it."""
+    """Return the convex hull of columns, dilated by `MARGIN_VOXELS`."""
     corners = np.argwhere(columns).astype(float)
     every = np.argwhere(np.ones_like(columns))
     try:
         inside = Delaunay(corners[ConvexHull(corners).vertices]).find_simplex(every) >= 0
-    except QhullError:  # on one line, or fewer than three
+    except QhullError:  # collinear, or fewer than three
         return binary_dilation(columns, iterations=MARGIN_VOXELS)
     return binary_dilation(inside.reshape(columns.shape), iterations=MARGIN_VOXELS)

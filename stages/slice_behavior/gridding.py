@@ -1,4 +1,4 @@
-"""Motion at the recording's own times becomes a trajectory on an even time grid, honest about its gaps."""
+"""Resampling of motion to a trajectory on a regular time grid, with gaps marked invalid."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ class ReconstructedMotion:
     confidence: Float[np.ndarray, "frame"]
     agent_visible: Bool[np.ndarray, "frame"]
     companions: Float[np.ndarray, "frame companion 4"] | None = None
-    """others beside the one who films, as in a `Trajectory`"""
+    """others beside the observer, as in a `Trajectory`"""
 
 
 def trajectory_from_motion(
@@ -31,13 +31,11 @@ def trajectory_from_motion(
     smooth_s: float,
     rate_hz: float = RATE_HZ,
 ) -> Trajectory:
-    """Resample to an even rate. A grid time is valid where trusted frames no more than ``max_gap_s`` apart
-    enclose it.
+    """Resample motion to a regular rate.
 
-    Trusted are those that show the agent from a camera whose pose is known.
-
-    Invalid times hold the nearest trusted motion, so that every number is finite. ``smooth_s`` is the
-    standard deviation of a Gaussian in time that takes the jitter out of the agent's root.
+    Times are valid between trusted frames at most ``max_gap_s`` apart; trusted frames show the agent from a
+    camera of known pose. Invalid times hold the nearest trusted motion, so that all numbers are finite. The
+    agent's root is smoothed by a Gaussian in time with standard deviation ``smooth_s``.
     """
     finite = np.isfinite(motion.world_from_agent).all((1, 2))
     finite &= np.isfinite(motion.agent_from_bone).all((1, 2, 3))
@@ -53,8 +51,8 @@ def trajectory_from_motion(
     if not trusted.any():
         still = np.broadcast_to(np.eye(4), (len(grid), 4, 4))
         rest = np.broadcast_to(np.eye(4, dtype=np.float32), (len(grid), bones, 4, 4))
-        nowhere = np.zeros(len(grid), bool)
-        return Trajectory(grid, still.copy(), rest.copy(), still.copy(), nowhere, companions)
+        invalid = np.zeros(len(grid), bool)
+        return Trajectory(grid, still.copy(), rest.copy(), still.copy(), invalid, companions)
     good = time[trusted]
     agent = rigid.interpolate(good, motion.world_from_agent[trusted], grid)
     agent = rigid.smoothed(agent, smooth_s * rate_hz)
@@ -71,13 +69,13 @@ def resampled(
     max_gap_s: float,
     rate_hz: float,
 ) -> Float[np.ndarray, "sample companion 4"]:
-    """Resample companions; NaN at times that known frames at most ``max_gap_s`` apart do not enclose."""
+    """Resample companions; NaN at times not between known frames at most ``max_gap_s`` apart."""
     found = np.full((len(grid), *companions.shape[1:]), np.nan, np.float32)
     for number in range(companions.shape[1]):
         known = np.isfinite(companions[:, number]).all(-1)
         if known.any():
             here = subsampling.within_short_gaps(time[known], grid, max_gap_s, 0.5 / rate_hz)
-            being = companions[known, number]
-            for channel in range(being.shape[1]):
-                found[here, number, channel] = np.interp(grid[here], time[known], being[:, channel])
+            track = companions[known, number]
+            for channel in range(track.shape[1]):
+                found[here, number, channel] = np.interp(grid[here], time[known], track[:, channel])
     return found

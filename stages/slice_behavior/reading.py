@@ -1,4 +1,4 @@
-"""Reading what `reconstruct` and `read_trajectories` promise to the behaviour models."""
+"""Reading of the motion and scenes that `reconstruct` and `read_trajectories` wrote."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,19 +18,19 @@ from pipeline.geometry import rigid
 from stages.slice_behavior.gridding import ReconstructedMotion
 
 PHONE_M = 1.4
-"""how high above the floor people hold a phone: they are perceived where one who films is"""
+"""height of a phone above the floor; people are perceived at that height, as the observer is"""
 
 
 @dataclass(frozen=True)
 class BehaviorSource:
-    """Motion per recording, and the scenes around it."""
+    """Motion of each recording, and their scenes."""
 
     motions: dict[str, ReconstructedMotion]
     agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
     volumes: tuple[FeatureVolume, ...]
-    """One for all recordings, or one for each, in their order."""
+    """One for all recordings, or one for each in order."""
     where: str
-    """For messages."""
+    """Path for messages."""
 
 
 def read_reconstruction(
@@ -40,8 +40,9 @@ def read_reconstruction(
     min_confidence: float,
     masks: Mapping[str, Path] = MappingProxyType({}),
 ) -> BehaviorSource:
-    """Read the sessions that were reconstructed, all in one scene, with the home's other animals and people
-    who walk through as companions. Raises InputError ART-010 when damaged.
+    """Read the reconstructed sessions, all in one scene; other animals of the home and people are companions.
+
+    Raises InputError ART-010 when damaged.
     """
     motions = {id: read_motion(folder / id) for id in sessions if (folder / id).is_dir()}
     for id, motion in motions.items():
@@ -59,8 +60,9 @@ def read_reconstruction(
 def companion_of(
     motion: ReconstructedMotion, timestamp_s: Float[np.ndarray, "frame"], min_confidence: float
 ) -> Float[np.ndarray, "frame 4"]:
-    """Return where an animal is at the times of another's motion in the same recording, and that it is one;
-    NaN where it is not seen or its motion has less confidence.
+    """Return position and kind of another animal at these times of the same recording.
+
+    NaN where it is not visible or its confidence is lower.
     """
     found = np.full((len(timestamp_s), 4), np.nan)
     trusted = motion.agent_visible & (motion.confidence >= min_confidence)
@@ -74,8 +76,9 @@ def companion_of(
 def people_of(
     people: dict[str, Shaped[np.ndarray, "..."]], motion: ReconstructedMotion
 ) -> list[Float[np.ndarray, "frame 4"]]:
-    """Return where each person's phone would be at the times of a motion in the same recording, and that it
-    is a person; NaN where nobody is seen or the camera is not known.
+    """Return position, at phone height, and kind of each person at the times of a motion.
+
+    NaN where the person is not visible or the camera is unknown.
     """
     _, mine, its = np.intersect1d(motion.timestamp_s, people["timestamp_s"], return_indices=True)
     found = []
@@ -89,7 +92,7 @@ def people_of(
 
 
 def read_tables(folders: Mapping[str, Path]) -> BehaviorSource:
-    """Read recordings with a scene each. Raises BEH-002 for different bodies, ART-010 when damaged."""
+    """Read recordings with a scene each. Raises BEH-002 for different skeletons, ART-010 when damaged."""
     motions = {id: read_motion(folder) for id, folder in folders.items()}
     first, *others = folders.values()
     rest = _rest(first)

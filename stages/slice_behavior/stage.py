@@ -15,12 +15,12 @@ from stages.slice_behavior.gridding import trajectory_from_motion
 from stages.slice_behavior.windows import slice_windows, write_volumes
 
 MIN_PAST = 3
-"""Frames that a posture and a velocity are taken from."""
+"""Minimum number of past frames, which give posture and velocity."""
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """What the stage reads: one of both."""
+    """What the stage reads: a reconstruction or trajectories."""
 
     reconstruction: Path | None = None
     """Motion of all sessions in one scene."""

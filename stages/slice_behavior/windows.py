@@ -1,4 +1,4 @@
-"""The exact list of training and test windows, and where in the room an animal may be."""
+"""The list of training and test windows, and the voxels where an animal may be."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -24,8 +24,7 @@ from pipeline.data import npz
 from stages.slice_behavior.floor import with_filled_floor
 
 REACH_VOXELS = 2
-"""Voxels around visited places in which the animal may be, whatever the map says: its root errs by as much.
-"""
+"""Radius around visited places that is allowed whatever the map: the error of the root, voxels."""
 
 
 def slice_windows(
@@ -37,9 +36,10 @@ def slice_windows(
     past: int = PAST,
     rate_hz: float = RATE_HZ,
 ) -> BehaviorData:
-    """List the windows of every recording: with ``stride`` in training recordings, every one in test
-    recordings. They have ``past`` known frames and as many seconds ahead as `FUTURE` is at `RATE_HZ`, in
-    multiples of four frames.
+    """List the windows of all recordings: training ones every ``stride`` frames, all test ones.
+
+    They have ``past`` known frames; the future is as long as `FUTURE` at `RATE_HZ`, in multiples of four
+    frames.
     """
     future = 4 * max(round(FUTURE / RATE_HZ * rate_hz / 4), 1)
     videos = tuple(sorted(trajectories))
@@ -57,8 +57,8 @@ def slice_windows(
 def allowed_voxels(
     volume: FeatureVolume, trajectories: dict[str, Trajectory], *, reach_voxels: int
 ) -> UInt8[np.ndarray, "x y z"]:
-    """Return 1 where the animal's root may be: seen as free, or within ``reach_voxels`` of where it has been;
-    there 2 right above something solid, and 3 above floor that nobody recorded and that was filled.
+    """Return 1 where the animal's root may be: seen as free, or within ``reach_voxels`` of visited voxels; 2
+    right above solid voxels, and 3 above filled floor.
     """
     visited = np.zeros(volume.occupancy.shape, bool)
     for trajectory in trajectories.values():
@@ -73,7 +73,7 @@ def allowed_voxels(
 def standing_heights(
     pairs: Iterable[tuple[FeatureVolume, Trajectory]], rate_hz: float = RATE_HZ
 ) -> Float[np.ndarray, "2 2"]:
-    """Return how high above what carries it the root is, see `Support.range_m`."""
+    """Return the range of the root's height above its support, see `Support.range_m`."""
     seen = []
     for volume, trajectory in pairs:
         root = trajectory.world_from_agent[:, :3, 3]
@@ -91,7 +91,7 @@ def write_volumes(
 ) -> None:
     """Write `volume.npz`, or `volumes/<id>.npz` where each recording has its own scene.
 
-    ``seen`` are the training recordings: only where they went counts as visited.
+    ``seen`` are the training recordings, which determine the visited voxels.
     """
     scene = dict(zip(videos, volumes if len(volumes) > 1 else volumes * len(videos), strict=True))
     stands_m = standing_heights(((scene[id], trajectory) for id, trajectory in seen.items()), rate_hz)

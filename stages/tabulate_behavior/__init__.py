@@ -1,6 +1,5 @@
-"""From the scores of all trials to the paper's Tables 4 and 5, with intervals.
+"""Tables 4 and 5 of the paper, with bootstrap intervals, from the scores of all trials.
 
-`tables` draws intervals over seeds and episodes, `untrained` scores the rivals that need no training,
-`chaining` lets the model live on for minutes, `printing` lays out the tables, `pictures` shows the learning
-curves.
+`tables` computes intervals over seeds and episodes, `untrained` scores the baselines without training,
+`chaining` simulates minutes of chained plans, `printing` formats tables, `pictures` draws learning curves.
 """

@@ -1,6 +1,4 @@
-"""Plans chained for minutes beside the observer of a test recording: does the animal stay, and move as it
-does?
-"""
+"""Long rollouts of chained plans beside the observer of a test recording, compared with recorded motion."""
 
 from typing import cast
 
@@ -17,31 +15,31 @@ from pipeline.rivals.predictors import Ats
 REST_M_S = 0.05
 """speed below which an animal rests: it breathes, and reconstructions err by more"""
 UPRIGHT_QUANTILE = 0.999
-"""share of recorded time in which an animal is nearer to upright than what counts as tilted"""
+"""quantile of recorded tilts above which an animal counts as tilted"""
 
 
 def figures(
     ats: Ats, data: BehaviorData, scenes: Scenes, *, count: int, seconds: float, seed: int
 ) -> dict[str, float]:
-    """Return the share of time inside something solid or outside, and Kolmogorov-Smirnov distances of speeds.
+    """Return the share of time inside solid or unmapped space, and Kolmogorov-Smirnov distances of speeds.
 
-    Truth against truth compares each test recording (each half, if there is one) with the others. ``moving``
-    counts all speeds of an animal that rests as one. ``tilted`` is the share of time further from upright
-    than recorded animals mostly are.
+    ``behavior/true`` compares each test recording (each half of a single one) with the others. ``moving``
+    treats all speeds at rest as equal. ``tilted`` is the share of time with a tilt beyond nearly all recorded
+    ones.
     """
     rng, test = np.random.default_rng(seed), data.indices(TEST)
     chosen = test[
         (np.arange(count) * len(test)) // count + rng.integers(max(len(test) // count, 1), size=count)
     ]
     poses = rollouts(ats, data, scenes, chosen, seconds, rng)
-    lived, tilt = poses[..., :3, 3], _tilts(poses)
-    solid = scenes.inside_solid(lived, data.video[chosen]).mean(1)
+    position, tilt = poses[..., :3, 3], _tilts(poses)
+    solid = scenes.inside_solid(position, data.video[chosen]).mean(1)
     recorded = [data.trajectories[data.videos[video]] for video in np.unique(data.video[test])]
     true = [_speeds(t.world_from_agent[:, :3, 3], data.rate_hz)[t.valid[1:] & t.valid[:-1]] for t in recorded]
     tilted = np.quantile(
         np.concatenate([_tilts(t.world_from_agent[t.valid]) for t in recorded]), UPRIGHT_QUANTILE
     )
-    speeds, whole = [_speeds(life, data.rate_hz) for life in lived], np.concatenate(true)
+    speeds, whole = [_speeds(life, data.rate_hz) for life in position], np.concatenate(true)
     return {
         "behavior/ats/chain_rollouts": float(count),
         "behavior/ats/chain_seconds": float(seconds),
@@ -69,9 +67,7 @@ def rollouts(
     seconds: float,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "life frame 4 4"]:
-    """Let the model go on from some windows, in their homes, with their observers walking as recorded, over
-    and over.
-    """
+    """Roll out the model from some windows in their homes; recorded observers walk in a loop."""
     animals = AnimalBatch(
         ats.sampler,
         scenes,
@@ -96,7 +92,7 @@ def rollouts(
 
 
 def _tilts(world_from_agent: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch"]:
-    """Return how far from upright roots are, radians."""
+    """Return the tilt of roots from upright, radians."""
     return np.arccos(np.clip(world_from_agent[..., 1, 1], -1, 1))
 
 
@@ -105,16 +101,17 @@ def _speeds(path: Float[np.ndarray, "frame 3"], rate_hz: float) -> Float[np.ndar
 
 
 def _ks_distance(
-    mine: Float[np.ndarray, "step"], others: Float[np.ndarray, "other"], least: float = 0.0
+    mine: Float[np.ndarray, "step"], others: Float[np.ndarray, "other"], min_speed: float = 0.0
 ) -> float:
-    found = ks_2samp(np.maximum(mine, least), np.maximum(others, least))
+    found = ks_2samp(np.maximum(mine, min_speed), np.maximum(others, min_speed))
     return cast("tuple[float, float]", found)[0]  # statistic and p-value
 
 
-def _ks_among_recordings(recorded: list[Float[np.ndarray, "step"]], least: float = 0.0) -> float:
+def _ks_among_recordings(recorded: list[Float[np.ndarray, "step"]], min_speed: float = 0.0) -> float:
     parts = recorded if len(recorded) > 1 else np.array_split(recorded[0], 2)
     others = [
         np.concatenate([part for other, part in enumerate(parts) if other != mine])
         for mine in range(len(parts))
     ]
-    return float(np.mean([_ks_distance(part, rest, least) for part, rest in zip(parts, others, strict=True)]))
+    pairs = zip(parts, others, strict=True)
+    return float(np.mean([_ks_distance(part, rest, min_speed) for part, rest in pairs]))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Config:
-    """Which methods are compared, and how often each is trained."""
+    """Methods that are compared, and numbers of trainings and samples."""
 
     methods: tuple[str, ...] = (
         "ats",
@@ -19,14 +19,14 @@ class Config:
         "horizon_4_0",
         "horizon_7_2",
     )
-    """Trained methods: variants in `agents/variants/`; `ats` changes nothing."""
+    """Trained methods, which are variants in `agents/variants/`; `ats` is unchanged."""
     seeds: int = 5
     """Trainings of each method."""
     trials: int = 12
-    """Trials of the rivals that need no training."""
+    """Trials of the baselines without training."""
     rollouts: int = 20
-    """Chained lives of the first trained model; 0: none."""
+    """Rollouts of the first trained model; 0: none."""
     rollout_s: float = 300.0
-    """Length of each, seconds."""
+    """Length of each rollout, seconds."""
     seed: int = 0
-    """Of samples and resampling."""
+    """Seed of samples and resampling."""

@@ -1,4 +1,4 @@
-"""The tables as people read them."""
+"""The tables as text."""
 
 from collections.abc import Mapping
 
@@ -45,7 +45,7 @@ def table(
     figures: Mapping[str, float | None],
     methods: tuple[str, ...],
 ) -> str:
-    """Return one table; methods that have none of its figures are left out."""
+    """Return one table, without methods that have none of its figures."""
     rows = [["method", *(head for _, head in columns)]]
     for method in methods:
         cells = [formatted_interval(figures, f"behavior/{method}/{name}", ".3f") for name, _ in columns]

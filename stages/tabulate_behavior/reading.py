@@ -1,4 +1,4 @@
-"""Reading what `score_behavior` and `train_behavior` wrote of every trial."""
+"""Reading of the scores and losses of every trial."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ class MethodScores:
     """The scores of one method."""
 
     goal_window: Int[np.ndarray, "goal_window 2"]
-    """recording and first frame of the windows on which goals are judged"""
+    """recording and first frame of the windows that goals are scored on"""
     plan_window: Int[np.ndarray, "plan_window 2"]
-    """the same of paths and bodies"""
+    """the same for paths and bodies"""
     values: dict[str, Float[np.ndarray, "_ _"]]
     """[seed window] of `<protocol>/<score>`, `recorded/solid`; `flees/<condition>`, which is per approach"""
     past: int = PAST
@@ -47,13 +47,13 @@ def stacked(folders: Sequence[Path]) -> MethodScores:
 
 
 def curves(folders: Sequence[Path]) -> dict[str, Float[np.ndarray, "seed step"]]:
-    """Read the losses of every step of the trials of one method."""
+    """Read the losses at every step of the trials of one method."""
     read = [npz.load(folder / "losses.npz") for folder in folders]
     return {name.removeprefix("loss/"): np.stack([each[name] for each in read]) for name in read[0]}
 
 
 def windows(found: Mapping[str, MethodScores]) -> dict[str, Int[np.ndarray, "window 2"]]:
-    """Return the exact windows of every method."""
+    """Return the windows of every method."""
     return {
         f"{method}/{kind}": getattr(scores, kind)
         for method, scores in found.items()

@@ -15,7 +15,7 @@ from stages.tabulate_behavior import chaining, pictures, printing, reading, tabl
 from stages.tabulate_behavior.config import Config
 
 OURS = "ats"
-"""The method that changes nothing, with which all others are compared."""
+"""The unchanged method, with which all others are compared."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Means over windows and seeds, with intervals drawn over both: whole episodes, and whole trainings."""
+"""Means over windows and seeds, with bootstrap intervals that resample episodes and trainings."""
 
 from collections.abc import Mapping
 
@@ -9,13 +9,13 @@ from pipeline.metrics.intervals import Interval, episodes
 from stages.tabulate_behavior.reading import MethodScores
 
 UNPREFIXED = "end_to_end"
-"""Its figures carry no prefix: they are those of Table 4."""
+"""Protocol of Table 4, whose figures have no prefix."""
 CONTRASTS = (
     ("flees_seen_minus_true", "flees/seen", "flees/true"),
     ("flees_seen_minus_unseen", "flees/seen", "flees/unseen"),
     ("solid_minus_recorded", f"{UNPREFIXED}/solid", "recorded/solid"),
 )
-"""Figure, and the two scores whose difference it is, approach by approach or window by window."""
+"""Figures, each the paired difference of two scores per approach or window."""
 
 RESAMPLES = 2000
 """Bootstrap resamples: bounds of 95 % intervals vary by about 1 % of their width."""
@@ -24,9 +24,7 @@ RESAMPLES = 2000
 def figures(
     found: Mapping[str, MethodScores], ours: str, *, seed: int, draws: int = RESAMPLES
 ) -> dict[str, float | None]:
-    """Return all figures with their intervals, and those of the differences to ours where windows are the
-    same.
-    """
+    """Return all figures with intervals, and paired differences to ours where the windows are the same."""
     table: dict[str, float | None] = {}
     for method, scores in found.items():
         for name, values in scores.values.items():
@@ -40,33 +38,33 @@ def figures(
                     both = min(len(rival), len(values))
                 else:
                     both = max(len(rival), len(values))
-                less = np.broadcast_to(rival[:both], (both, rival.shape[1])) - np.broadcast_to(
+                difference = np.broadcast_to(rival[:both], (both, rival.shape[1])) - np.broadcast_to(
                     values[:both], (both, values.shape[1])
                 )
-                table |= interval(less, window, frames, draws, seed).as_figures(
+                table |= interval(difference, window, frames, draws, seed).as_figures(
                     f"behavior/{ours}_minus_{method}/{_figure(name)}"
                 )
-        _contrast(table, method, scores, draws, seed)
+        _add_contrasts(table, method, scores, draws, seed)
         table[f"behavior/{method}/seeds"] = len(next(iter(scores.values.values())))
     return table
 
 
-def _contrast(
+def _add_contrasts(
     table: dict[str, float | None], method: str, scores: MethodScores, draws: int, seed: int
 ) -> None:
-    """Put what the bars ask of one method alone: flight against the animal's own and without the observer,
-    and control.
-    """
+    """Add the contrasts within one method: `CONTRASTS`, and paths given the true goal against end to end."""
     for name, first, second in CONTRASTS:
         if first in scores.values and second in scores.values:
-            less = scores.values[first] - scores.values[second]
+            difference = scores.values[first] - scores.values[second]
             frames = scores.past + scores.future
-            table |= interval(less, scores.windows_of(first), frames, draws, seed).as_figures(
+            table |= interval(difference, scores.windows_of(first), frames, draws, seed).as_figures(
                 f"behavior/{method}/{name}"
             )
-    fed, alone = (scores.values.get(f"{protocol}/path_minade_m") for protocol in ("truth_fed", UNPREFIXED))
-    if fed is not None and alone is not None:
-        table[f"behavior/{method}/path_minade_truth_fed_share"] = float(fed.mean() / alone.mean())
+    given_goal, end_to_end = (
+        scores.values.get(f"{protocol}/path_minade_m") for protocol in ("truth_fed", UNPREFIXED)
+    )
+    if given_goal is not None and end_to_end is not None:
+        table[f"behavior/{method}/path_minade_truth_fed_share"] = float(given_goal.mean() / end_to_end.mean())
 
 
 def interval(
@@ -76,10 +74,9 @@ def interval(
     draws: int,
     seed: int,
 ) -> Interval:
-    """Resample seeds and episodes as long as a window of ``frames``, both with replacement, and return the
-    mean with percentiles 2.5 and 97.5.
+    """Return the mean and its 95 % bootstrap interval over seeds and episodes of ``frames`` frames.
 
-    The bounds of one episode alone are NaN.
+    The bounds of a single episode are NaN.
     """
     rng = np.random.default_rng(seed)
     episode = episodes(window[:, 1], window[:, 0], frames)
@@ -96,9 +93,7 @@ def interval(
 
 
 def plateaus(curves: Mapping[str, Mapping[str, Float[np.ndarray, "seed step"]]]) -> dict[str, float]:
-    """Return by how much of itself each loss still fell from its last but one tenth to its last: near 0 is a
-    plateau.
-    """
+    """Return the last tenth of each loss and its relative decrease since the tenth before; 0 is a plateau."""
     table = {}
     for method, terms in curves.items():
         for name, loss in terms.items():

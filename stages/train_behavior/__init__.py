@@ -1,9 +1,9 @@
 """Train the behaviour model from trajectories: perception, goal, path and body.
 
-`batches` draws augmented windows in the ego frame, `objective` turns them into denoising losses
-(`rival_losses` into those of the rivals of Table 4), `training` runs the loop, `reactions` asks whether the
-animal reacts to the observer, `export` writes weights, ONNX and the sampler's contract, `pictures` judges it
-all, `outcome` has all of this written, `refusals` rejects what cannot be learned before it is tried.
+`batches` draws augmented windows in the ego frame, `objective` computes denoising losses (`rival_losses`
+those of the baselines of Table 4), `training` runs the loop, `reactions` measures reactions to the observer,
+`export` writes weights, ONNX and the sampler's contract, `pictures` draws charts and checks, `outcome` writes
+all results, `refusals` rejects invalid settings and data before training.
 
-Errors: BEH-001 no window as long as is foretold, REC-002 settings of which nothing can be learned or made.
+Errors: BEH-001 no window of past and horizon, REC-002 settings that cannot be trained or exported.
 """

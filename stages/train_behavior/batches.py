@@ -1,8 +1,7 @@
 """Training windows as tensors in the ego frame, and the augmented batches drawn from them.
 
-Augmentation rotates the ego frame about its up axis, mirrors left and right (bones are hidden then, since
-nobody knows which bone mirrors which), shifts the observer and blurs what is remembered: five minutes of
-video must go a long way.
+Augmentation rotates the ego frame about its up axis, mirrors left and right (which hides bones, as their
+symmetry is unknown), shifts the observer and adds noise to the past: five minutes of video must suffice.
 """
 
 import math
@@ -29,28 +28,26 @@ from stages.train_behavior.homes import TrainingHomes
 from stages.train_behavior.scene_sampler import SceneSampler
 
 YAW_JITTER_RAD = 0.3
-"""largest rotation of samples that are not turned by any angle"""
+"""maximum rotation of samples that are not rotated by an arbitrary angle"""
 OBSERVER_SHIFT_M = 0.05
-"""standard deviation of a shift of the observer's whole past: how far reconstructed cameras are off"""
+"""standard deviation of a shift of the observer's whole past: the error of reconstructed cameras"""
 POSTURE_TILT_RAD, POSTURE_BEND = 0.15, 0.3
 """standard deviations of a posture's offset: tilt of the root; bones, in their own standard deviations"""
 APPROACH_DISTANCE_M, APPROACH_SPEED_M_S = 2.4, 0.4
-"""distance and pace of an observer that comes up"""
+"""maximum distance and minimum speed of an approaching observer"""
 BIN_M, MAX_REPEATS = 0.2, 8
-"""bins of distance of approaches, and how often a window may count so that rare distances are
-asked as often"""
+"""width of the distance bins that approaches are balanced over, and maximum repetitions of a window"""
 MIN_PATH_STD_M, MIN_WAY_STD = 0.02, 0.05
-"""smallest scales of a path's frames (metres), and of goals (powered metres), strides (m/s) and positions"""
+"""minimum scales of positions of paths (metres), and of goals, strides and past positions"""
 MIN_ROTATION_STD, MIN_BONE_STD = 0.1, (0.05, 0.05, 0.05, 0.01, 0.01, 0.01)
-"""smallest scales of the root's rotation and of a bone's six numbers: an animal that only rests divides by
-nearly nothing otherwise"""
+"""minimum scales of the root's rotation and of the six channels of a bone, for animals that only rest"""
 MAX_STATISTICS_WINDOWS = 8192
-"""Windows that means and standard deviations are computed from."""
+"""Maximum number of windows for means and standard deviations."""
 
 
 @dataclass(frozen=True)
 class EgoTracks:
-    """What animal and others do in some windows, each in its own ego frame."""
+    """Motion of animal and others in some windows, each in its own ego frame."""
 
     root: Float[Tensor, "window frame 3"]
     rotation: Float[Tensor, "window frame 3 3"]
@@ -60,7 +57,7 @@ class EgoTracks:
 
 @dataclass(frozen=True)
 class TrainingWindows:
-    """All training windows: every frame once, and which frames each window holds."""
+    """All training windows: concatenated frames, and the frame indices of each window."""
 
     world_from_agent: Float[Tensor, "frame 4 4"]
     world_from_observer: Float[Tensor, "frame 4 4"]
@@ -69,24 +66,24 @@ class TrainingWindows:
     world_from_ego: Float[Tensor, "window 4 4"]
     frame: Int[Tensor, "window window_frame"]
     scene: Int[Tensor, "window"]
-    """number of the window's feature volume"""
+    """index of the window's feature volume"""
     bones_known: Bool[Tensor, "window"]
-    """recorded in the animal's own build, whose bones the model has"""
+    """whether it is of the animal's own build, whose bones the model has"""
     approached: Int[Tensor, "some"]
-    """windows that begin with a person coming up, those at rare distances several times"""
+    """windows with an approaching observer, repeated to balance distances"""
     rate_hz: float = RATE_HZ
     """frames per second"""
 
     @property
     def past(self) -> int:
-        """Return how many frames of a window are known."""
+        """Number of past frames of a window."""
         return self.companions_world.shape[2]
 
     def __len__(self) -> int:
         return len(self.frame)
 
     def tracks(self, index: Int[Tensor, "some"]) -> EgoTracks:
-        """Express some windows in the ego frames of their current times."""
+        """Transform some windows to the ego frames of their current times."""
         ego_from_world = rigid_torch.inverse(self.world_from_ego[index])
         ego_from_agent = ego_from_world[:, None] @ self.world_from_agent[self.frame[index]]
         ego_from_observer = ego_from_world[:, None] @ self.world_from_observer[self.frame[index, : self.past]]
@@ -99,7 +96,7 @@ class TrainingWindows:
 
 @dataclass(frozen=True)
 class WindowStatistics:
-    """Means and spreads of the training windows."""
+    """Means and standard deviations of the training windows."""
 
     scaling: Scaling
     """of goal, path and body"""
@@ -116,19 +113,19 @@ class TrainingBatch:
     others: Float[Tensor, "batch other past_frame 10"]
     past: Float[Tensor, "batch past"]
     held: Float[Tensor, "batch held_frame held_channel"]
-    """root and bones of the frames that give velocity and posture, as they were"""
+    """root and bones of the frames that give velocity and posture, without noise"""
     bones_keep: Float[Tensor, "batch"]
     bones_known: Bool[Tensor, "batch"]
     """not mirrored, and of the animal's own build"""
     oversampled: Bool[Tensor, "batch"]
-    """drawn for their observer, who is always perceived then: without, the odds would be wrong"""
+    """drawn for an approaching observer, who is never dropped then: the null must keep unbiased data"""
     goal: Float[Tensor, "batch 3"]
     track: Float[Tensor, "batch 3 frame"]
-    """where the animal is in each frame, encoded as a goal is"""
+    """positions of all frames, encoded as goals"""
     path: Float[Tensor, "batch 4 frame"]
-    """its strides"""
+    """strides"""
     places: Float[Tensor, "batch 3 frame"]
-    """the path as it conditions a body"""
+    """the path as it controls the body"""
     body: Float[Tensor, "batch body_channel frame"]
 
     def to(self, device: torch.device) -> "TrainingBatch":
@@ -137,7 +134,7 @@ class TrainingBatch:
 
 
 def windows_from_data(homes: TrainingHomes, architecture: Architecture) -> TrainingWindows:
-    """Put the frames of all recordings in one row and index each training window in it."""
+    """Concatenate the frames of all recordings and index the training windows."""
     data, index = homes.data, homes.windows()
     tracks = [data.trajectories[video] for video in data.videos]
     agent = np.concatenate([track.world_from_agent for track in tracks])
@@ -152,10 +149,10 @@ def windows_from_data(homes: TrainingHomes, architecture: Architecture) -> Train
     companions = data.nearest_companions(index, now)
     arrays = agent, observer, companions, bones, frame
     tables = (torch.from_numpy(array.astype(np.float32)) for array in arrays)
-    met = approached(now, observer[rows[:, : data.past], :3, 3], data.rate_hz)
-    met = met[:0] if architecture.ablated_input == "observer" else met
+    approaching = approached(now, observer[rows[:, : data.past], :3, 3], data.rate_hz)
+    approaching = approaching[:0] if architecture.ablated_input == "observer" else approaching
     known = homes.home[data.video[index]] == 0
-    indices = (torch.from_numpy(index) for index in (rows, number, known, met))
+    indices = (torch.from_numpy(index) for index in (rows, number, known, approaching))
     return TrainingWindows(*tables, *indices, rate_hz=data.rate_hz)
 
 
@@ -164,34 +161,32 @@ def approached(
     observer: Float[np.ndarray, "window past_frame 3"],
     rate_hz: float = RATE_HZ,
 ) -> Int[np.ndarray, "some"]:
-    """Return the windows in which the observer, at most `APPROACH_DISTANCE_M` from the animal, comes up at
-    `APPROACH_SPEED_M_S` or more.
-
-    Those at distances that are rare are named several times: an animal learns no rule from what it is hardly
-    asked.
+    """Return the windows in which an observer within `APPROACH_DISTANCE_M` approaches at least at
+    `APPROACH_SPEED_M_S`, repeated to balance the distances.
     """
     away = (agent[:, None] - observer)[..., [0, 2]]
     distance = np.linalg.norm(away[:, -1], axis=-1)
-    walked = (observer[:, -1] - observer[:, 0])[:, [0, 2]] * (rate_hz / (observer.shape[1] - 1))
-    comes = (walked * away[:, -1]).sum(-1) > APPROACH_SPEED_M_S * distance
-    met = np.flatnonzero((distance < APPROACH_DISTANCE_M) & comes)
-    each = (distance[met] / BIN_M).astype(int)
-    most = np.bincount(each).max(initial=0)
-    parts = [met[each == number] for number in np.unique(each)]
-    return np.concatenate([met[:0], *(np.resize(part, min(most, MAX_REPEATS * len(part))) for part in parts)])
+    velocity = (observer[:, -1] - observer[:, 0])[:, [0, 2]] * (rate_hz / (observer.shape[1] - 1))
+    approaches = (velocity * away[:, -1]).sum(-1) > APPROACH_SPEED_M_S * distance
+    approaching = np.flatnonzero((distance < APPROACH_DISTANCE_M) & approaches)
+    bins = (distance[approaching] / BIN_M).astype(int)
+    most = np.bincount(bins).max(initial=0)
+    parts = [approaching[bins == number] for number in np.unique(bins)]
+    return np.concatenate(
+        [approaching[:0], *(np.resize(part, min(most, MAX_REPEATS * len(part))) for part in parts)]
+    )
 
 
 def largest_turn_rad(augmentation: AugmentationConfig) -> float:
-    """Return how far the ego frame may be rotated about its up axis, either way, radians."""
+    """Return the maximum rotation of the ego frame about its up axis, either vectors, radians."""
     return math.pi if augmentation.turn > 0 else 0.0
 
 
 def statistics_from_windows(windows: TrainingWindows, turn_rad: float) -> WindowStatistics:
-    """Fit the scales of goal, path (per frame; both horizontal axes alike), body and past to at most 8,192
-    windows.
+    """Fit the scales of goal, path (per frame, horizontal axes pooled), body and past to some windows.
 
-    The root's rotation is scaled for ego frames that are turned by up to ``turn_rad`` either way. What is
-    remembered of a body is scaled as the body is, but for its heading.
+    Root rotations are scaled for ego frames rotated by up to ``turn_rad`` either way. Past bodies are scaled
+    as future ones, except for the heading.
     """
     some = torch.arange(0, len(windows), -(-len(windows) // MAX_STATISTICS_WINDOWS))
     tracks, rows, known = windows.tracks(some), windows.frame[some], windows.bones_known[some]
@@ -202,7 +197,7 @@ def statistics_from_windows(windows: TrainingWindows, turn_rad: float) -> Window
     path_std = np.stack([level, height, level])
     bones = windows.bones[rows[known, past:].unique()]
     mean, std = body_statistics(tracks.rotation[:, past:], bones, turn_rad)
-    # The smallest scale with which no heading is clipped: what sampling leaves of the noise shakes a body.
+    # The smallest scale that clips no heading: residual sampling noise shakes a body.
     heading_std = (1 + np.abs(mean[:3]).max()) / STANDARD.clip
     body_std = np.concatenate([np.full(3, heading_std), std[3:]])
     strides = velocity_channels_from_path(tracks.root[:, past:], tracks.root[:, past - 1], rate_hz)
@@ -214,16 +209,16 @@ def statistics_from_windows(windows: TrainingWindows, turn_rad: float) -> Window
     return WindowStatistics(scaling, torch.cat([torch.zeros(3), mean]), torch.cat([position, std]))
 
 
-def _spread(way: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "3"]:
-    """Return the root mean square of ways, both horizontal axes alike."""
-    square = (way**2).mean(0)
+def _spread(vectors: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "3"]:
+    """Return the root mean square per axis, horizontal axes pooled."""
+    square = (vectors**2).mean(0)
     return np.sqrt([square[::2].mean(), square[1], square[::2].mean()]).clip(MIN_WAY_STD)
 
 
 def body_statistics(
     rotation: Float[Tensor, "window frame 3 3"], bones: Float[Tensor, "row channel"], turn_rad: float
 ) -> tuple[Float[np.ndarray, "body_channel"], Float[np.ndarray, "body_channel"]]:
-    """Return mean and standard deviation, with floors, of root rotation and bones."""
+    """Return mean and standard deviation, with lower bounds, of root rotation and bones."""
     turns = rigid.rotation_from_vector(np.linspace(-1, 1, 9)[:, None] * [0, turn_rad, 0])
     root = rigid.rotation_to_6d(turns[:, None, None] @ rotation[::4, ::4].double().numpy()).reshape(-1, 6)
     posed = bones.double().numpy()
@@ -235,7 +230,7 @@ def body_statistics(
 def body_channels(
     rotation: Float[Tensor, "*batch 3 3"], bones: Float[Tensor, "*batch channel"]
 ) -> Float[Tensor, "*batch c"]:
-    """Put the root's rotation (6) before the bones."""
+    """Concatenate the root's 6D rotation and the bones."""
     return torch.cat([rigid_torch.rotation_to_6d(rotation), bones], dim=-1)
 
 
@@ -246,7 +241,7 @@ def with_posture_noise(
     augmentation: AugmentationConfig,
     generator: torch.Generator,
 ) -> tuple[Float[Tensor, "batch past_frame 3 3"], Float[Tensor, "batch past_frame channel"]]:
-    """Tilt the roots and bend the bones of some samples, in all frames alike."""
+    """Offset root tilt and bones of some samples, by a constant over all frames."""
     size, channels = len(bones), bones.shape[-1]
     some = (torch.rand(size, 1, generator=generator) < augmentation.posture_offset).float()
     tilt = torch.randn(size, 3, generator=generator) * torch.tensor([1.0, 0.0, 1.0]) * POSTURE_TILT_RAD * some
@@ -258,7 +253,7 @@ def with_posture_noise(
 def _drawn_windows(
     windows: TrainingWindows, augmentation: AugmentationConfig, size: int, generator: torch.Generator
 ) -> tuple[Int[Tensor, "batch"], Bool[Tensor, "batch"]]:
-    """Draw windows with replacement; return them and which were drawn for an observer that comes up."""
+    """Draw windows with replacement; also return which were drawn for an approaching observer."""
     index = torch.randint(len(windows), (size,), generator=generator)
     wanted = torch.rand(size, generator=generator) < augmentation.approached
     chosen = wanted & (len(windows.approached) > 0)
@@ -270,7 +265,7 @@ def _drawn_windows(
 def _drawn_turns(
     augmentation: AugmentationConfig, size: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch 3 3"]]:
-    """Draw which samples are mirrored (-1, else 1) and how each ego frame is turned about its up axis."""
+    """Draw mirroring (-1, else 1) and the rotation of each ego frame about its up axis."""
     mirrored, turned, share = (torch.rand(size, generator=generator) for _ in range(3))
     jitter_rad = min(largest_turn_rad(augmentation), YAW_JITTER_RAD)
     yaw = (share * 2 - 1) * torch.where(turned < augmentation.turn, torch.pi, jitter_rad)
@@ -288,10 +283,9 @@ def draw_batch(
     *,
     bodies: bool = True,
 ) -> TrainingBatch:
-    """Draw windows with replacement and augment each on its own, on the CPU; the batch lands where the scene
-    lies.
+    """Draw and augment windows on the CPU; return the batch on the device of ``scene``.
 
-    Without ``bodies``, which take the longest, those have no frames.
+    Without ``bodies``, which take the longest, these have no frames.
     """
     scaling, count = statistics.scaling, windows.past
     posed = slice(count, None if bodies else count)

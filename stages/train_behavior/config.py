@@ -6,7 +6,7 @@ from typing import Literal
 from pipeline.behavior.config import AblatedInput, Control, Ego, Family, MapLookup, ObservedPast, SceneEncoder
 
 Weighting = Literal["noise", "velocity", "flow"]
-"""Which error has equal weight at all noise levels, see `objective.squared_error`."""
+"""Prediction target whose error has equal weight at all noise levels, see `objective.squared_error`."""
 
 
 @dataclass(frozen=True)
@@ -16,9 +16,8 @@ class BehaviorOptimizerConfig:
     steps: int = 1000
     """Optimizer steps."""
     goal_steps: int = 200
-    """First steps, in which perception and goals are trained alone; both are frozen after them, for they
-    overfit minutes of video long before path and body are good. 0: all are trained together, as one-stage
-    models always are."""
+    """Initial steps that train perception and goals alone; both are then frozen, since they overfit minutes
+    of video long before path and body converge. 0: all are trained together, as in one-stage models."""
     batch: int = 64
     """Windows per step."""
     goal_batch: int = 64
@@ -28,67 +27,65 @@ class BehaviorOptimizerConfig:
     average: float = 0.995
     """Decay per step of the exponential moving average of the weights."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """Of the convolutions of path and body, which cost the most; mixed precision is faster on most GPUs."""
+    """Precision of the costly convolutions of path and body; mixed precision is faster on most GPUs."""
     compile: bool = False
-    """Compile path and body, which takes a minute and a C++ compiler; on a GPU each runs as one CUDA graph.
-    """
+    """Compile path and body (a minute, needs a C++ compiler); on a GPU each runs as one CUDA graph."""
 
 
 @dataclass(frozen=True)
 class AugmentationConfig:
-    """How far training samples are from the recorded ones."""
+    """Augmentation of training windows."""
 
     turn: float = 0.5
-    """Probability of rotating the ego frame about its up axis by any angle; the others rotate by up to 0.3
-    rad. 0 rotates none."""
+    """Probability of rotating the ego frame about its up axis by an arbitrary angle, otherwise by up to 0.3
+    rad; 0: no rotation."""
     mirror: float = 0.5
     """Probability of mirroring left and right."""
     past: float = 0.3
-    """Standard deviation of noise on the remembered motion, in its own standard deviations; 0 also leaves the
-    observer where it was, who else is shifted by 0.05 m."""
+    """Standard deviation of noise on the past motion, relative to its own; 0 also disables the shift of the
+    observer by 0.05 m."""
     posture_offset: float = 0.5
-    """Probability that the remembered posture is off by a constant, as sampled postures are; without it
-    errors add up over chained plans."""
+    """Probability of a constant offset of past postures, as sampled postures have; without it, errors
+    accumulate over chained plans."""
     hide_bones: float = 0.5
-    """Probability that a sample's remembered bones are hidden."""
+    """Dropout probability of past bones."""
     approached: float = 0.1
-    """Share of samples drawn from windows that begin with a person coming up, near and far alike, which are
-    few and matter; what follows is as likely in them as ever."""
+    """Share of samples drawn from windows with an approaching person, which are rare and matter, balanced
+    over distances; the distribution of futures given the approach is unchanged."""
     approached_paths: float = 0.1
-    """The same while path and body are trained apart from goals."""
+    """The same while path and body are trained, after goals."""
 
 
 @dataclass(frozen=True)
 class ObjectiveConfig:
-    """How a batch becomes losses."""
+    """Losses of a batch."""
 
     code_dropout: float = 0.1
     """Dropout on the perception code."""
     joint_dropout: float = 0.0
-    """Probability that scene, observer, past and goal or path are dropped together, so that guidance may act
-    on all of them at once; each is also dropped on its own with probability 0.1."""
+    """Probability of dropping scene, observer, past and goal or path together, for guidance on all of them;
+    each is also dropped independently with probability 0.1."""
     weighting: Weighting = "velocity"
-    """Error with equal weight at all noise levels: of the noise, as in the paper; of the velocity, which
-    gives noisy steps, where the outline is decided, their share; or of the straight line of rectified flow,
-    with its noise levels in place of the 50 linear ones of the paper."""
+    """Error with equal weight at all noise levels: of the noise, as in the paper; of the velocity
+    (v-prediction), which weights noisy steps, where the coarse shape is decided, more; or of the flow of
+    rectified flow, with its noise levels in place of the paper's 50 linear ones."""
     motion_weight: float = 4.0
-    """Weight of the change of a body's error from frame to frame beside the error itself (velocity loss of
-    Tevet et al. 2022): errors that change make feet skate."""
+    """Weight of the frame-to-frame change of a body's error relative to the error itself (velocity loss of
+    Tevet et al. 2022), against foot skate."""
     path_share: float = 0.5
-    """Share of a batch's windows that paths, whose network is costly, are trained on in a step."""
+    """Share of a batch that trains paths, whose network is costly."""
     body_share: float = 0.5
-    """Share of a batch's windows that bodies, whose network is the costliest, are trained on in a step; 0
-    trains none."""
+    """Share of a batch that trains bodies, whose network is the costliest; 0: no bodies."""
     goal_draws: int = 8
     """Noise levels per window for the goal, whose network is small."""
     earlier_share: float = 0.7
-    """Share of those draws whose target is where the animal is before the horizon ends: minutes of video hold
-    few goals."""
+    """Share of those draws that predict a position before the end of the horizon, since minutes of video
+    contain few goals."""
 
 
 @dataclass(frozen=True)
 class BehaviorTrainingConfig:
-    """Everything that a recipe sets about training."""
+    """Training settings of a recipe."""
 
     optimization: BehaviorOptimizerConfig = field(default_factory=BehaviorOptimizerConfig)
     """Length and speed."""
@@ -109,20 +106,20 @@ class Config:
     """What is learned: goal, path and body by diffusion; each as a Gaussian; path and body at once without a
     goal."""
     control: Control = "unet"
-    """How goal and path condition: by a second UNet, or, as an ablation, as one more part of the perception
-    code."""
+    """Control by goal and path: a second UNet (ControlNet), or, as an ablation, concatenation to the
+    perception code."""
     horizon_s: float = 5.6
-    """Seconds that are predicted; a multiple of four frames (0.4 s at 10 Hz). The page needs 5.6 s."""
+    """Predicted seconds; a multiple of four frames (0.4 s at 10 Hz). The page needs 5.6 s."""
     export: bool = True
-    """Write what the simulator needs (ONNX, golden plan, pictures); off for the trials of the tables."""
+    """Write the files of the simulator (ONNX, pictures); off for the trials of the tables."""
     scene: SceneEncoder = "pillars"
     """Scene encoder: 2.5-D with height in 32 channels, or the six 3-D convolutions of 128 channels of the
     paper, or none, for trajectories without a map."""
     observed_past: ObservedPast = "positions"
-    """What is read of the observer's past: positions, from which distance and approach are computed, or SE(3)
-    poses as in the paper; where rotations are not known, the observer looks at the agent."""
+    """Encoding of the observer's past: positions, with distance and approach speed as features, or SE(3)
+    poses as in the paper; unknown rotations look at the agent."""
     ensemble_size: int = 3
-    """Perception and goal networks that are trained side by side and whose predictions are averaged, against
+    """Size of the ensemble of perception and goal networks, whose predictions are averaged, against
     overfitting."""
     ablated_input: AblatedInput = "nothing"
     """Ablation: an input that the model never perceives."""
@@ -136,7 +133,7 @@ class Config:
     training: BehaviorTrainingConfig = field(default_factory=BehaviorTrainingConfig)
     """Length of training, augmentation, losses."""
     homes: tuple[str, ...] = ()
-    """Further builds of the same animal, from which goals and paths are learned as well; bodies are learned
-    from this build alone, since every build has bones of its own."""
+    """Other builds of the same animal that train goals and paths as well; bodies are trained on this build
+    alone, since every build has bones of its own."""
     seed: int = 0
     """Seed of weights, batches and noise."""

@@ -24,22 +24,7 @@ from pipeline.geometry import rigid
 
 NETWORKS = ("perception", "goal", "path", "body")
 GOLDEN_OBSERVER_M = ((0.5, 0.2), (1.2, 1.2), (1.8, 1.1))
-"""first and last place of the golden plan's observer, who comes up: left, up, ahead"""
-
-
-def write_model(
-    folder: Path,
-    nets: BehaviorNets,
-    architecture: Architecture,
-    scaling: Scaling,
-    schedule: Schedule,
-    rest: Float[np.ndarray, "bone 4 4"],
-    *,
-    accompanied: bool = False,
-) -> float:
-    """Write everything a sampler needs. Return the largest difference between ONNX and torch."""
-    write_contract(folder, nets, architecture, scaling, schedule, rest, accompanied=accompanied)
-    return write_networks(folder, nets, architecture, accompanied=accompanied)
+"""first and last position of the golden plan's approaching observer: left, up, ahead"""
 
 
 def write_contract(
@@ -52,8 +37,8 @@ def write_contract(
     *,
     accompanied: bool = False,
 ) -> None:
-    """Write weights, `behavior.json` and, of the model that other samplers know, `golden.json`, in which an
-    ``accompanied`` animal has a companion.
+    """Write weights, `behavior.json` and, for diffusion models, `golden.json`, in which an ``accompanied``
+    animal has a companion.
     """
     state = {name: value.contiguous() for name, value in nets.state_dict().items()}
     save_file(state, folder / "behavior.safetensors")
@@ -68,8 +53,9 @@ def write_contract(
 def write_networks(
     folder: Path, nets: BehaviorNets, architecture: Architecture, *, accompanied: bool = False
 ) -> float:
-    """Write the four ONNX files; that of an ``accompanied`` animal perceives any number of others, that of
-    another one the observer. Return the largest difference between ONNX and torch.
+    """Write the four ONNX files; return the largest difference between ONNX and torch.
+
+    The perception of an ``accompanied`` animal takes any number of others, else the observer alone.
     """
     differences = []
     for name in NETWORKS:
@@ -77,18 +63,18 @@ def write_networks(
         path, network = folder / f"{name}.onnx", getattr(nets, name)
         export_network(network, path, inputs, output)
         differences.append(difference(network, path, inputs))
-    return float(np.max(differences))  # which NaN passes through
+    return float(np.max(differences))  # propagates NaN
 
 
 def export_network(
     module: torch.nn.Module, path: Path, inputs: dict[str, tuple[int, ...]], output: str
 ) -> None:
-    """Write one network as ONNX with a free batch dimension and, where ``inputs`` have several others, a free
+    """Write one network as ONNX with a dynamic batch axis and, if ``inputs`` have several others, a dynamic
     number of them; the same weights always give the same bytes.
     """
-    free = {name: {0: "batch"} for name in (*inputs, output)}
+    dynamic_axes = {name: {0: "batch"} for name in (*inputs, output)}
     if inputs.get("others", (1,))[0] > 1:
-        free["others"][1] = "other"
+        dynamic_axes["others"][1] = "other"
     example = tuple(torch.zeros(2, *shape) for shape in inputs.values())
     with warnings.catch_warnings(action="ignore"):
         torch.onnx.export(
@@ -98,7 +84,7 @@ def export_network(
             input_names=list(inputs),
             output_names=[output],
             dynamo=False,  # 3 s for all four networks, `torch.export` 46 s; knows no `diff`, no `mT`
-            dynamic_axes=free,
+            dynamic_axes=dynamic_axes,
         )
     onnx.checker.check_model(str(path))
 
@@ -106,8 +92,9 @@ def export_network(
 def signature(
     name: str, a: Architecture, *, accompanied: bool = False
 ) -> tuple[dict[str, tuple[int, ...]], str]:
-    """Return the inputs of a network (name and shape without batch) and the name of its output; an
-    ``accompanied`` animal has two others as an example.
+    """Return the inputs of a network (name and shape without batch) and the name of its output.
+
+    An ``accompanied`` animal has two others as an example.
     """
     step: dict[str, tuple[int, ...]] = {"t": (), "condition": (a.condition_length,)}
     match name:
@@ -123,14 +110,12 @@ def signature(
         case "path":
             return {"x": (PATH_CHANNELS, a.future)} | step | {"control": (3,), "keep": (1,)}, "epsilon"
         case _:
-            steered = {"control": (3, a.future), "keep": (1,)}
-            return {"x": (a.body_channels, a.future)} | step | steered, "epsilon"
+            controlled = {"control": (3, a.future), "keep": (1,)}
+            return {"x": (a.body_channels, a.future)} | step | controlled, "epsilon"
 
 
 def golden_observation(a: Architecture, *, accompanied: bool = False) -> Observation:
-    """Return the fixed input of the golden plan; every number follows from its index. A companion walks away
-    to the left.
-    """
+    """Return the deterministic input of the golden plan; a companion walks away to the left."""
 
     def wave(*shape: int, amplitude: float, frequency: float) -> np.ndarray:
         number = np.arange(np.prod(shape), dtype=np.float64)
@@ -148,7 +133,7 @@ def golden_observation(a: Architecture, *, accompanied: bool = False) -> Observa
 
 
 def golden_plan(sampler: Sampler, architecture: Architecture, *, accompanied: bool = False) -> dict:
-    """Sample one plan by DDIM and note its input, its noise and its result."""
+    """Sample plans by DDIM; return input, noise and results."""
     observation = golden_observation(architecture, accompanied=accompanied)
     sampling = PlanSamplingConfig(method="ddim", goal_steps=10, sequence_steps=10, max_path_draws=1)
     noise = np.random.default_rng(0)
@@ -186,8 +171,9 @@ def _plain(array: np.ndarray) -> list:
 
 
 def difference(module: torch.nn.Module, path: Path, inputs: dict[str, tuple[int, ...]]) -> float:
-    """Return how far an ONNX file is from its network on random inputs and, as the last of the batch, on an
-    animal that has stood still: a past in which every frame is alike. NaN where the file has no answer.
+    """Return the largest difference between an ONNX file and its network on random inputs.
+
+    The last of the batch is an animal at rest, with equal past frames. NaN outputs are propagated.
     """
     rng = np.random.default_rng(0)
     drawn = {name: rng.standard_normal((4, *shape), dtype=np.float32) for name, shape in inputs.items()}

@@ -1,7 +1,6 @@
-"""Windows of several homes of one animal, as one model learns them: one world each, features in own terms.
+"""Training windows of several homes of one animal, with features in the basis of its own build.
 
-Of the other homes the training windows are read. Their bones are not: each build found bones of its own, so
-that bodies are learned from the animal's own build alone.
+Every build has bones of its own, so that bodies are trained on the animal's own build alone.
 """
 
 from collections.abc import Sequence
@@ -20,12 +19,12 @@ from pipeline.environments.other_home import ReconstructedHome, perceived
 
 @dataclass(frozen=True)
 class TrainingHomes:
-    """What one model learns from: recordings and scenes of one or several homes."""
+    """Training data: recordings and scenes of one or several homes."""
 
     data: BehaviorData
     scenes: Scenes
     home: Int[np.ndarray, "video"]
-    """Number of each recording's home, 0 of the animal's own."""
+    """Index of each recording's home; 0 is the animal's own build."""
 
     @classmethod
     def of_one(cls, data: BehaviorData, scenes: Scenes) -> "TrainingHomes":
@@ -33,22 +32,19 @@ class TrainingHomes:
         return cls(data, scenes, np.zeros(len(data.videos), int))
 
     def windows(self) -> Int[np.ndarray, "window"]:
-        """Return the training windows of all homes, repeated where a home has fewer than another, so that
-        each home is drawn as often.
-        """
+        """Return the training windows of all homes, repeated so that all homes have as many."""
         index = self.data.indices(TRAIN)
         each = [index[self.home[self.data.video[index]] == number] for number in range(self.home.max() + 1)]
         most = max(len(mine) for mine in each)
         return np.concatenate([np.resize(mine, most) for mine in each if len(mine)])
 
 
-def lived(
+def with_other_homes(
     data: BehaviorData, scenes: Scenes, own: ReconstructedHome | None, others: Sequence[Path]
 ) -> TrainingHomes:
     """Add the training windows of ``others``, builds of the same animal, to those of its own build.
 
-    Raises REC-002 where their rate is another, and what `pipeline.environments.other_home` raises for homes
-    that cannot be used.
+    Raises REC-002 for another rate or past, and the errors of `pipeline.environments.other_home`.
     """
     if not others:
         return TrainingHomes.of_one(data, scenes)
@@ -56,13 +52,13 @@ def lived(
     habitats = [Habitat.of_one_home(data, scenes)]
     for build in others:
         home = perceived(own, ReconstructedHome.of_build(build))
-        habitats.append(Habitat.of_one_home(_learned(build, data), home.scenes()))
+        habitats.append(Habitat.of_one_home(_training_windows(build, data), home.scenes()))
     habitat = together(habitats)
     return TrainingHomes(habitat.data, habitat.scenes, habitat.home_of_video)
 
 
-def _learned(build: Path, own: BehaviorData) -> BehaviorData:
-    """Return the training windows of another build, with as many bones as ``own`` has, at rest."""
+def _training_windows(build: Path, own: BehaviorData) -> BehaviorData:
+    """Return the training windows of another build, with the bones of ``own`` at rest."""
     data = BehaviorData.load(build / "behavior_data")
     if (data.rate_hz, data.past) != (own.rate_hz, own.past):
         what = f"{data.past} known frames at {data.rate_hz:g} Hz, here {own.past} at {own.rate_hz:g}"

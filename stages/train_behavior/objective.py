@@ -1,4 +1,4 @@
-"""The denoising losses of goal, path and body (Eq. 8), with conditions dropped at random for guidance."""
+"""Denoising losses of goal, path and body (Eq. 8), with condition dropout for classifier-free guidance."""
 
 import contextlib
 from collections.abc import Callable
@@ -17,14 +17,14 @@ from stages.train_behavior.batches import TrainingBatch
 from stages.train_behavior.config import ObjectiveConfig, Weighting
 
 Denoise = Callable[[Tensor, Tensor], Tensor]
-"""From noisy samples and their steps to the noise"""
+"""Maps noisy samples and their steps to the predicted noise"""
 SequenceError = Callable[[Denoise, Float[Tensor, "row ..."]], Float[Tensor, "row ..."]]
 CONDITION_DROPOUT = 0.1
-"""Probability that a condition is replaced by its null, each on its own, for classifier-free guidance"""
+"""Probability of replacing a condition by its null, independently, for classifier-free guidance"""
 EARLIEST_GOAL = 0.2
-"""Earliest time that goals are trained for, as a share of the horizon"""
+"""Earliest time of training targets of goals, as a share of the horizon"""
 TrainingPhase = Literal["goals", "sequences", "all"]
-"""What learns: perception and goals; path and body, of a perception that rests; or all at once"""
+"""Trained networks: perception and goals; path and body, with frozen perception; or all"""
 
 
 def losses(
@@ -36,10 +36,7 @@ def losses(
     *,
     phase: TrainingPhase = "all",
 ) -> dict[str, Float[Tensor, ""]]:
-    """Return the weighted mean squared error of the predicted noise, per network.
-
-    Only what learns has an error.
-    """
+    """Return the weighted mean squared error of the predicted noise of each network trained in ``phase``."""
 
     def goal(code: Tensor) -> Tensor:
         return goal_error(nets, batch, code, schedule, objective, generator)
@@ -61,8 +58,9 @@ def level_losses(
     path_error: SequenceError,
     body_error: SequenceError,
 ) -> dict[str, Float[Tensor, ""]]:
-    """Return the mean error of goal, path and body, each given the level above it; ``goal`` takes the
-    perception code. Without a share of the windows a body learns nothing.
+    """Return the mean error of goal, path and body, each conditioned on the level above it.
+
+    ``goal`` takes the perception code. Bodies have no loss if their share of the batch is 0.
     """
     joint = joint_mask(batch, objective, generator)
     with torch.no_grad() if phase == "sequences" else contextlib.nullcontext():
@@ -71,15 +69,15 @@ def level_losses(
     if phase == "goals":
         return goal_loss
     path_rows, body_rows, known = sequence_rows(batch, objective)
-    steered = keep_mask(len(code), 1, generator).to(code.device) * joint
+    control_keep = keep_mask(len(code), 1, generator).to(code.device) * joint
     towards, along = batch.goal[path_rows], batch.places[body_rows]
     path = path_error(
-        lambda x, t: nets.path(x, t, code[path_rows], towards, steered[path_rows]), batch.path[path_rows]
+        lambda x, t: nets.path(x, t, code[path_rows], towards, control_keep[path_rows]), batch.path[path_rows]
     )
     if not len(body_rows):
         return goal_loss | {"path": path.mean()}
     body = body_error(
-        lambda x, t: nets.body(x, t, code[body_rows], along, steered[body_rows]), batch.body[body_rows]
+        lambda x, t: nets.body(x, t, code[body_rows], along, control_keep[body_rows]), batch.body[body_rows]
     )
     return goal_loss | {"path": path.mean(), "body": mean_of_known(body, known)}
 
@@ -87,11 +85,10 @@ def level_losses(
 def sequence_rows(
     batch: TrainingBatch, objective: ObjectiveConfig
 ) -> tuple[Int[Tensor, "path"], Int[Tensor, "body"], Bool[Tensor, "body"]]:
-    """Return the windows from which paths learn, those from which bodies learn, and which of the latter have
-    true bones.
+    """Return the rows that train paths, those that train bodies, and which of the latter have known bones.
 
-    Both are always as many in every step, for kernels are made anew for every size. Windows whose bones are
-    unknown (mirrored, of other homes) come last among the bodies.
+    Their numbers are the same in every step, since each size compiles new kernels. Rows with unknown bones
+    (mirrored, of other homes) are chosen last.
     """
     shares = objective.path_share, objective.body_share
     paths, bodies = (max(round(len(batch.goal) * share), 1) for share in shares)
@@ -101,7 +98,7 @@ def sequence_rows(
 
 
 def mean_of_known(error: Float[Tensor, "row channel frame"], known: Bool[Tensor, "row"]) -> Float[Tensor, ""]:
-    """Return the mean over known rows of all processes; root and bones count for a half each."""
+    """Return the mean over known rows of all processes; root and bones have equal weight."""
     each = (error[:, :ROOT_CHANNELS].mean((1, 2)) + error[:, ROOT_CHANNELS:].mean((1, 2))) / 2
     return (each * known).sum() / distributed.mean(known.sum().float()).clamp_min(1 / distributed.size())
 
@@ -115,7 +112,7 @@ def perceive(
 ) -> Float[Tensor, "batch condition"]:
     """Encode a batch, dropping scene, others and past independently, and all where ``joint`` is 0.
 
-    What is dropped is so for every member alike.
+    All members of the ensemble drop the same conditions.
     """
     keep = keep_mask(len(batch.goal), 3, generator).to(batch.goal.device) * joint
     keep[:, 1] = torch.maximum(keep[:, 1], batch.oversampled.float())
@@ -134,9 +131,9 @@ def with_some_absent(
     oversampled: Bool[Tensor, "batch"],
     generator: torch.Generator,
 ) -> Float[Tensor, "batch other past_frame 10"]:
-    """Return the others with each of several left out at times, so that each can be guided on its own."""
+    """Drop each of several others independently, so that guidance can act on each."""
     size, count = others.shape[:2]
-    if count == 1:  # who is left out with the condition as a whole
+    if count == 1:  # dropped with the condition as a whole
         return others
     present = keep_mask(size, count, generator).to(others.device)
     present[:, 0] = torch.maximum(present[:, 0], oversampled.float())
@@ -153,7 +150,7 @@ def goal_error(
     objective: ObjectiveConfig,
     generator: torch.Generator,
 ) -> Float[Tensor, "draw 3"]:
-    """Return the error of the goals, mean over members; some of the draws ask for earlier times."""
+    """Return the error of goals, mean over members; some draws have targets at earlier times."""
     draws, frames = objective.goal_draws, batch.track.shape[-1]
     count = len(code) * draws
     earlier = torch.rand(count, generator=generator) < objective.earlier_share
@@ -169,14 +166,14 @@ def goal_error(
 
 
 def keep_mask(size: int, count: int, generator: torch.Generator) -> Float[Tensor, "batch count"]:
-    """Draw 1 with probability ``1 - drop``, else 0."""
+    """Draw 0 with probability `CONDITION_DROPOUT`, else 1."""
     return (torch.rand(size, count, generator=generator) >= CONDITION_DROPOUT).float()
 
 
 def joint_mask(
     batch: TrainingBatch, objective: ObjectiveConfig, generator: torch.Generator
 ) -> Float[Tensor, "batch 1"]:
-    """Draw 0 where all conditions are dropped together, else 1; draws nothing where none are."""
+    """Draw 0 where all conditions are dropped together, else 1; no random draws if that never happens."""
     size, device = len(batch.goal), batch.goal.device
     if objective.joint_dropout == 0:
         return torch.ones(size, 1, device=device)
@@ -191,18 +188,17 @@ def squared_error(
     generator: torch.Generator,
     motion_weight: float | Float[Tensor, "channel 1"] = 0.0,
 ) -> Float[Tensor, "batch ..."]:
-    """Noise ``clean`` to a random step and compare the noise, the velocity or noise less clean sample with
-    its prediction.
+    """Return the squared error at a random step of the predicted noise, velocity, or flow (noise - clean).
 
-    All three are the error of the noise, for the noisy sample is given, by a factor of the step. Beside the
-    error of a sequence counts its change from frame to frame, by ``motion_weight``; errors that do not depend
-    on the frame's neighbours have the same mean with any weight.
+    Given the noisy sample, these differ only by a factor of the step. ``motion_weight`` weights the squared
+    frame-to-frame change of the error of a sequence; if errors of frames are independent, the mean does not
+    depend on it.
     """
     t = torch.randint(schedule.steps, (len(clean),), generator=generator)
     alpha_bar = torch.from_numpy(schedule.alpha_bar).float()
-    share = alpha_bar[t].reshape(-1, *[1] * (clean.ndim - 1)).to(clean.device)
+    alpha_bar_t = alpha_bar[t].reshape(-1, *[1] * (clean.ndim - 1)).to(clean.device)
     noise = torch.randn(clean.shape, generator=generator).to(clean.device)
-    residual = denoise(noised(clean, noise, share), t.float().to(clean.device)) - noise
+    residual = denoise(noised(clean, noise, alpha_bar_t), t.float().to(clean.device)) - noise
     error = residual**2
     if clean.ndim > 2:
         change = nn.functional.pad(residual.diff(dim=-1), (1, 0)) ** 2
@@ -211,8 +207,8 @@ def squared_error(
         case "noise":
             return error
         case "velocity":
-            return error / share
+            return error / alpha_bar_t
         case "flow":
-            return error * (1 + ((1 - share) / share).sqrt()) ** 2
+            return error * (1 + ((1 - alpha_bar_t) / alpha_bar_t).sqrt()) ** 2
         case _:
             assert_never(weighting)

@@ -1,4 +1,4 @@
-"""What comes of a training: the model's files and, for the simulator, its networks and pictures."""
+"""Outputs of training: the model's files and, for the simulator, ONNX networks and pictures."""
 
 from pathlib import Path
 
@@ -19,11 +19,11 @@ from stages.train_behavior.config import Config
 from stages.train_behavior.training import TrainedBehavior
 
 SCENE_CHANNELS: dict[SceneEncoder, int] = {"pillars": 32, "volume": 128, "none": 0}
-"""Width of the scene encoder: enough for minutes of video; the paper's (appendix A.2)."""
+"""Width of the scene encoder: 32 suffices for minutes of video, 128 is the paper's (appendix A.2)."""
 
 
 def architecture_for(config: Config, data: BehaviorData, scenes: Scenes) -> Architecture:
-    """Return the networks' shape: what the configuration sets, and what the data decides."""
+    """Return the architecture given configuration and data."""
     return Architecture(
         bones=len(data.agent_from_bone_rest),
         ego=config.ego,
@@ -72,7 +72,7 @@ def write_exported(
     *,
     seed: int,
 ) -> None:
-    """Write the networks for other samplers, and how the model looks."""
+    """Write the ONNX networks, checks and pictures."""
     sampler = sampler_of(architecture, TorchNetworks(fitted.nets), schedule, fitted.scaling)
     difference = export.write_networks(folder, fitted.nets, architecture, accompanied=data.accompanied)
     moments = reactions.moments(data, scenes, architecture)

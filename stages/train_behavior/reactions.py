@@ -1,7 +1,7 @@
-"""Does the animal react to the observer? The same noise under observers that come close, are far, or absent.
+"""Reaction to the observer: shifts of sampled goals under approaching, far and absent observers.
 
-The observer walks up to the animal from one side, from the other side, stands beyond the radius of
-perception, and is dropped; everything else, scene, past and noise, is the same.
+The observer approaches from each side, stands beyond the radius of perception, or is dropped; scene, past and
+noise are the same.
 """
 
 from dataclasses import dataclass, replace
@@ -19,9 +19,9 @@ from pipeline.geometry import rigid, subsampling
 
 SAMPLES = 16
 CLOSE_M, WALK_M_S = 0.8, 1.0
-"""How near an observer is who comes close, and its speed."""
+"""Distance and speed of an approaching observer."""
 SIDES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
-"""where the observer comes from, ego frame: ahead, its left, behind, its right"""
+"""directions of approach, ego frame: ahead, left, behind, right"""
 
 
 @dataclass(frozen=True)
@@ -42,18 +42,18 @@ class Reactions:
 
 @dataclass(frozen=True)
 class SampledMoments:
-    """Some training windows, evenly spread, at which the model is looked at."""
+    """Some training windows, evenly spread, on which the model is evaluated."""
 
     observation: Observation
     world_from_ego: Float[np.ndarray, "window 4 4"]
     scene: Int[np.ndarray, "window"]
-    """number of each window's feature volume"""
+    """index of each window's feature volume"""
 
 
 def moments(
     data: BehaviorData, scenes: Scenes, architecture: Architecture, count: int = 24
 ) -> SampledMoments:
-    """Choose training windows and encode what the animal perceives in them."""
+    """Choose training windows and encode their observations."""
     train = data.indices(TRAIN)
     context, _ = data.windows(train[subsampling.evenly(len(train), count)])
     observation = observe(context, scenes, data.agent_from_bone_rest, architecture.ego)
@@ -70,15 +70,15 @@ def approach(
     frames: int = PAST,
     rate_hz: float = RATE_HZ,
 ) -> Float[np.ndarray, "1 past_frame 10"]:
-    """Return an observer's past, ego frame: it walks up from ``side`` and looks at the animal."""
+    """Return the past of an observer who approaches from ``side`` and looks at the animal; ego frame."""
     before_s = np.arange(frames - 1, -1, -1)[:, None] / rate_hz
     eye = (distance_m + speed_m_s * before_s) * side + UP
     return other_channels(rigid.look_at(eye, np.zeros(3), UP)[None])[0]
 
 
 def measure(sampler: Sampler, observation: Observation, *, radius_m: float, seed: int) -> Reactions:
-    """Sample goals of some windows under scripted observers, always with the same noise."""
-    sampling = PlanSamplingConfig(guidance=1.0, avoid_solid=False)  # what was learned, not amplified
+    """Sample goals of some windows under scripted observers with the same noise."""
+    sampling = PlanSamplingConfig(guidance=1.0, avoid_solid=False)  # as learned, not amplified
     how = {"frames": observation.others.shape[2], "rate_hz": sampler.scaling.rate_hz}
 
     def mean_goals(

@@ -1,4 +1,4 @@
-"""Refuse at once what training would find out too late."""
+"""Validation of settings and data before training."""
 
 from pipeline.behavior.model import Architecture
 from pipeline.behavior.trajectories import RATE_HZ, TRAIN, BehaviorData
@@ -11,9 +11,9 @@ def check_settings(config: Config, data: BehaviorData, architecture: Architectur
 
     Args:
         config: the stage's settings.
-        data: what would be learned, with the horizon of the settings.
-        architecture: of what would learn.
-        where: the data stand, for messages.
+        data: the training data, with the horizon of the settings.
+        architecture: of the model.
+        where: path of the data, for messages.
     """
     optimization, staged = config.training.optimization, architecture.family != "one_stage"
     goal_steps, steps, table = optimization.goal_steps, optimization.steps, "[train_behavior]"

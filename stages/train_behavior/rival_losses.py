@@ -1,4 +1,4 @@
-"""What the rival models of Table 4 minimise, on the same batches and with the same dropping of conditions."""
+"""Losses of the baselines of Table 4, on the same batches and with the same condition dropout."""
 
 import math
 
@@ -32,7 +32,7 @@ def gaussian_losses(
     *,
     phase: TrainingPhase = "all",
 ) -> dict[str, Float[Tensor, ""]]:
-    """Return the negative log-likelihood per number of goal, path and body, each given the level above it."""
+    """Return the negative log-likelihood per channel of goal, path and body, each given the level above."""
     del schedule
 
     def goal(code: Tensor) -> Tensor:
@@ -45,7 +45,7 @@ def gaussian_losses(
 def negative_log_likelihood(
     predict: Denoise, clean: Float[Tensor, "batch ..."]
 ) -> Float[Tensor, "batch ..."]:
-    """Return -log N(clean; mean, std) of mean and log std that ``predict`` returns at two steps."""
+    """Return -log N(clean; mean, std); ``predict`` returns mean and log std at two steps."""
     nothing = torch.zeros_like(clean)
     mean, log_std = (
         predict(nothing, torch.full((len(clean),), step, device=clean.device))
@@ -64,7 +64,7 @@ def one_stage_losses(
     *,
     phase: TrainingPhase = "all",
 ) -> dict[str, Float[Tensor, ""]]:
-    """Return the denoising errors of path and body as one sequence without control."""
+    """Return the denoising losses of path and body as one sequence without control."""
     assert phase == "all", "a model of one stage has no goals that could learn before"
     code = perceive(nets, batch, objective, generator, joint_mask(batch, objective, generator))
     known = batch.bones_known

@@ -1,4 +1,4 @@
-"""What the scene encoder sees of training windows, sampled from smoothed volumes."""
+"""Inputs of the scene encoder in training, sampled from smoothed volumes."""
 
 import numpy as np
 import torch
@@ -12,10 +12,10 @@ from pipeline.geometry import rigid_torch
 
 
 class SceneSampler:
-    """Samples the ego grid at the resolution that the scene encoder works on, fast enough for every step.
+    """Samples the ego grid at the resolution of the scene encoder, fast enough for every step.
 
-    The encoder averages blocks of cells; here the volume is smoothed once as that averaging would, and read
-    at the blocks' centres.
+    The encoder averages blocks of cells. Here the volume is smoothed once by the same kernel, and sampled at
+    the centres of the blocks.
     """
 
     def __init__(self, scenes: Scenes, stride: int, device: str):
@@ -37,7 +37,7 @@ class SceneSampler:
         side: Float[Tensor, "batch"],
         scene: Int[Tensor, "batch"],
     ) -> Float[Tensor, "batch channel x y z"]:
-        """Sample the grid in the volumes ``scene``; ``side`` is -1 where left and right are exchanged."""
+        """Sample the grid in the volumes ``scene``; ``side`` is -1 for mirrored samples."""
         one = side.new_ones(len(side))
         points = self.points.flatten(0, 2) * torch.stack([side, one, one], dim=-1)[:, None]
         away = rigid_torch.apply(world_from_ego, points) - self.origin[scene][:, None]
@@ -50,7 +50,7 @@ class SceneSampler:
 
 
 def _smoothed(volume: FeatureVolume, stride: int) -> Float[np.ndarray, "x y z channel"]:
-    """Return features as averaging the nearest voxels of blocks of cells would leave them, or as they are."""
+    """Smooth features like the average of the nearest voxels over blocks of ``stride`` cells."""
     features = volume.features.astype(np.float32)
     kernel = np.convolve(np.ones(stride), [0.5, 0.5]) / stride if stride > 1 else np.array([1.0])
     for axis in (1, 2, 3):

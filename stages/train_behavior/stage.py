@@ -13,7 +13,7 @@ from pipeline.core.errors import InputError
 from pipeline.environments.other_home import ReconstructedHome
 from stages.train_behavior import outcome
 from stages.train_behavior.config import Config
-from stages.train_behavior.homes import lived
+from stages.train_behavior.homes import with_other_homes
 from stages.train_behavior.refusals import check_settings
 from stages.train_behavior.training import train
 
@@ -25,9 +25,9 @@ class Inputs:
     behavior_data: Path
     """Trajectories, windows and scenes."""
     feature_basis: Path | None = None
-    """Of its own build, with ``homes``: what the features of the others are expressed in."""
+    """Feature basis of its own build, if there are ``homes``; features of the others are converted to it."""
     scene_template: Path | None = None
-    """The same: its scale and floor."""
+    """Scale and floor of its own build, if there are ``homes``."""
     homes: Mapping[str, Path] | None = None
     """Folders of further builds of the same animal."""
 
@@ -35,7 +35,7 @@ class Inputs:
 def run(
     inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "cpu", resume: Path | None = None
 ) -> None:
-    """Train, export and judge the model; of several processes the first writes.
+    """Train, export and evaluate the model; of several processes, the first one writes.
 
     Raises BEH-001, BEH-003, REC-002, ART-007, ART-010, SIM-011.
     """
@@ -48,8 +48,10 @@ def run(
     weighting = config.training.objective.weighting
     schedule = Schedule(course="rectified" if weighting == "flow" else "linear")
     check_settings(config, data, architecture, str(inputs.behavior_data))
-    homes = lived(data, scenes, *_homes(inputs, config))
-    progress.log(f"{len(homes.data.indices(TRAIN))} training windows; {len(data.start)} windows of its own")
+    homes = with_other_homes(data, scenes, *_homes(inputs, config))
+    progress.log(
+        f"{len(homes.data.indices(TRAIN))} training windows; {len(data.start)} windows of its own build"
+    )
     fitted = train(
         homes, architecture, schedule, config.training, seed=config.seed, resume=resume, device=device
     )
@@ -63,7 +65,7 @@ def run(
 
 
 def _homes(inputs: Inputs, config: Config) -> tuple[ReconstructedHome | None, list[Path]]:
-    """Return the animal's own home, to compare with, and the folders of the others."""
+    """Return the animal's own home and the folders of the others."""
     if not config.homes:
         return None, []
     if inputs.feature_basis is None or inputs.scene_template is None or inputs.homes is None:

@@ -1,4 +1,4 @@
-"""Training of perception and the three denoisers together, with an average of the weights kept beside."""
+"""Training of perception and the three denoisers, with an exponential moving average of the weights."""
 
 import copy
 import math
@@ -28,17 +28,17 @@ from stages.train_behavior.rival_losses import gaussian_losses, one_stage_losses
 from stages.train_behavior.scene_sampler import SceneSampler
 
 WEIGHT_DECAY = 0.05
-"""Of AdamW; minutes of video overfit with the usual 0.01."""
+"""Weight decay of AdamW; the usual 0.01 overfits minutes of video."""
 CHECKPOINTS = 20
-"""Written over a training: a killed run repeats a twentieth at most."""
+"""Number of checkpoints of a training; a killed run repeats at most a twentieth."""
 CLIP_NORM = 1.0
-"""Largest norm of the gradient; single windows with jumps exceed it."""
+"""Gradient norm that is clipped to; single windows with jumps exceed it."""
 AVERAGE_WARMUP_STEPS = 10
-"""Steps over which the moving average of the weights begins to forget their initialisation."""
+"""Warm-up of the moving average, so that it forgets the initial weights."""
 MANTISSA_STEPS = 2.0**12
-"""Steps of a weight's mantissa that are kept, 12 significant bits."""
+"""Quantization of mantissas of weights: 12 significant bits."""
 WARMUP_SHARE, FINAL_RATE_SHARE = 0.02, 0.02
-"""Share of a phase over which the learning rate rises, and the share of its peak at which it ends."""
+"""Share of a phase with rising learning rate, and final learning rate relative to its peak."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class TrainedBehavior:
     """A trained model."""
 
     nets: BehaviorNets
-    """the average of the weights"""
+    """networks with averaged weights"""
     scaling: Scaling
     record: FitRecord
 
@@ -65,15 +65,15 @@ def train(
 
     Several processes (`pipeline.core.distributed`) share each step's batch; all hold the same networks.
     """
-    of_family = {"diffusion": losses, "gaussian": gaussian_losses, "one_stage": one_stage_losses}
-    minimised = of_family[architecture.family]
+    losses_of = {"diffusion": losses, "gaussian": gaussian_losses, "one_stage": one_stage_losses}
+    family_losses = losses_of[architecture.family]
     windows = windows_from_data(homes, architecture)
     statistics = statistics_from_windows(windows, largest_turn_rad(settings.augmentation))
     nets = initial_nets(architecture, schedule, statistics, seed).to(device)
     average = copy.deepcopy(nets).requires_grad_(False)
     scene = SceneSampler(homes.scenes, architecture.scene_stride, device)
-    optimization, drawn = settings.optimization, settings.augmentation
-    of_paths = replace(drawn, approached=drawn.approached_paths)
+    optimization, augmentation = settings.optimization, settings.augmentation
+    of_paths = replace(augmentation, approached=augmentation.approached_paths)
     goal_steps = 0 if architecture.family == "one_stage" else optimization.goal_steps
     accelerate(nets, optimization, device)
     optimizer = torch.optim.AdamW(
@@ -85,10 +85,10 @@ def train(
             torch.compiler.cudagraph_mark_step_begin()
         phase: TrainingPhase = "all" if goal_steps == 0 else "goals" if step < goal_steps else "sequences"
         size = optimization.goal_batch if phase == "goals" else optimization.batch
-        how = of_paths if phase == "sequences" else drawn
+        augmented = of_paths if phase == "sequences" else augmentation
         size = distributed.share(size)
-        batch = draw_batch(windows, scene, statistics, how, size, generator, bodies=phase != "goals")
-        return minimised(nets, batch, schedule, settings.objective, generator, phase=phase)
+        batch = draw_batch(windows, scene, statistics, augmented, size, generator, bodies=phase != "goals")
+        return family_losses(nets, batch, schedule, settings.objective, generator, phase=phase)
 
     record = fit(
         modules={"nets": nets, "average": average},
@@ -108,7 +108,7 @@ def train(
 
 
 def _average(average: BehaviorNets, nets: BehaviorNets, step: int, goal_steps: int, max_decay: float) -> None:
-    """Move the average towards the weights; when the goals' phase ends, its nets take over the average."""
+    """Update the moving average; after the goal phase, load it into perception and goal networks."""
     begun = step - goal_steps if step >= goal_steps else step
     decay = min(max_decay, (begun + 1) / (begun + AVERAGE_WARMUP_STEPS))
     with torch.no_grad():
@@ -120,7 +120,7 @@ def _average(average: BehaviorNets, nets: BehaviorNets, step: int, goal_steps: i
 
 
 def accelerate(nets: BehaviorNets, optimization: BehaviorOptimizerConfig, device: str) -> None:
-    """Let path and body compute in the precision asked for, compiled if asked for; weights stay float32."""
+    """Set precision and compilation of path and body as configured; weights stay float32."""
     kind = torch.device(device).type
     for net in (nets.path, nets.body):
         if optimization.precision == "bfloat16":
@@ -130,7 +130,7 @@ def accelerate(nets: BehaviorNets, optimization: BehaviorOptimizerConfig, device
 
 
 def rounded(nets: BehaviorNets) -> BehaviorNets:
-    """Round weights to 12 significant bits, which halves what a page sends of them."""
+    """Round weights to 12 significant bits, which halves their compressed size for the page."""
     with torch.no_grad():
         for weight in nets.parameters():
             mantissa, exponent = torch.frexp(weight)
@@ -141,7 +141,7 @@ def rounded(nets: BehaviorNets) -> BehaviorNets:
 def initial_nets(
     architecture: Architecture, schedule: Schedule, statistics: WindowStatistics, seed: int
 ) -> BehaviorNets:
-    """Return freshly initialised networks that know the statistics of the past."""
+    """Return initialised networks with the statistics of the data in their buffers."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         nets = BehaviorNets(architecture, schedule)

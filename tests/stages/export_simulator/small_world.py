@@ -27,7 +27,7 @@ from stages.export_simulator import stage
 from stages.export_simulator.config import Config
 from stages.export_simulator.home import stage as home_stage
 from stages.export_simulator.home.config import Config as HomeConfig
-from stages.train_behavior.export import write_model
+from stages.train_behavior.export import write_contract, write_networks
 
 BONES = 5
 HALF_ROOM_M = 2.0
@@ -239,7 +239,8 @@ def write(build: Path, *, accompanied: bool = False) -> None:
     )
     nets, scaling = networks_that_flee(architecture)
     shape = (architecture, scaling, Schedule(), rest())
-    write_model(build / "behavior", nets, *shape, accompanied=accompanied)
+    write_contract(build / "behavior", nets, *shape, accompanied=accompanied)
+    write_networks(build / "behavior", nets, architecture, accompanied=accompanied)
     assert json.loads((build / "behavior/behavior.json").read_bytes())["rate_hz"] == 10
 
 

@@ -113,7 +113,7 @@ def test_flight_is_counted_as_the_animal_does_it():
     met = RecordedApproaches(
         poses, np.tile(REST.astype(np.float32), (2, 3, 8, 1, 1, 1)), observer, Scenes.of(room())
     )
-    found = approaches.shares(untrained(ARCHITECTURE), met, 2, 0)
+    found = approaches.flight_shares(untrained(ARCHITECTURE), met, 2, 0)
     assert found["flees/true"].tolist() == [1, 1, 1]
     assert found["flees/true_standing"].tolist() == [0, 0, 0]
     assert found["flees/seen"].shape == (3,)

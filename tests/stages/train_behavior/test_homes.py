@@ -17,7 +17,7 @@ from stages.train_behavior.batches import (
     windows_from_data,
 )
 from stages.train_behavior.config import AugmentationConfig, BehaviorTrainingConfig, Config, ObjectiveConfig
-from stages.train_behavior.homes import TrainingHomes, lived
+from stages.train_behavior.homes import TrainingHomes, with_other_homes
 from stages.train_behavior.objective import sequence_rows
 from stages.train_behavior.scene_sampler import SceneSampler
 from stages.train_behavior.stage import Inputs, run
@@ -46,7 +46,7 @@ def learned(builds):
     own, other = builds
     data = wandering()
     scenes = Scenes.load(own / "behavior_data", data.videos)
-    return lived(data, scenes, ReconstructedHome.of_build(own), [other])
+    return with_other_homes(data, scenes, ReconstructedHome.of_build(own), [other])
 
 
 def test_training_windows_of_both_homes_and_test_windows_of_its_own(learned):
@@ -95,7 +95,7 @@ def test_a_build_with_other_windows_is_refused(builds, tmp_path):
     data = wandering()
     scenes = Scenes.load(own / "behavior_data", data.videos)
     with pytest.raises(InputError, match="REC-002"):
-        lived(data, scenes, ReconstructedHome.of_build(own), [slow])
+        with_other_homes(data, scenes, ReconstructedHome.of_build(own), [slow])
 
 
 def test_homes_of_tables_are_refused(builds, tmp_path):
