@@ -84,7 +84,7 @@ class AnimalBatch:
     ) -> None:
         """Start from these windows, one animal per window.
 
-        Animals of the same ``life`` share a scene; without it each is alone. ``companions`` are others from
+        Animals of the same ``life`` perceive each other; without it each is alone. ``companions`` are from
         outside of the batch, as in a `Context`.
         """
         bones = channels_from_bones(context.agent_from_bone, self.rest)
