@@ -1,4 +1,4 @@
-"""Settings of long-term motion: sizes of its networks, length of their training, length of the optimisation.
+"""Settings of long-term motion: network sizes, training, and motion optimisation.
 
 Standard library only, so that a stage's configuration can be read without torch.
 """
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class LongTermSizes:
-    """Everything that fixes the shape of the networks; stored in `longterm.json`."""
+    """Sizes that determine the networks' shapes; stored in `longterm.json`."""
 
     pose: int = 32
     """length of the pose code p, as of the body prior of SMPL-X"""
@@ -35,7 +35,7 @@ class LongTermOptimizerConfig:
     batch: int = 48
     """examples a step"""
     rate: float = 2e-3
-    """peak learning rate; falls along a cosine (the paper: 1e-3, and five to twenty times the steps)"""
+    """peak learning rate of a cosine schedule (the paper: 1e-3, with five to twenty times the steps)"""
 
 
 @dataclass(frozen=True)
@@ -45,4 +45,4 @@ class MotionOptimizationConfig:
     steps: int = 200
     """steps of Adam"""
     vertices: int = 300
-    """vertices of the surface that collision and smoothness look at"""
+    """surface vertices sampled for the collision and smoothness terms"""

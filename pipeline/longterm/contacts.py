@@ -1,9 +1,7 @@
-"""What touches the scene, found from the data: contact vertices, the feet they form, and when each foot
-stands.
+"""Contact of a body with the scene, found from data: contact vertices, feet, and stance phases of each foot.
 
-`find_contact_vertices` needs no list made by hand: a vertex counts that is among the closest to the scene in
-a fair share of the frames. `detect_stance` then finds, for any motion, in which frames each foot carries
-weight.
+`find_contact_vertices` takes the vertices that are among the closest to the scene in many frames; nothing is
+labelled by hand. `detect_stance` finds the frames in which each foot is in stance, for any motion.
 """
 
 from collections.abc import Iterator
@@ -24,49 +22,49 @@ from pipeline.longterm.bodies import PosedSurface, SkinnedBody
 from pipeline.longterm.short_motions import RATE_HZ, BodyMotion
 
 TOUCH_M = 0.01
-"""A vertex this close to the frame's closest ones touches too."""
+"""A vertex within this distance of the frame's closest ones is in contact too."""
 CONTACT_FRAME_SHARE = 0.15
-"""A vertex that touches in this share of the frames is a contact vertex."""
+"""A vertex in contact in this share of the frames is a contact vertex."""
 FOOT_M = 0.035
 """Contact vertices closer than this at rest belong to the same foot."""
 SWING_M_S2 = 15.0
-"""Acceleration that a swinging foot may need: a step of 10 cm takes 0.2 s."""
+"""Maximum acceleration of a swinging foot: a step of 10 cm takes 0.2 s."""
 STRIDE_M = 0.25
-"""A foot that glides further than this in one phase should stand more than once."""
+"""A stance phase in which the foot slides further than this is split."""
 GROUND_PERCENTILE, GROUND_ERROR_M = 20, 0.02
-"""a foot's lowest heights are its ground; the reconstruction's floor is right within so much"""
+"""percentile of a foot's heights taken as its ground; error of the reconstructed floor"""
 STANCE_SPEED, STANCE_SPEED_M_S = 0.4, 0.08
-"""a foot slower than this, as a share of the body's speed or in meters per second, stands"""
+"""a foot slower than this share of the body's speed, or than this speed, is in stance"""
 SLOWEST_FOOT, SLOWEST_FOOT_LIFTED = 0.8, 0.6
-"""so does the slowest foot, below these shares: where feet should stand, and where they may not"""
+"""so is the slowest foot below this share of the body's speed: where feet should stand, and otherwise"""
 LIFTED_M = 0.03
 """A foot higher than this above its ground is lifted."""
 SHORTEST_PHASE_FRAMES = 3
-"""Frames that a phase has at least."""
+"""Minimum length of a stance phase."""
 
 
 @dataclass(frozen=True)
 class ContactVertices:
-    """Where a body touches the world."""
+    """The contact vertices of a body, grouped into feet."""
 
     vertices: Int[np.ndarray, "vertex"]
-    """contact vertices, indices into the body's surface"""
+    """indices into the body's surface"""
     foot: Int[np.ndarray, "vertex"]
-    """foot that each contact vertex belongs to"""
+    """index of the foot that each contact vertex belongs to"""
 
     @property
     def feet(self) -> int:
-        """How many feet there are."""
+        """Number of feet."""
         return int(self.foot.max()) + 1 if len(self.foot) else 0
 
     def centres(self, vertices_world: Float[Tensor, "frame vertex 3"]) -> Float[Tensor, "frame foot 3"]:
-        """Return the mean of each foot's vertices, given the contact vertices."""
+        """Return the centroid of each foot from the positions of the contact vertices."""
         share = vertices_world.new_zeros(self.feet, len(self.foot))
         share[torch.from_numpy(self.foot), torch.arange(len(self.foot))] = 1
         return (share / share.sum(1, keepdim=True)) @ vertices_world
 
     def lowest(self, distance_m: Float[Tensor, "frame vertex"]) -> Float[Tensor, "frame foot"]:
-        """Return how far each foot is from the scene, given the contact vertices' distances."""
+        """Return the signed distance of each foot to the scene from those of the contact vertices."""
         of_foot = (distance_m[:, np.flatnonzero(self.foot == foot)] for foot in range(self.feet))
         return torch.stack([distance.min(1).values for distance in of_foot], dim=1)
 
@@ -74,10 +72,10 @@ class ContactVertices:
 def find_contact_vertices(
     body: SkinnedBody, motions: list[BodyMotion], scenes: list[SignedDistance], *, max_frames: int = 400
 ) -> ContactVertices:
-    """Find the contact vertices of a body from motions, each in its scene, and group them to feet.
+    """Find the contact vertices of a body from motions, each in its scene, and group them into feet.
 
-    In each frame those vertices touch that are within 1 cm of the lowest percentile of the distances, so that
-    a root that hovers or sinks a little does not matter.
+    Vertices within 1 cm of the frame's first percentile of distances are in contact, so that a root slightly
+    too high or low does not matter.
     """
     surface = PosedSurface(body)
     every = max(1, sum(map(len, motions)) // max_frames)
@@ -95,10 +93,10 @@ def find_contact_vertices(
 def _feet(
     points: Float[np.ndarray, "vertex 3"], weights: Float[np.ndarray, "vertex bone"]
 ) -> Int[np.ndarray, "vertex"]:
-    """Group close vertices of the same bone, and those that nearly touch; largest group first."""
+    """Cluster near vertices of the same bone, and nearly coincident ones of any; largest cluster first."""
     pairs = KDTree(points).query_pairs(FOOT_M, output_type="ndarray")
-    bone, apart = weights.argmax(1), np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
-    pairs = pairs[(bone[pairs[:, 0]] == bone[pairs[:, 1]]) | (apart < FOOT_M / 3)]
+    bone, distance = weights.argmax(1), np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+    pairs = pairs[(bone[pairs[:, 0]] == bone[pairs[:, 1]]) | (distance < FOOT_M / 3)]
     graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(points),) * 2)
     _, label = connected_components(graph, directed=False)
     order = np.argsort(-np.bincount(label), kind="stable")
@@ -112,41 +110,38 @@ def detect_stance(
     *,
     should_stand: bool = False,
 ) -> Bool[np.ndarray, "frame foot"]:
-    """Return when each foot stands: near the scene, and hardly moving, or moving least of all feet and less
-    than the body.
+    """Return the stance of each foot: near the ground, and nearly still or the slowest foot.
 
-    ``height_m`` is the foot's distance from the scene. The paper lets the foot that moves less between two
-    frames stand; an animal has more than two, so others stand too that are clearly slower than the body.
-    Blinks under 0.1 s do not count. ``should_stand`` returns instead which feet should stand, in motion that
-    glides: of those near the scene the one that moves least, however fast, as in the paper, and any that
-    falls behind the body.
+    ``height_m`` is the foot's signed distance to the scene. The paper puts the slower of two feet in stance;
+    an animal has more, so any foot clearly slower than the body is in stance too. Phases and gaps under 0.1 s
+    are removed. With ``should_stand``, return which feet should stand in motion with foot skate: the slowest
+    near the ground, at any speed, as in the paper, and any that is slower than the body.
     """
     foot, body = _speed(centres_world), _speed(root_world[:, None])
-    even = ndimage.uniform_filter1d(foot, round(RATE_HZ / 6), axis=0, mode="nearest")
+    smoothed = ndimage.uniform_filter1d(foot, round(RATE_HZ / 6), axis=0, mode="nearest")
     ground = np.percentile(height_m, GROUND_PERCENTILE, axis=0, keepdims=True)
     low = height_m < ground.clip(-GROUND_ERROR_M, GROUND_ERROR_M) + LIFTED_M
-    least = np.where(low, even, np.inf)
-    least = least == least.min(axis=1, keepdims=True)
+    slowest = np.where(low, smoothed, np.inf)
+    slowest = slowest == slowest.min(axis=1, keepdims=True)
     slow = foot < np.maximum(STANCE_SPEED * body, STANCE_SPEED_M_S)
     if should_stand:
-        slow |= least | (even < SLOWEST_FOOT * body)
+        slow |= slowest | (smoothed < SLOWEST_FOOT * body)
     else:
-        slow |= least & (even < SLOWEST_FOOT_LIFTED * body)
-    both = ndimage.binary_closing(slow & low, np.ones((3, 1)))
-    stands = ndimage.binary_opening(np.pad(both, ((1, 1), (0, 0)), mode="edge"), np.ones((3, 1)))[1:-1]
-    return enforce_swing_time(stands, centres_world) if should_stand else stands
+        slow |= slowest & (smoothed < SLOWEST_FOOT_LIFTED * body)
+    closed = ndimage.binary_closing(slow & low, np.ones((3, 1)))
+    stance = ndimage.binary_opening(np.pad(closed, ((1, 1), (0, 0)), mode="edge"), np.ones((3, 1)))[1:-1]
+    return enforce_swing_time(stance, centres_world) if should_stand else stance
 
 
 def enforce_swing_time(
     stance: Bool[np.ndarray, "frame foot"], centres_world: Float[np.ndarray, "frame foot 3"]
 ) -> Bool[np.ndarray, "frame foot"]:
-    """Shorten, part or leave out phases in which feet should stand, so that between two of them each foot can
-    swing.
+    """Split, shorten or drop stance phases so that each foot has time to swing between two of them.
 
-    A foot that glides on for more than `STRIDE_M` should stand more than once; from one place to another d
-    metres away it takes sqrt(6 d / `SWING_M_S2`) seconds at least (a cubic in time, at rest at both ends).
+    Phases with more than `STRIDE_M` of skate are split. A swing over d metres takes at least
+    sqrt(6 d / `SWING_M_S2`) seconds (a cubic in time, at rest at both ends).
     """
-    standing = np.zeros_like(stance)
+    enforced = np.zeros_like(stance)
     for foot, centres in enumerate(np.moveaxis(centres_world, 1, 0)):
         phases: list[range] = []
         for phase in _split_phases(stance[:, foot], centres):
@@ -160,18 +155,18 @@ def enforce_swing_time(
                 phases.append(phase)
             elif pair is not None:
                 phases[-1:] = pair
-        standing[[frame for phase in phases for frame in phase], foot] = True
-    return standing
+        enforced[[frame for phase in phases for frame in phase], foot] = True
+    return enforced
 
 
 def _split_phases(
     stance: Bool[np.ndarray, "frame"], centres: Float[np.ndarray, "frame 3"]
 ) -> Iterator[range]:
-    """Yield the frames of each phase; those in which the foot goes too far, in parts."""
+    """Yield the frames of each stance phase, split where the foot slides too far."""
     edges = np.flatnonzero(np.diff(np.pad(stance.astype(np.int8), 1)))
     for start, end in zip(edges[::2], edges[1::2], strict=True):
-        gone = np.linalg.norm(np.diff(centres[start:end], axis=0), axis=1).sum()
-        count = max(1, min(int(np.ceil(gone / STRIDE_M)), (end - start) // SHORTEST_PHASE_FRAMES))
+        skate = np.linalg.norm(np.diff(centres[start:end], axis=0), axis=1).sum()
+        count = max(1, min(int(np.ceil(skate / STRIDE_M)), (end - start) // SHORTEST_PHASE_FRAMES))
         cuts = np.linspace(start, end, count + 1).round().astype(int).tolist()
         yield from (range(*pair) for pair in pairwise(cuts))
 
@@ -179,9 +174,9 @@ def _split_phases(
 def _make_room_to_swing(
     before: range, after: range, centres: Float[np.ndarray, "frame 3"]
 ) -> tuple[range, range] | None:
-    """Give a foot time to swing between two phases; None where there is not that much."""
-    away = np.linalg.norm(centres[after].mean(0) - centres[before].mean(0))
-    lacking = max(int(np.ceil(np.sqrt(6 * away / SWING_M_S2) * RATE_HZ)) - (after.start - before.stop), 0)
+    """Shorten two phases until the foot has time to swing between them; None if they are too short."""
+    step_m = np.linalg.norm(centres[after].mean(0) - centres[before].mean(0))
+    lacking = max(int(np.ceil(np.sqrt(6 * step_m / SWING_M_S2) * RATE_HZ)) - (after.start - before.stop), 0)
     spare = [max(len(phase) - SHORTEST_PHASE_FRAMES, 0) for phase in (before, after)]
     if lacking > sum(spare):
         return None
@@ -190,7 +185,7 @@ def _make_room_to_swing(
 
 
 def motion_tensors(motion: BodyMotion) -> tuple[Float[Tensor, "frame 4 4"], Float[Tensor, "frame bone 4 4"]]:
-    """Return root and bones of a motion, metres, as torch tensors."""
+    """Return root and bones of a motion as torch tensors, metres."""
     root, bones = np.asarray(motion.world_from_agent), np.asarray(motion.agent_from_bone)
     return torch.from_numpy(root).float(), torch.from_numpy(bones).float()
 

@@ -1,8 +1,8 @@
-"""What long-term motion is learned from: stretches of motion in scenes, cut into clips and single bodies.
+"""Training data of long-term motion: stretches of motion in scenes, cut into clips and static bodies.
 
-`MotionDataset` is the common form of reconstructed sessions (`reconstructed_split`) and of simulated ones
-(`simulated_lives.load`); `select_clips` and `encode_selection` make clips of it, `sample_static_bodies`
-single bodies.
+`MotionDataset` holds reconstructed sessions (`reconstructed_split`) or simulated ones
+(`simulated_lives.load`). `select_clips` and `encode_selection` cut clips from it, `sample_static_bodies`
+samples static bodies.
 """
 
 from collections.abc import Sequence
@@ -38,11 +38,11 @@ class MotionDataset:
     body: SkinnedBody
     stretches: tuple[BodyMotion, ...]
     scene_of: tuple[int, ...]
-    """per stretch, which scene"""
+    """index of each stretch's scene"""
     scenes: tuple[MotionScene, ...]
 
     def subset(self, chosen: Sequence[int] | Int[np.ndarray, "some"]) -> "MotionDataset":
-        """Return some of the stretches, with the scenes that they need."""
+        """Return some of the stretches, with their scenes."""
         needed = sorted({self.scene_of[index] for index in chosen})
         stretches = tuple(self.stretches[index] for index in chosen)
         scene_of = tuple(needed.index(self.scene_of[index]) for index in chosen)
@@ -56,7 +56,7 @@ class MotionDataset:
 
 @dataclass(frozen=True)
 class DatasetSplit:
-    """Motion to learn from, and motion held out, of which there may be none."""
+    """Training motion and held-out motion, if any."""
 
     train: MotionDataset
     held_out: MotionDataset | None
@@ -65,15 +65,15 @@ class DatasetSplit:
 
     @classmethod
     def of(cls, dataset: MotionDataset, kinds: Sequence[str]) -> "DatasetSplit":
-        """Part a dataset by what each stretch is for: to `train`, or else."""
+        """Split a dataset by the kind of each stretch: `train`, or any other kind for held-out motion."""
         is_train = np.array(kinds) == "train"
-        learned, rest = np.flatnonzero(is_train), np.flatnonzero(~is_train)
+        train, rest = np.flatnonzero(is_train), np.flatnonzero(~is_train)
         held_out = dataset.subset(rest) if len(rest) else None
-        return cls(dataset.subset(learned), held_out, tuple(kinds[index] for index in rest.tolist()))
+        return cls(dataset.subset(train), held_out, tuple(kinds[index] for index in rest.tolist()))
 
 
 def reconstructed_split(reconstruction: Path, data: BehaviorData) -> DatasetSplit:
-    """Read all long enough stretches of reconstructed sessions, those of the behaviour test held out."""
+    """Read stretches of two seconds or more of reconstructed sessions; behaviour test videos are held out."""
     found = [
         (video, part) for video, trajectory in data.trajectories.items() for part in stretches(trajectory)
     ]
@@ -87,22 +87,22 @@ def reconstructed_split(reconstruction: Path, data: BehaviorData) -> DatasetSpli
 STRIDE = 3
 """Frames (30 fps) between the starts of clips."""
 RESTING_SHARE = 0.3
-"""Share of the clips that end within `MOVED_M` of their start: without any, a model never learns to rest."""
+"""Share of clips that end within `MOVED_M` of their start: without any, a model never learns to rest."""
 MAX_CLIPS = 6000
-"""Clips at most; beyond that they are subsampled evenly."""
+"""Maximum number of clips; beyond that they are subsampled evenly."""
 LEVEL_SHARE = 0.5
-"""Share of static bodies whose place is given without tilt and exact height, as a user gives it."""
+"""Share of static bodies conditioned on a place without tilt and exact height, as a user specifies it."""
 LEVEL_HEIGHT_M = 0.03
-"""Deviation of the heights of such places."""
+"""Standard deviation of the heights of such places."""
 POSE_STRIDE = 3
-"""Every so many frames of motion the pose space is fitted to: neighbours at 30 fps hardly differ."""
+"""Stride of the frames that the pose space is fitted to: neighbours at 30 fps hardly differ."""
 MOVED_M = 0.5
 """A clip that ends further than this from its start travels (the paper keeps only those)."""
 
 
 @dataclass(frozen=True)
 class StaticBodies:
-    """Single bodies, each described as a place and as what really stands there."""
+    """Static bodies: the place each is conditioned on, and the true body there."""
 
     places: EncodedPlaces
     truth: Float[Tensor, "body channel"]
@@ -112,13 +112,13 @@ class StaticBodies:
 
 @dataclass(frozen=True)
 class ClipSelection:
-    """Which short motions are taken: stretch and first frame of each."""
+    """Stretch and first frame of each selected clip."""
 
     stretch: Int[np.ndarray, "clip"]
     start: Int[np.ndarray, "clip"]
 
     def parts(self, dataset: MotionDataset) -> list[BodyMotion]:
-        """Return the motions."""
+        """Return the motions of the clips."""
         pairs = zip(self.stretch, self.start, strict=True)
         return [dataset.stretches[stretch][start : start + STEPS + 1] for stretch, start in pairs]
 
@@ -131,13 +131,13 @@ def select_clips(
     resting: float = RESTING_SHARE,
     most: int = MAX_CLIPS,
 ) -> ClipSelection:
-    """Choose short motions: those that travel and a share ``resting`` of clips that rest."""
+    """Select clips: all that travel, and a share ``resting`` of clips that rest, ``most`` at most."""
     starts = [np.arange(0, len(stretch) - STEPS, stride) for stretch in dataset.stretches]
     stretch, start = np.repeat(np.arange(len(starts)), list(map(len, starts))), np.concatenate(starts)
     roots = (each.world_from_agent[:, :3, 3] for each in dataset.stretches)
     both = zip(roots, starts, strict=True)
-    way = [np.linalg.norm(root[first + STEPS] - root[first], axis=1) for root, first in both]
-    moves = np.concatenate(way) > MOVED_M
+    displacement = [np.linalg.norm(root[first + STEPS] - root[first], axis=1) for root, first in both]
+    moves = np.concatenate(displacement) > MOVED_M
     still = np.flatnonzero(~moves)
     if moves.any():
         count = int(moves.sum() * resting / max(1 - resting, 1e-6))
@@ -148,15 +148,16 @@ def select_clips(
 
 
 def encode_selection(
-    dataset: MotionDataset, cuts: ClipSelection, poses: PoseSpace, points: int, rng: np.random.Generator
+    dataset: MotionDataset, selection: ClipSelection, poses: PoseSpace, points: int, rng: np.random.Generator
 ) -> Clips:
-    """Encode short motions; the poses of each stretch are encoded once."""
+    """Encode clips as network channels; the poses of each stretch are encoded once."""
     p = [pose_channels(stretch.agent_from_bone, poses) for stretch in dataset.stretches]
-    pairs = list(zip(cuts.stretch, cuts.start, strict=True))
+    pairs = list(zip(selection.stretch, selection.start, strict=True))
     roots = [stretch.world_from_agent for stretch in dataset.stretches]
     root = np.stack([roots[stretch][start : start + STEPS + 1] for stretch, start in pairs])
     pose = torch.stack([p[stretch][start : start + STEPS + 1] for stretch, start in pairs])
-    return encode_clips(root, pose, np.asarray(dataset.scene_of)[cuts.stretch], dataset.scenes, points, rng)
+    scene = np.asarray(dataset.scene_of)[selection.stretch]
+    return encode_clips(root, pose, scene, dataset.scenes, points, rng)
 
 
 def sample_static_bodies(
@@ -168,7 +169,7 @@ def sample_static_bodies(
     most: int,
     level: float = LEVEL_SHARE,
 ) -> StaticBodies:
-    """Take single bodies out of the motion and describe their places, some as loosely as a user would."""
+    """Sample static bodies from the motion; a share ``level`` of their places is as imprecise as a user's."""
     stride = max(1, int(np.ceil(sum(map(len, dataset.stretches)) / most)))
     frames = [stretch[::stride] for stretch in dataset.stretches]
     root = np.concatenate([part.world_from_agent for part in frames])
@@ -183,16 +184,16 @@ def sample_static_bodies(
 
 
 def body_channels(
-    world_from_place: Float[np.ndarray, "body 4 4"], moving: BodyMotion, poses: PoseSpace
+    world_from_place: Float[np.ndarray, "body 4 4"], bodies: BodyMotion, poses: PoseSpace
 ) -> Float[Tensor, "body channel"]:
-    """Return t, r and p of bodies in the frames of their places."""
-    root = root_channels(rigid.inverse(world_from_place) @ moving.world_from_agent)
-    return torch.cat([root, pose_channels(moving.agent_from_bone, poses)], dim=-1)
+    """Return t, r and p of bodies, root in the frames of their places."""
+    root = root_channels(rigid.inverse(world_from_place) @ bodies.world_from_agent)
+    return torch.cat([root, pose_channels(bodies.agent_from_bone, poses)], dim=-1)
 
 
 def fit_pose_space(
     stretches: Sequence[BodyMotion], rest: Float[np.ndarray, "bone 4 4"], components: int
 ) -> PoseSpace:
-    """Find the pose space of some motion."""
+    """Fit a pose space to motion."""
     bones = np.concatenate([part.agent_from_bone[::POSE_STRIDE] for part in stretches])
     return PoseSpace(rest, components).fit(bones)

@@ -1,6 +1,6 @@
-"""Long-term motion through sub-goals, and any other motion, made physical; its worth before and after.
+"""Long-term motion through sub-goals, or any other motion, optimised to be physically plausible.
 
-Both are judged by the same feet: those that should stand in the motion as it was given.
+Plausibility before and after uses the same stance: the feet that should stand in the given motion.
 """
 
 from dataclasses import dataclass, replace
@@ -21,15 +21,15 @@ from pipeline.longterm.surroundings import MotionScene
 
 @dataclass(frozen=True)
 class LongTermWorld:
-    """What long-term motion takes place with and in."""
+    """The model, body and scene of long-term motion."""
 
     model: LongTerm
     body: SkinnedBody
     scene: MotionScene
 
     @property
-    def judge(self) -> PlausibilityMeter:
-        """Return what measures motion here."""
+    def meter(self) -> PlausibilityMeter:
+        """The meter for motion of this body in this scene."""
         return PlausibilityMeter(self.body, self.model.contacts, self.scene.distance)
 
 
@@ -37,20 +37,20 @@ class LongTermWorld:
 class Journey:
     """A motion at 30 fps through sub-goals."""
 
-    moving: BodyMotion
+    motion: BodyMotion
     subgoals_world: Float[np.ndarray, "goal 3"]
     arrival_s: Float[np.ndarray, "goal"]
     before: Plausibility
-    """as the networks made it"""
+    """of the networks' output"""
     after: Plausibility
-    """as it is"""
+    """of ``motion``"""
     largest_seam_m: float
-    """how far the fastest vertex jumps at a seam, beyond what it does in the frames beside it"""
+    """largest jump of any vertex at a seam, beyond its step in the adjacent frames"""
 
     @property
     def timestamp_s(self) -> Float[np.ndarray, "frame"]:
         """Time of every frame."""
-        return np.arange(len(self.moving)) / RATE_HZ
+        return np.arange(len(self.motion)) / RATE_HZ
 
 
 def travel(
@@ -59,30 +59,25 @@ def travel(
     settings: MotionOptimizationConfig | None,
     rng: np.random.Generator,
 ) -> Journey:
-    """Make motion through sub-goals; ``settings`` None leaves it as the networks made it."""
-    places = plan_waypoints(None, subgoals, world.scene, world.model.motion_prior)
-    raw, _ = world.model.long_motion(
-        places.world_from_agent, world.body, world.scene, rng, stops=places.subgoal
-    )
-    made = refine_motion(world, raw, settings)
-    return replace(
-        made,
-        subgoals_world=places.world_from_agent[places.subgoal, :3, 3],
-        arrival_s=places.subgoal * STEPS / RATE_HZ,
-    )
+    """Synthesize motion through sub-goals; with ``settings`` None it is not optimised."""
+    waypoints = plan_waypoints(None, subgoals, world.scene, world.model.motion_prior)
+    roots, stops = waypoints.world_from_agent, waypoints.subgoal
+    raw, _ = world.model.long_motion(roots, world.body, world.scene, rng, stops=stops)
+    journey = refine_motion(world, raw, settings)
+    return replace(journey, subgoals_world=roots[stops, :3, 3], arrival_s=stops * STEPS / RATE_HZ)
 
 
 def refine_motion(
     world: LongTermWorld, raw: BodyMotion, settings: MotionOptimizationConfig | None
 ) -> Journey:
-    """Make any motion at 30 fps physical where ``settings`` are given; it has no sub-goals."""
-    judge, stance = world.judge, world.judge.stance(raw, should_stand=True)
-    moving = raw
+    """Optimise any motion at 30 fps, unless ``settings`` is None; the journey has no sub-goals."""
+    meter, stance = world.meter, world.meter.stance(raw, should_stand=True)
+    motion = raw
     if settings is not None:
-        moving = optimize_motion(raw, world.model.contact_body(world.body), world.scene.distance, settings)
-    before, after = (judge.plausibility(each, stance) for each in (raw, moving))
-    largest_seam_m = float(seams(world.body, moving, STEPS).max(initial=0.0))
-    return Journey(moving, np.zeros((0, 3)), np.zeros(0), before, after, largest_seam_m)
+        motion = optimize_motion(raw, world.model.contact_body(world.body), world.scene.distance, settings)
+    before, after = (meter.plausibility(each, stance) for each in (raw, motion))
+    largest_seam_m = float(seams(world.body, motion, STEPS).max(initial=0.0))
+    return Journey(motion, np.zeros((0, 3)), np.zeros(0), before, after, largest_seam_m)
 
 
 def refine_at_rate(
@@ -93,10 +88,11 @@ def refine_at_rate(
 ) -> tuple[BodyMotion, Plausibility, Plausibility]:
     """Optimise motion of any rate; return it at its own times, and plausibility before and after."""
     raw = resample_motion(timestamp_s, given)
-    judge, stance = world.judge, world.judge.stance(raw, should_stand=True)
-    done = optimize_motion(raw, world.model.contact_body(world.body), world.scene.distance, settings)
-    when = np.arange(len(done)) / RATE_HZ
-    at = np.minimum(timestamp_s - timestamp_s[0], when[-1])
-    bones = [rigid.interpolate(when, bone, at) for bone in np.moveaxis(done.agent_from_bone, 1, 0)]
-    back = BodyMotion(rigid.interpolate(when, done.world_from_agent, at), np.stack(bones, axis=1))
-    return back, judge.plausibility(raw, stance), judge.plausibility(done, stance)
+    meter, stance = world.meter, world.meter.stance(raw, should_stand=True)
+    optimized = optimize_motion(raw, world.model.contact_body(world.body), world.scene.distance, settings)
+    time_s = np.arange(len(optimized)) / RATE_HZ
+    query_s = np.minimum(timestamp_s - timestamp_s[0], time_s[-1])
+    tracks = np.moveaxis(optimized.agent_from_bone, 1, 0)
+    bones = np.stack([rigid.interpolate(time_s, track, query_s) for track in tracks], axis=1)
+    motion = BodyMotion(rigid.interpolate(time_s, optimized.world_from_agent, query_s), bones)
+    return motion, meter.plausibility(raw, stance), meter.plausibility(optimized, stance)

@@ -1,8 +1,8 @@
-"""Long-term motion as a whole: the trained networks with all they need, and motion between sub-goals.
+"""Long-term motion synthesis: the trained model, and motion through waypoints.
 
-`LongTerm.load` reads what `train_longterm` wrote; `bodies` puts bodies at places, `short_motions` fills the
-two seconds between pairs of them, `long_motion` does both for a whole row of places;
-`motion_optimization.optimize_motion` finishes it.
+`LongTerm.load` reads what `train_longterm` wrote. `bodies` samples bodies at waypoints, `short_motions`
+in-betweens two seconds between consecutive ones, `long_motion` does both for a sequence of waypoints;
+`motion_optimization.optimize_motion` refines the result.
 """
 
 import json
@@ -38,32 +38,32 @@ from pipeline.longterm.surroundings import MotionScene
 
 NETWORKS = ("static", "route", "pose")
 CONVENTIONS = {"units": "metres, radians, seconds", "up": [0, 1, 0], "rate_hz": RATE_HZ, "frames": STEPS + 1}
-"""What the networks' numbers mean; a model that says otherwise is another version's."""
+"""Conventions stored with a model; one with others is from another version."""
 JUMP_M = 0.1
-"""A leg between places whose levels differ by more than this is leapt."""
+"""A leg whose ends differ in height by more than this is a jump."""
 TURN_PERCENTILE = 99
-"""The prior's fastest turn: jumps of the reconstruction are left out."""
+"""Percentile taken as the fastest turn: jumps of the reconstruction are outliers."""
 SWEEPS = 2
-"""How often bodies in passing are made again from what is before and after them."""
+"""Iterations that resample the poses at waypoints in passing from the motion before and after them."""
 
 
 @dataclass(frozen=True)
 class MotionPrior:
-    """How the body was seen to move."""
+    """Statistics of recorded motion."""
 
     clearance_m: float
-    """median distance of the root from the scene while it travels"""
+    """median distance of the root from the scene in locomotion"""
     pace_m: float
-    """median way of a two-second motion that travels"""
+    """median displacement over two seconds of locomotion"""
     above_m: float
-    """how far the highest bone is above the root, median while it travels"""
+    """median height of the highest bone above the root in locomotion"""
     turn_rad: float
-    """how far the root turns from one frame to the next, 99th percentile"""
+    """rotation of the root per frame, 99th percentile"""
 
 
 @dataclass(frozen=True)
 class LongTerm:
-    """Everything that makes long-term motion of one body."""
+    """A trained model of long-term motion of one body."""
 
     sizes: LongTermSizes
     poses: PoseSpace
@@ -116,7 +116,7 @@ class LongTerm:
         return cls(sizes, poses, contacts, motion_prior, static.eval(), route.eval(), pose.eval())
 
     def contact_body(self, body: SkinnedBody) -> ContactBody:
-        """Return what the optimisation needs of a body."""
+        """Return a body with contacts and pose space, for the optimisation."""
         return ContactBody(body, self.contacts, self.poses)
 
     def bodies(
@@ -128,35 +128,35 @@ class LongTerm:
         *,
         candidates: int = 8,
     ) -> BodyMotion:
-        """Put a body at each place: of several that the CVAE draws, the one that stands in the scene best,
-        `settle_bodies` there.
+        """Return a body at each waypoint: the best of several CVAE samples, refined by `settle_bodies`.
 
-        A good body touches the scene, is not inside it, and stays near its place.
+        The cost is gap to the scene plus penetration plus distance from the waypoint.
         """
         first = np.zeros(len(world_from_agent), int)
         places = encode_places(world_from_agent, first, [scene], self.sizes.points, rng)
         shape = torch.from_numpy(body.shape).float().expand(len(world_from_agent), -1)
-        judge = PlausibilityMeter(body, self.contacts, scene.distance)
-        best, least = None, np.full(len(world_from_agent), np.inf)
+        meter = PlausibilityMeter(body, self.contacts, scene.distance)
+        best, lowest_cost = None, np.full(len(world_from_agent), np.inf)
         with torch.no_grad():
-            given = self.static.given(places.place, shape, places.points)
+            condition = self.static.encode_condition(places.place, shape, places.points)
         for _ in range(candidates):
-            z = torch.from_numpy(rng.standard_normal((len(given), self.sizes.latent))).float()
+            z = torch.from_numpy(rng.standard_normal((len(condition), self.sizes.latent))).float()
             with torch.no_grad():
-                drawn = self.static.decode(z, given)
-            made = placed(drawn, places.world_from_place, self.poses)
-            away = np.linalg.norm((made.world_from_agent - world_from_agent)[:, :3, 3], axis=1)
-            cost = sum(judge.gap_and_penetration(made)) + away
-            better = (cost < least)[:, None, None]
-            best = made if best is None else _where(better, made, best)
-            least = np.minimum(least, cost)
+                channels = self.static.decode(z, condition)
+            local = decode_clip(channels, np.eye(4), self.poses)
+            sample = BodyMotion(places.world_from_place @ local.world_from_agent, local.agent_from_bone)
+            offset = np.linalg.norm((sample.world_from_agent - world_from_agent)[:, :3, 3], axis=1)
+            cost = sum(meter.gap_and_penetration(sample)) + offset
+            better = (cost < lowest_cost)[:, None, None]
+            best = sample if best is None else _where(better, sample, best)
+            lowest_cost = np.minimum(lowest_cost, cost)
         assert best is not None, candidates
         return settle_bodies(best, self.contact_body(body), scene.distance, MotionOptimizationConfig())
 
     def short_motions(
         self, start: BodyMotion, end: BodyMotion, scene: MotionScene, rng: np.random.Generator
     ) -> list[BodyMotion]:
-        """Return the 61 frames from each start body to its end body."""
+        """In-between each start body and its end body: 61 frames, both ends included."""
         root = np.stack([start.world_from_agent, end.world_from_agent], axis=1)
         p = torch.stack([pose_channels(each.agent_from_bone, self.poses) for each in (start, end)], dim=1)
         ends = encode_clips(root, p, np.zeros(len(root), int), [scene], self.sizes.points, rng)
@@ -168,7 +168,7 @@ class LongTerm:
     def between(
         self, start: Float[Tensor, "clip channel"], end: Float[Tensor, "clip channel"], seen: LocalScene
     ) -> Float[Tensor, "clip frame channel"]:
-        """Return t, r, p between first and last frames, in the clips' frames."""
+        """Return t, r, p of all frames between first and last ones, in the clips' frames."""
         with torch.no_grad():
             route = self.route(start, end, seen)
             return self.pose(start[:, ROOT_CHANNELS:], end[:, ROOT_CHANNELS:], route, seen.points)
@@ -182,26 +182,26 @@ class LongTerm:
         *,
         stops: Int[np.ndarray, "stop"] | None = None,
     ) -> tuple[BodyMotion, BodyMotion]:
-        """Return motion through a row of places, two seconds from one to the next, and the bodies at them.
+        """Return motion through waypoints two seconds apart, and the bodies at the waypoints.
 
-        A body that stays at its place stays as it is. At places that are none of ``stops`` (None: all are) it
-        is only passing: there its pose is what the networks make of it between a second before and a second
-        after, for a body drawn on its own would be caught at any moment of a stride.
+        At consecutive equal waypoints the body rests. Waypoints not in ``stops`` (None: all) are passed in
+        locomotion: their poses are in-betweened from a second before to a second after, since a body sampled
+        independently has an arbitrary gait phase.
         """
-        number = np.arange(len(world_from_agent))
-        stays = np.append(False, np.isclose(world_from_agent[1:], world_from_agent[:-1]).all((1, 2)))
-        since = np.maximum.accumulate(np.where(stays, 0, number))
+        index = np.arange(len(world_from_agent))
+        rests = np.append(False, np.isclose(world_from_agent[1:], world_from_agent[:-1]).all((1, 2)))
+        since = np.maximum.accumulate(np.where(rests, 0, index))
         bodies = self.bodies(world_from_agent, body, scene, rng)[since]
-        drawn = np.isin(number, number if stops is None else [0, *stops, number[-1]])
-        drawn |= stays | np.append(stays[1:], False)
-        for _ in range(SWEEPS if not drawn.all() else 0):
-            bodies = self._passed(bodies, np.flatnonzero(~drawn), scene, rng)
+        sampled = np.isin(index, index if stops is None else [0, *stops, index[-1]])
+        sampled |= rests | np.append(rests[1:], False)
+        for _ in range(SWEEPS if not sampled.all() else 0):
+            bodies = self._with_passing_poses(bodies, np.flatnonzero(~sampled), scene, rng)
         rise = np.abs(np.diff(world_from_agent[:, 1, 3]))
         parts = zip(self.short_motions(bodies[:-1], bodies[1:], scene, rng), rise > JUMP_M, strict=True)
-        joined = concatenate_motions([jump_between_levels(part) if leaps else part for part, leaps in parts])
+        joined = concatenate_motions([jump_between_levels(part) if jumps else part for part, jumps in parts])
         return limit_turn_rate(smooth_seams(joined), self.motion_prior.turn_rad), bodies
 
-    def _passed(
+    def _with_passing_poses(
         self,
         bodies: BodyMotion,
         passing: Int[np.ndarray, "place"],
@@ -213,48 +213,39 @@ class LongTerm:
             np.stack([part.world_from_agent[STEPS // 2] for part in parts]),
             np.stack([part.agent_from_bone[STEPS // 2] for part in parts]),
         )
-        made = self.short_motions(middle[passing - 1], middle[passing], scene, rng)
+        parts = self.short_motions(middle[passing - 1], middle[passing], scene, rng)
         bones = bodies.agent_from_bone.copy()
-        bones[passing] = np.stack([part.agent_from_bone[STEPS // 2] for part in made])
+        bones[passing] = np.stack([part.agent_from_bone[STEPS // 2] for part in parts])
         return BodyMotion(bodies.world_from_agent, bones)
-
-
-def placed(
-    channels: Float[Tensor, "body channel"], world_from_place: Float[np.ndarray, "body 4 4"], poses: PoseSpace
-) -> BodyMotion:
-    """Turn bodies drawn by the CVAE into bodies in the world."""
-    local = decode_clip(channels, np.eye(4), poses)
-    return BodyMotion(world_from_place @ local.world_from_agent, local.agent_from_bone)
 
 
 def measure_motion_prior(
     stretches: list[BodyMotion], scenes: list[MotionScene], *, moving_m: float = 0.3
 ) -> MotionPrior:
-    """Measure how a body moves; ``moving_m`` is the least way in two seconds that counts as travelling.
+    """Measure motion statistics; ``moving_m`` is the displacement in two seconds that counts as locomotion.
 
-    Half a turn within a second counts as possible for any body, also for one that was only seen to rest.
+    Half a turn per second is always allowed, even for a body that was only recorded at rest.
     """
-    clearance, above, travelled, travels, turn = [], [], [], [], []
+    clearance, above, displacements, turn = [], [], [], []
     for stretch, scene in zip(stretches, scenes, strict=True):
         root = stretch.world_from_agent[:, :3, 3]
-        way = np.linalg.norm((root[STEPS:] - root[:-STEPS])[:, [0, 2]], axis=1)
-        middle = slice(STEPS // 2, len(way) + STEPS // 2)
+        displacement = np.linalg.norm((root[STEPS:] - root[:-STEPS])[:, [0, 2]], axis=1)
+        middle = slice(STEPS // 2, len(displacement) + STEPS // 2)
         bones = np.swapaxes(stretch.agent_from_bone[middle, :, :3, 3], 1, 2)
         up = (stretch.world_from_agent[middle, 1:2, :3] @ bones)[:, 0]
         clearance.append(scene.distance.at(torch.from_numpy(root[middle]).float()).numpy())
         above.append(up.max(1))
-        travelled.append(way)
-        travels.append(way > moving_m)
+        displacements.append(displacement)
         rotation = stretch.world_from_agent[:, :3, :3]
         turn.append(rigid.rotation_angle(rotation[:-1], rotation[1:]))
-    chosen = np.concatenate(travels)
-    chosen = chosen if chosen.any() else ~chosen
-    found = (float(np.median(np.concatenate(each)[chosen])) for each in (clearance, travelled, above))
-    clearance_m, pace_m, above_m = found
+    moves = np.concatenate(displacements) > moving_m
+    moves = moves if moves.any() else ~moves
+    medians = (float(np.median(np.concatenate(each)[moves])) for each in (clearance, displacements, above))
+    clearance_m, pace_m, above_m = medians
     turn_rad = max(float(np.percentile(np.concatenate(turn), TURN_PERCENTILE)), np.pi / RATE_HZ)
     return MotionPrior(clearance_m, max(pace_m, moving_m), above_m, turn_rad)
 
 
-def _where(first: np.ndarray, one: BodyMotion, other: BodyMotion) -> BodyMotion:
-    roots = np.where(first, one.world_from_agent, other.world_from_agent)
-    return BodyMotion(roots, np.where(first[..., None], one.agent_from_bone, other.agent_from_bone))
+def _where(condition: np.ndarray, one: BodyMotion, other: BodyMotion) -> BodyMotion:
+    roots = np.where(condition, one.world_from_agent, other.world_from_agent)
+    return BodyMotion(roots, np.where(condition[..., None], one.agent_from_bone, other.agent_from_bone))

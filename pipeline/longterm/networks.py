@@ -1,10 +1,8 @@
-"""The networks of long-term motion: bodies at sub-goals, routes between them, poses along routes (paper 002,
-Sec. 3).
+"""Networks of long-term motion: static bodies, routes between them, poses along routes (paper 002, Sec. 3).
 
-All speak in a clip's frame: heading and position of its first body, +y up. `t` is the root's position in
-metres, `r` its rotation by its first two columns, `p` the pose by `pipeline.longterm.bodies.PoseSpace`.
-RouteNet, PoseNet and BaseNet say how far the truth lies from the straight line between start and end; at both
-ends that is nothing, so that short motions join without seams.
+Inputs and outputs are in a clip's frame, +y up: `t` is the root's position in metres, `r` its rotation in 6D
+(first two columns), `p` the pose in `pipeline.longterm.bodies.PoseSpace`. RouteNet, PoseNet and BaseNet
+predict offsets from linear interpolation between start and end that vanish at both ends, so that clips join.
 """
 
 from dataclasses import replace
@@ -22,22 +20,21 @@ from pipeline.longterm.local_scene import LocalScene
 from pipeline.longterm.short_motions import RATE_HZ, STEPS
 
 ROOT_CHANNELS = 9
-"""t and r together"""
+"""channels of t and r"""
 REACH_M = 1.5
-"""scene points of a clip come from this far around the middle between start and end"""
+"""radius around a clip's centre within which scene points are sampled"""
 BODY_REACH_M = 0.8
-"""scene points of a static body come from this far around it"""
+"""radius around a static body within which scene points are sampled"""
 LEAK = 0.2
-"""slope of LeakyReLU below 0"""
-FEWEST_TURNS = 0.4
-"""untrained gait phases turn at least so often per meter and per second on the move, and up to 2 more"""
-
+"""negative slope of LeakyReLU"""
+MIN_GAIT_CYCLES = 0.4
+"""lowest initial frequency of the gait phases per metre and per second of locomotion; they span 2 more"""
 IDLE_M_S = 0.1
-"""a body slower than this hardly counts as on the move"""
+"""speed at which time counts half as time of locomotion"""
 
 
 class PointNet(nn.Module):
-    """A code for a set of points: shared layers, then the maximum (no transformation nets)."""
+    """Encoder of a point set: a shared MLP, then max pooling (no transformation nets)."""
 
     def __init__(self, code: int, with_scene: bool = True):
         super().__init__()
@@ -55,7 +52,7 @@ class PointNet(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """Two linear layers and what came in."""
+    """Two linear layers with a skip connection."""
 
     def __init__(self, width: int):
         super().__init__()
@@ -68,7 +65,7 @@ class ResidualBlock(nn.Module):
 
 
 class StaticBody(nn.Module):
-    """A conditional VAE of bodies: (t, r, p) given shape, clearance, orientation, scene points (Sec. 3.2)."""
+    """A CVAE of bodies: (t, r, p) given shape, clearance, orientation and scene points (Sec. 3.2)."""
 
     def __init__(self, sizes: LongTermSizes):
         super().__init__()
@@ -85,7 +82,7 @@ class StaticBody(nn.Module):
         self.decoder = nn.Sequential(ResidualBlock(width), ResidualBlock(width))
         self.decoder_out = nn.Linear(width, body)
 
-    def given(
+    def encode_condition(
         self,
         place: Float[Tensor, "batch 7"],
         shape: Float[Tensor, "batch shape"],
@@ -111,7 +108,7 @@ class StaticBody(nn.Module):
 
 
 class InbetweenNet(nn.Module):
-    """A bi-LSTM over start and end, the scene's code, two linear layers."""
+    """A bidirectional LSTM over interpolated ends, then an MLP that also sees the scene's PointNet code."""
 
     def __init__(self, channels: int, extra: int, sizes: LongTermSizes, with_scene: bool):
         super().__init__()
@@ -131,7 +128,7 @@ class InbetweenNet(nn.Module):
         extra: Float[Tensor, "batch frame extra"] | None = None,
         coarse: Float[Tensor, "batch frame channel"] | None = None,
     ) -> Float[Tensor, "batch frame channel"]:
-        """Return the channels of all k + 1 frames: a draft, or the line between the ends, and an offset."""
+        """Return the channels of all k + 1 frames: ``coarse``, or the interpolated ends, plus an offset."""
         share = torch.linspace(0, 1, STEPS + 1, dtype=start.dtype, device=start.device)
         share = share[None, :, None].expand(len(start), -1, 1)
         line = torch.lerp(start[:, None], end[:, None], share)
@@ -144,11 +141,9 @@ class InbetweenNet(nn.Module):
 
 
 class CoarseToFine(nn.Module):
-    """A draft made without the scene, and its correction, made knowing what is beside each frame of the
-    draft.
+    """A coarse prediction without the scene, refined with the signed distance around each of its frames.
 
-    Distances beside the way that would be gone say what bends it; a code of all points around leaves that to
-    be found.
+    The distances beside the coarse route show directly where it must bend, unlike a code of all points.
     """
 
     def __init__(self, channels: int, extra: int, sizes: LongTermSizes, with_scene: bool):
@@ -166,37 +161,35 @@ class CoarseToFine(nn.Module):
         seen: LocalScene,
         extra: Float[Tensor, "batch frame extra"] | None = None,
     ) -> list[Float[Tensor, "batch frame channel"]]:
-        """Return the draft and what it becomes, t in metres and r orthonormal, in the clip's frame."""
+        """Return coarse and refined prediction, t in metres and r orthonormal, in the clip's frame."""
         coarse = orthonormalized(self.coarse(start, end, seen.points, extra))
-        still = coarse.detach()
-        read = (
-            local_scene.read_distances(seen.field, still[..., :3])
+        fixed = coarse.detach()
+        distances = (
+            local_scene.read_distances(seen.field, fixed[..., :3])
             if self.with_scene
-            else still.new_zeros(*still.shape[:2], local_scene.READ_CHANNELS)
+            else fixed.new_zeros(*fixed.shape[:2], local_scene.READ_CHANNELS)
         )
-        known = torch.cat([read, still, with_velocity(still[..., :ROOT_CHANNELS])], dim=-1)
-        return [coarse, orthonormalized(self.fine(start, end, seen.points, known, still))]
+        known = torch.cat([distances, fixed, with_velocity(fixed[..., :ROOT_CHANNELS])], dim=-1)
+        return [coarse, orthonormalized(self.fine(start, end, seen.points, known, fixed))]
 
 
 def end_window(like: Float[Tensor, "batch frame channel"]) -> Float[Tensor, "frame 1"]:
-    """Return a factor per frame that is 0 at both ends and near 1 from a tenth of a second on."""
+    """Return a window over the frames: 0 at both ends, near 1 from a tenth of a second away from them."""
     share = torch.linspace(0, 1, STEPS + 1, dtype=like.dtype, device=like.device)[:, None]
     return torch.tanh(STEPS / 3 * share) * torch.tanh(STEPS / 3 * (1 - share))
 
 
 def orthonormalized(channels: Float[Tensor, "*batch channel"]) -> Float[Tensor, "*batch channel"]:
-    """Make the columns of r orthonormal."""
+    """Orthonormalize the columns of r."""
     r = rigid_torch.rotation_to_6d(rigid_torch.rotation_from_6d(channels[..., 3:ROOT_CHANNELS]))
     return torch.cat([channels[..., :3], r, channels[..., ROOT_CHANNELS:]], dim=-1)
 
 
 class RouteNet(nn.Module):
-    """Positions and orientations between start and end (Eq. 1); or positions alone, orientations being left
-    to PoseNet.
+    """Root positions and, unless PoseNet predicts them, rotations between start and end (Eq. 1).
 
-    Beyond the paper it also sees the poses at both ends, which indicate whether the body is on the move, and
-    corrects a draft by the distances beside it; as in the paper, by a code of the scene's points alone, if
-    ``blind``.
+    Beyond the paper, it sees the poses at both ends, which show whether the body is walking, and refines a
+    coarse route by the signed distance around it. If ``blind`` it sees only scene points, as in the paper.
     """
 
     def __init__(
@@ -218,7 +211,7 @@ class RouteNet(nn.Module):
     def stages(
         self, start: Float[Tensor, "batch channel"], end: Float[Tensor, "batch channel"], seen: LocalScene
     ) -> list[Float[Tensor, "batch frame 9"]]:
-        """Return the routes that are made one after the other, the last of which counts."""
+        """Return the routes of all stages, the final one last."""
         first, last = start[:, :ROOT_CHANNELS], end[:, :ROOT_CHANNELS]
         if isinstance(self.between, InbetweenNet):
             routes = [orthonormalized(self.between(first, last, seen.points))]
@@ -228,34 +221,33 @@ class RouteNet(nn.Module):
         if self.predicts_rotation:
             return routes
         share = torch.linspace(0, 1, STEPS + 1, device=first.device)[None, :, None]
-        straight = torch.lerp(first[:, None, 3:], last[:, None, 3:], share)
-        return [orthonormalized(torch.cat([route[..., :3], straight], dim=-1)) for route in routes]
+        rotation = torch.lerp(first[:, None, 3:], last[:, None, 3:], share)
+        return [orthonormalized(torch.cat([route[..., :3], rotation], dim=-1)) for route in routes]
 
     def forward(
         self, start: Float[Tensor, "batch channel"], end: Float[Tensor, "batch channel"], seen: LocalScene
     ) -> Float[Tensor, "batch frame 9"]:
-        """Return t and r of all frames; r interpolated between the ends where the network does not turn."""
+        """Return t and r of all frames; r is interpolated unless the network predicts it."""
         return self.stages(start, end, seen)[-1]
 
 
 class GaitPhase(nn.Module):
-    """The poses of both ends, each taken along the route as a gait takes it: around and around with the way
-    and the time on the move.
+    """Phase features: the poses of both ends, advanced along the route as by a gait.
 
-    A pose is read as ``waves`` complex numbers that turn at learned rates; products of pose and phase are
-    what an LSTM learns slowly, and without them feet glide between the ends.
+    A pose is encoded as ``waves`` complex numbers that rotate at learned rates with distance and time of
+    locomotion. An LSTM learns such products of pose and phase slowly, and without them feet skate.
     """
 
     def __init__(self, pose: int, waves: int = 16):
         super().__init__()
         self.code = nn.Linear(pose, 2 * waves)
         step = torch.linspace(0, 1, waves)
-        turns = [FEWEST_TURNS + 2 * step, FEWEST_TURNS + 2 * ((7 * step) % 1), 0 * step]
-        self.rate = nn.Parameter(2 * torch.pi * torch.stack(turns, dim=-1))
+        cycles = [MIN_GAIT_CYCLES + 2 * step, MIN_GAIT_CYCLES + 2 * ((7 * step) % 1), 0 * step]
+        self.rate = nn.Parameter(2 * torch.pi * torch.stack(cycles, dim=-1))
 
     @property
     def channels(self) -> int:
-        """How many numbers a frame gets."""
+        """Channels per frame."""
         return 2 * self.code.out_features
 
     def forward(
@@ -264,11 +256,11 @@ class GaitPhase(nn.Module):
         end: Float[Tensor, "batch pose"],
         route: Float[Tensor, "batch frame 9"],
     ) -> Float[Tensor, "batch frame channel"]:
-        """Return the codes of start turned forward and of end turned backward."""
+        """Return the code of start rotated forward in phase, and that of end rotated backward."""
         phase = gait_progress(route) @ self.rate.T
-        return torch.cat([self._turned(start, phase), self._turned(end, phase - phase[:, -1:])], dim=-1)
+        return torch.cat([self._rotated(start, phase), self._rotated(end, phase - phase[:, -1:])], dim=-1)
 
-    def _turned(
+    def _rotated(
         self, pose: Float[Tensor, "batch pose"], phase: Float[Tensor, "batch frame wave"]
     ) -> Float[Tensor, "batch frame channel"]:
         real, imaginary = self.code(pose)[:, None].chunk(2, dim=-1)
@@ -277,11 +269,9 @@ class GaitPhase(nn.Module):
 
 
 class PoseNet(nn.Module):
-    """Poses between start and end along a route (Eq. 2); blind to the route, or also turning the body, as
-    variants.
+    """Poses between start and end along a route (Eq. 2); variants ignore the route or also predict rotations.
 
-    Beyond the paper it carries the poses of both ends along the route (`GaitPhase`); not where ``strides`` is
-    false.
+    Beyond the paper, with ``strides``, it has the phase features of both ends along the route (`GaitPhase`).
     """
 
     def __init__(
@@ -307,39 +297,39 @@ class PoseNet(nn.Module):
         route: Float[Tensor, "batch frame 9"],
         points: Float[Tensor, "batch point 3"],
     ) -> Float[Tensor, "batch frame channel"]:
-        """Return t, r and p of all frames: the route's, with the poses and, as a variant, the turns."""
+        """Return t, r and p of all frames: the route with poses, r predicted by the variant that does so."""
         if self.predicts_rotation:
             start, end = torch.cat([route[:, 0, 3:], start], -1), torch.cat([route[:, -1, 3:], end], -1)
         if self.strides is None or self.short is None:
-            made = self.between(start, end, points, with_velocity(route) if self.follows_route else None)
+            pose = self.between(start, end, points, with_velocity(route) if self.follows_route else None)
         else:
-            carried = self.strides(start, end, route)
-            made = self.between(start, end, points, torch.cat([with_velocity(route), carried], dim=-1))
-            made = made + end_window(made) * self.short(carried)
+            phase = self.strides(start, end, route)
+            pose = self.between(start, end, points, torch.cat([with_velocity(route), phase], dim=-1))
+            pose = pose + end_window(pose) * self.short(phase)
         if self.predicts_rotation:
-            return orthonormalized(torch.cat([route[..., :3], made], dim=-1))
-        return torch.cat([route, made], dim=-1)
+            return orthonormalized(torch.cat([route[..., :3], pose], dim=-1))
+        return torch.cat([route, pose], dim=-1)
 
 
 def with_velocity(route: Float[Tensor, "batch frame 9"]) -> Float[Tensor, "batch frame 18"]:
-    """Return a route with its change per tenth of a second, the velocity in the body's own axes."""
+    """Return a route with its change per tenth of a second, the velocity in the body's frame."""
     rate = functional.pad(route[:, 1:] - route[:, :-1], (0, 0, 0, 1), mode="replicate") * (RATE_HZ / 10)
-    own = rigid_torch.rotation_from_6d(route[..., 3:]).transpose(-1, -2)
-    return torch.cat([route, (own @ rate[..., :3, None])[..., 0], rate[..., 3:]], dim=-1)
+    body_from_clip = rigid_torch.rotation_from_6d(route[..., 3:]).transpose(-1, -2)
+    return torch.cat([route, (body_from_clip @ rate[..., :3, None])[..., 0], rate[..., 3:]], dim=-1)
 
 
 def gait_progress(route: Float[Tensor, "batch frame 9"]) -> Float[Tensor, "batch frame 3"]:
-    """Return, since the start: metres gone, seconds on the move, turns of the heading."""
-    gone = (route[:, 1:, :3] - route[:, :-1, :3])[..., [0, 2]].norm(dim=-1)
-    ahead = rigid_torch.rotation_from_6d(route[..., 3:])[..., 2]
-    turned = (ahead[:, 1:] - ahead[:, :-1]).norm(dim=-1)
-    drive = RATE_HZ * (gone + LEVER_M * turned)
-    steps = torch.stack([gone, drive / (drive + IDLE_M_S) / RATE_HZ, turned], dim=-1)
+    """Return since the start: distance (m), time of locomotion (s), and path length of the forward axis."""
+    distance = (route[:, 1:, :3] - route[:, :-1, :3])[..., [0, 2]].norm(dim=-1)
+    forward = rigid_torch.rotation_from_6d(route[..., 3:])[..., 2]
+    turn = (forward[:, 1:] - forward[:, :-1]).norm(dim=-1)
+    speed = RATE_HZ * (distance + LEVER_M * turn)
+    steps = torch.stack([distance, speed / (speed + IDLE_M_S) / RATE_HZ, turn], dim=-1)
     return functional.pad(steps.cumsum(1), (0, 0, 1, 0))
 
 
 class BaseNet(nn.Module):
-    """Route and poses from one network (ablation), its draft corrected by the distances beside it."""
+    """Route and poses from one coarse-to-fine network (ablation)."""
 
     def __init__(self, sizes: LongTermSizes, *, with_scene: bool = True):
         super().__init__()
@@ -348,7 +338,7 @@ class BaseNet(nn.Module):
     def stages(
         self, start: Float[Tensor, "batch channel"], end: Float[Tensor, "batch channel"], seen: LocalScene
     ) -> list[Float[Tensor, "batch frame channel"]]:
-        """Return the motions that are made one after the other, the last of which counts."""
+        """Return the motions of all stages, the final one last."""
         return self.between.stages(start, end, seen)
 
     def forward(

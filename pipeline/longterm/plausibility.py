@@ -1,7 +1,7 @@
-"""How physical a motion in a scene is: collision, contact, sliding feet and seams, as the paper counts them.
+"""Physical plausibility of motion in a scene: collision, contact, foot skate and seams, as in the paper.
 
-`stance` says which feet stand when; `plausibility` measures a motion with it, so that a motion before and
-after it was optimised is judged by the same stance.
+`plausibility` takes the stance as an argument, so that a motion can be measured with the same stance before
+and after optimisation.
 """
 
 from dataclasses import dataclass
@@ -17,34 +17,34 @@ from pipeline.longterm.contacts import ContactVertices, detect_stance, motion_te
 from pipeline.longterm.short_motions import RATE_HZ, BodyMotion
 
 FRAMES_AT_ONCE = 200
-"""Frames whose vertices are held at a time, for memory."""
+"""Frames per batch, to bound memory."""
 SOLID_M = 0.005
-"""A vertex deeper than this inside the scene collides: half a centimetre is what grid and fur leave open."""
+"""A vertex penetrating the scene by more than this collides; grid and fur are no more accurate."""
 CONTACT_M = 0.02
-"""A body whose closest contact vertex is no further than this from the scene touches it."""
+"""A body with a contact vertex within this distance of the scene is in contact."""
 
 
 @dataclass(frozen=True)
 class Plausibility:
-    """Figures of one motion."""
+    """Metrics of one motion."""
 
     non_collision: float
-    """share of vertices and frames outside of what is solid"""
+    """share of vertices without collision, over all frames"""
     contact: float
-    """share of frames in which the body touches the scene"""
+    """share of frames with contact"""
     penetration_m: float
-    """mean depth inside the scene over vertices and frames"""
+    """mean penetration depth over vertices and frames"""
     deepest_m: float
-    """deepest vertex of any frame, a positive number"""
+    """largest penetration depth of any vertex and frame"""
     slide_m_s: float
-    """median speed along the ground of feet while they stand, or should; NaN where none does"""
+    """foot skate: median horizontal speed of feet in stance; NaN without any stance"""
     min_slide_m_s: float
-    """median speed over the ground of the slowest foot near the scene: one should stand"""
+    """median horizontal speed of the slowest foot near the scene, which should be in stance"""
 
 
 @dataclass(frozen=True)
 class PlausibilityMeter:
-    """A body and its contacts in a scene, ready to measure motions."""
+    """Measures motions of a body, with its contact vertices, in a scene."""
 
     body: SkinnedBody
     contacts: ContactVertices
@@ -52,11 +52,11 @@ class PlausibilityMeter:
 
     @cached_property
     def surface(self) -> PosedSurface:
-        """All vertices of the body, to be posed."""
+        """The full surface of the body."""
         return PosedSurface(self.body)
 
     def stance(self, motion: BodyMotion, *, should_stand: bool = False) -> Bool[np.ndarray, "frame foot"]:
-        """Return which feet stand when, or with ``should_stand`` which should."""
+        """Return the stance of each foot, or with ``should_stand`` which feet should be in stance."""
         points = PosedSurface(self.body, self.contacts.vertices)(*motion_tensors(motion))
         centres, height = self.contacts.centres(points), self.contacts.lowest(self.scene.at(points))
         roots = motion.world_from_agent[:, :3, 3]
@@ -65,42 +65,41 @@ class PlausibilityMeter:
     def gap_and_penetration(
         self, motion: BodyMotion
     ) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame"]]:
-        """Return, per frame, the gap between body and scene and the depth of the deepest vertex, metres."""
+        """Return per frame the gap between contact vertices and scene, and the penetration depth, metres."""
         distance = self.scene.at(self.surface(*motion_tensors(motion)))
         gap = distance[:, self.contacts.vertices].min(1).values.clamp_min(0)
         return gap.numpy(), (-distance).clamp_min(0).amax(1).numpy()
 
     def plausibility(self, motion: BodyMotion, stance: Bool[np.ndarray, "frame foot"]) -> Plausibility:
         """Measure a motion on all vertices of the body."""
-        distance, points = [], []
+        distances, points = [], []
         for start in range(0, len(motion), FRAMES_AT_ONCE):
             vertices = self.surface(*motion_tensors(motion[start : start + FRAMES_AT_ONCE]))
-            distance.append(self.scene.at(vertices))
+            distances.append(self.scene.at(vertices))
             points.append(vertices[:, self.contacts.vertices])
-        depth, touching = torch.cat(distance), torch.cat(points)
-        centres = self.contacts.centres(touching).numpy()
+        distance = torch.cat(distances)
+        centres = self.contacts.centres(torch.cat(points)).numpy()
         both = stance[1:] & stance[:-1]
         speed = np.linalg.norm(np.diff(centres, axis=0)[..., [0, 2]], axis=-1) * RATE_HZ
-        near = self.contacts.lowest(depth[1:, self.contacts.vertices]).numpy() < CONTACT_M
-        least = np.where(near, speed, np.inf).min(axis=1, initial=np.inf)
-        slide, least = speed[both], least[np.isfinite(least)]
+        near = self.contacts.lowest(distance[1:, self.contacts.vertices]).numpy() < CONTACT_M
+        slowest = np.where(near, speed, np.inf).min(axis=1, initial=np.inf)
+        skate, slowest = speed[both], slowest[np.isfinite(slowest)]
         return Plausibility(
-            non_collision=float((depth > -SOLID_M).float().mean()),
-            contact=float((depth[:, self.contacts.vertices].min(1).values < CONTACT_M).float().mean()),
-            penetration_m=float((-depth).clamp_min(0).mean()),
-            deepest_m=float((-depth).clamp_min(0).max()),
-            slide_m_s=float(np.median(slide)) if len(slide) else float("nan"),
-            min_slide_m_s=float(np.median(least)) if len(least) else float("nan"),
+            non_collision=float((distance > -SOLID_M).float().mean()),
+            contact=float((distance[:, self.contacts.vertices].min(1).values < CONTACT_M).float().mean()),
+            penetration_m=float((-distance).clamp_min(0).mean()),
+            deepest_m=float((-distance).clamp_min(0).max()),
+            slide_m_s=float(np.median(skate)) if len(skate) else float("nan"),
+            min_slide_m_s=float(np.median(slowest)) if len(slowest) else float("nan"),
         )
 
 
 def seams(
     body: SkinnedBody, motion: BodyMotion, every: int, vertices: int | None = 200
 ) -> Float[np.ndarray, "seam vertex"]:
-    """Return, at every ``every``-th frame, how much further each vertex moves than in the frames beside it,
-    metres.
+    """Return how much longer each vertex's step is at every ``every``-th frame than beside it, metres.
 
-    ``vertices`` spread over the surface are looked at; None: all.
+    ``vertices`` is the number of sampled vertices; None: all.
     """
     surface = PosedSurface(body, None if vertices is None else body.sample_vertices(vertices))
     at = np.arange(every, len(motion) - 2, every)

@@ -1,8 +1,8 @@
-"""Motion at 30 fps and its 2-second pieces, in which long-term motion is learned and made.
+"""Motion at 30 fps; long-term motion is learned and synthesized in two-second clips of it.
 
-`BodyMotion` is a stretch of motion of one body; `resample_motion` brings a trajectory to 30 fps (spline on
-positions, slerp on rotations), `stretches` cuts it where frames are missing; `smooth_seams` smooths where
-short motions were `concatenate_motions`, `limit_turn_rate` takes the time for a turn that an animal needs.
+`BodyMotion` is a stretch of motion of one body. `resample_motion` resamples a trajectory to 30 fps (cubic
+spline on positions, slerp on rotations), `stretches` splits it at missing frames. `smooth_seams` smooths the
+seams that `concatenate_motions` leaves, `limit_turn_rate` slows turns down to a rate that an animal can make.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ RATE_HZ = 30
 STEPS = 60
 """k of the paper: a short motion has k + 1 frames, the first and the last of which are given"""
 EARLY, LATE = (0.2, 0.55), (0.45, 0.8)
-"""shares of a leap in which it rises and goes across, or goes across and comes down"""
+"""phases of a jump, as shares of its duration: first up (or across), then across (or down)"""
 
 
 @dataclass(frozen=True)
@@ -39,17 +39,14 @@ class BodyMotion:
 
 
 def concatenate_motions(parts: Sequence[BodyMotion]) -> BodyMotion:
-    """Put stretches one after the other; frames in which one ends and the next begins count once."""
-    first, *rest = parts
-    every = [first, *(part[1:] for part in rest)]
-    roots, bones = (
-        [getattr(part, name) for part in every] for name in ("world_from_agent", "agent_from_bone")
-    )
-    return BodyMotion(np.concatenate(roots), np.concatenate(bones))
+    """Concatenate consecutive stretches; the frame that two of them share is kept once."""
+    parts = [parts[0], *(part[1:] for part in parts[1:])]
+    roots = np.concatenate([part.world_from_agent for part in parts])
+    return BodyMotion(roots, np.concatenate([part.agent_from_bone for part in parts]))
 
 
 def jump_between_levels(motion: BodyMotion, hop_m: float = 0.08) -> BodyMotion:
-    """Let a motion to another level rise before it goes across, or go across before it comes down."""
+    """Turn a motion between two levels into a jump: up before across, or across before down."""
     share, (start, end) = np.linspace(0, 1, len(motion)), motion.world_from_agent[[0, -1], :3, 3]
     early, late = (_smoothstep(share, *span) for span in (EARLY, LATE))
     upward, across = (early, late) if end[1] > start[1] else (late, early)
@@ -67,26 +64,23 @@ def _smoothstep(share: Float[np.ndarray, "frame"], low: float, high: float) -> F
 
 
 def smooth_seams(motion: BodyMotion, every: int = STEPS, reach: int = 6) -> BodyMotion:
-    """Take the snap out of the seams at every ``every``-th frame: the ``reach`` frames on both sides lead
-    there evenly.
+    """Interpolate over the ``reach`` frames on both sides of the seam at every ``every``-th frame.
 
-    Each short motion ends in a body that was made without it, and turns to it within its last frames.
+    Each clip ends in a given body that was sampled independently, and would snap to it in its last frames.
     """
     frame, last = np.arange(len(motion)), (len(motion) - 1) // every - 1
     if last < 1:
         return motion
     seam = np.clip(np.round(frame / every), 1, last) * every
-    away = np.abs(frame - seam)
-    anchors = np.flatnonzero((away == 0) | (away > reach))
+    offset = np.abs(frame - seam)
+    anchors = np.flatnonzero((offset == 0) | (offset > reach))
     return _interpolate(anchors, motion[anchors], frame)
 
 
 def limit_turn_rate(motion: BodyMotion, max_rad: float) -> BodyMotion:
-    """Spread turns of the root that are faster than ``max_rad`` a frame over the frames before and after;
-    positions and poses stay.
+    """Spread root turns faster than ``max_rad`` per frame over neighbouring frames; positions and poses stay.
 
-    Asked to face about within two seconds, networks that give orientations as two vectors flip within a frame
-    or two.
+    For half a turn within two seconds, networks with 6D rotations flip within a frame or two.
     """
     rotation = Rotation.from_matrix(motion.world_from_agent[:, :3, :3])
     turned = np.concatenate([[0.0], np.cumsum((rotation[:-1].inv() * rotation[1:]).magnitude())])
@@ -94,21 +88,21 @@ def limit_turn_rate(motion: BodyMotion, max_rad: float) -> BodyMotion:
     ramp = max(max_rad, turned[-1] / max(len(motion) - 1, 1)) * frame
     late = np.minimum.accumulate(turned - ramp) + ramp
     early = np.maximum.accumulate((turned - ramp)[::-1])[::-1] + ramp
-    wanted = np.clip((late + early) / 2, turned[-1] - ramp[::-1], ramp)
+    limited = np.clip((late + early) / 2, turned[-1] - ramp[::-1], ramp)
     roots = motion.world_from_agent.copy()
-    roots[:, :3, :3] = Slerp(frame, rotation)(np.interp(wanted, turned + 1e-9 * frame, frame)).as_matrix()
+    roots[:, :3, :3] = Slerp(frame, rotation)(np.interp(limited, turned + 1e-9 * frame, frame)).as_matrix()
     return BodyMotion(roots, motion.agent_from_bone)
 
 
-def resample_motion(timestamp_s: Float[np.ndarray, "frame"], moving: BodyMotion) -> BodyMotion:
-    """Bring motion to 30 fps: cubic spline on positions, slerp on rotations; roots and bones alike."""
+def resample_motion(timestamp_s: Float[np.ndarray, "frame"], motion: BodyMotion) -> BodyMotion:
+    """Resample root and bones to 30 fps: cubic spline on positions, slerp on rotations."""
     count = int(np.floor((timestamp_s[-1] - timestamp_s[0]) * RATE_HZ + 1e-6)) + 1
     query_s = np.minimum(timestamp_s[0] + np.arange(count) / RATE_HZ, timestamp_s[-1])
-    return _interpolate(timestamp_s, moving, query_s)
+    return _interpolate(timestamp_s, motion, query_s)
 
 
 def stretches(trajectory: Trajectory, shortest_s: float = STEPS / RATE_HZ) -> list[BodyMotion]:
-    """Return every uninterrupted stretch of a trajectory that is long enough, at 30 fps."""
+    """Return the uninterrupted stretches of a trajectory that last ``shortest_s`` or longer, at 30 fps."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], trajectory.valid, [False]]).astype(np.int8)))
     found = []
     for start, end in zip(edges[::2], edges[1::2], strict=True):

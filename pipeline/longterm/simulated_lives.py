@@ -1,7 +1,4 @@
-"""Simulated motion of one body in several homes as files: `body/`, `scenes/<number>.ply`, `motion.npz`.
-
-`save` writes what a simulation of known truth produced; `load` reads it.
-"""
+"""Files of simulated motion of one body in several homes: `body/`, `scenes/<number>.ply`, `motion.npz`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +14,7 @@ from pipeline.longterm.short_motions import BodyMotion
 from pipeline.longterm.surroundings import MotionScene
 
 Split = Literal["train", "held_out", "unseen"]
-"""to learn from; another session in a known home; a home never seen"""
+"""training sessions; held-out sessions in training homes; sessions in an unseen home"""
 
 
 def save(
@@ -28,7 +25,7 @@ def save(
     scene_of: Sequence[int],
     split: Sequence[Split],
 ) -> None:
-    """Write bodies, homes and sessions at 30 fps."""
+    """Write the body, the homes and the sessions at 30 fps."""
     (folder / "body").mkdir()
     (folder / "scenes").mkdir()
     ply.write_ply(folder / "body" / "agent.ply", body.mesh)

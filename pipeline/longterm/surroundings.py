@@ -1,7 +1,4 @@
-"""The scene around a motion: its signed distance, and points of its surface as PointNet reads them.
-
-`MotionScene` is a part of a mesh; `MotionScene.around` draws the points near any frame, in that frame.
-"""
+"""The scene around a motion: its signed distance, and surface points as input of PointNet."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -19,18 +16,18 @@ from pipeline.geometry.signed_distance import SignedDistance, SurfacePoints
 
 SPACING_M = 0.07
 VERTICAL_SURFACE = 0.7
-"""A surface whose normal has a smaller vertical part stands; half of the points are drawn from such."""
+"""A surface whose normal has a smaller vertical component is steep; half of the points are sampled there."""
 MARGIN_M = 0.15
-"""Distances are known this far beyond the mesh."""
+"""Margin of the signed distance grid around the mesh."""
 LEVEL_SURFACE = 0.9
-"""A surface whose normal has a larger vertical part lies."""
+"""A surface whose normal has a larger vertical component is level."""
 BIN_M, FLOOR_BAND_M = 0.02, 0.03
-"""Levels are counted in bins of this size; the floor is the median of what lies this close to its bin."""
+"""Bin size of the histogram of heights; the floor is the median of points this close to its bin."""
 
 
 @dataclass(frozen=True)
 class MotionScene:
-    """A still surface between two corners of a box, ready to be asked."""
+    """The part of a static scene mesh in an axis-aligned box; its signed distance is computed lazily."""
 
     mesh: Mesh
     low: Float[np.ndarray, "3"]
@@ -38,13 +35,13 @@ class MotionScene:
     """world frame"""
     voxel_m: float = 0.04
     known: SignedDistance | None = None
-    """distances in that part, where the scan came with them"""
+    """signed distance in the box, if the scan came with one"""
 
     @classmethod
     def for_motion(
         cls, mesh: Mesh, roots_world: Float[np.ndarray, "frame 3"], reach_m: float = 0.7
     ) -> "MotionScene":
-        """Take the whole breadth of a mesh, at the heights where a body has been."""
+        """Take a mesh at full width, cropped to ``reach_m`` above and below the heights of the roots."""
         low, high = np.asarray(mesh.vertices).min(0) - MARGIN_M, np.asarray(mesh.vertices).max(0) + MARGIN_M
         low[1] = max(low[1], roots_world[:, 1].min() - reach_m)
         high[1] = min(high[1], roots_world[:, 1].max() + reach_m)
@@ -52,25 +49,25 @@ class MotionScene:
 
     @classmethod
     def reconstructed(cls, reconstruction: Path, tracks: Iterable[Trajectory]) -> "MotionScene":
-        """Read `scene.ply` at the heights where the reconstructed animal has been."""
+        """Read `scene.ply`, cropped to the heights of the reconstructed animal."""
         roots = np.concatenate([track.world_from_agent[track.valid, :3, 3] for track in tracks])
         return cls.for_motion(ply.read_ply(reconstruction / "scene.ply"), roots)
 
     @cached_property
     def distance(self) -> SignedDistance:
-        """The signed distance in that part; measured when first asked for, where it is not known."""
+        """The signed distance in the box."""
         return self.known or signed_distance.from_mesh(self.mesh, self.low, self.high, voxel_m=self.voxel_m)
 
     @cached_property
     def surface(self) -> SurfacePoints:
-        """Points of the surface in that part."""
+        """Points of the surface in the box."""
         points = signed_distance.surface_points(self.mesh, SPACING_M)
         inside = ((points.points > self.low) & (points.points < self.high)).all(1)
         return SurfacePoints(points.points[inside], points.normals[inside])
 
     @property
     def floor_m(self) -> float:
-        """Height of the floor: the lowest level with a fair share of the surface that lies facing up."""
+        """Height of the floor: the lowest level with a quarter or more of the points of the largest level."""
         level = self.surface.points[self.surface.normals[:, 1] > LEVEL_SURFACE, 1]
         if not len(level):
             return float(self.surface.points[:, 1].min())
@@ -86,7 +83,7 @@ class MotionScene:
         count: int,
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "batch point 3"]:
-        """Draw points within ``reach_m`` of each centre, in the given frames; zeros where there are none."""
+        """Sample points within ``reach_m`` of each centre, in the given frames; zeros if there are none."""
         points = self.surface.points.astype(np.float32)
         standing = np.abs(self.surface.normals[:, 1]) < VERTICAL_SURFACE
         frame_from_world = rigid.inverse(world_from_frame)

@@ -37,13 +37,13 @@ def write_journey(folder: Path, journey: Journey, body: SkinnedBody) -> None:
     npz.save(
         folder / "take.npz",
         timestamp_s=journey.timestamp_s,
-        world_from_agent=journey.moving.world_from_agent,
-        agent_from_bone=journey.moving.agent_from_bone.astype(np.float32),
+        world_from_agent=journey.motion.world_from_agent,
+        agent_from_bone=journey.motion.agent_from_bone.astype(np.float32),
         subgoals_world=journey.subgoals_world,
         arrival_s=journey.arrival_s.astype(np.float64),
     )
-    skin = skin_of(body, journey.moving.agent_from_bone)
-    moving = journey.moving
+    skin = skin_of(body, journey.motion.agent_from_bone)
+    moving = journey.motion
     action = glb.Action("take", journey.timestamp_s, moving.world_from_agent, moving.agent_from_bone)
     (folder / "take.glb").write_bytes(glb.skinned(body.mesh, skin, [action]))
     about = {

@@ -198,7 +198,7 @@ def through_subgoals(inputs: Inputs, written: list[Subgoal] | None, c: Config, d
         journey_files.write_journey(folder, made, world.body)
         if c.pictures_per_s > 0:
             scene = ply.read_ply(_required(inputs, "reconstruction") / "scene.ply")
-            journey_files.write_frames(folder, made.moving, world.body, scene, rate_hz=c.pictures_per_s)
+            journey_files.write_frames(folder, made.motion, world.body, scene, rate_hz=c.pictures_per_s)
 
     metrics = made.after
     summary = f"{made.timestamp_s[-1]:.0f} s through {len(subgoals)} sub-goals; "

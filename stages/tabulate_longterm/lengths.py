@@ -32,11 +32,11 @@ def figures(source: MotionSource, config: Config) -> dict[str, float | None]:
     made = travel(world, timed, config.optimization, rng)
     low, high = world.scene.surface.points.min(0), world.scene.surface.points.max(0)
     surface, outside = PosedSurface(world.body, world.body.sample_vertices(WATCHED_VERTICES)), 0.0
-    for start in range(0, len(made.moving), FRAMES_AT_ONCE):
-        points = surface(*motion_tensors(made.moving[start : start + FRAMES_AT_ONCE])).numpy()
+    for start in range(0, len(made.motion), FRAMES_AT_ONCE):
+        points = surface(*motion_tensors(made.motion[start : start + FRAMES_AT_ONCE])).numpy()
         beyond = np.maximum(np.maximum(low - points, points - high), 0)[..., [0, 2]]
         outside = max(outside, float(beyond.max()))
-    there = made.moving.world_from_agent[np.round(made.arrival_s * RATE_HZ).astype(int), :3, 3]
+    there = made.motion.world_from_agent[np.round(made.arrival_s * RATE_HZ).astype(int), :3, 3]
     reached = np.linalg.norm((there - made.subgoals_world)[:, [0, 2]], axis=1)
     found = {
         "seconds": float(made.timestamp_s[-1]),

@@ -64,7 +64,7 @@ def route_cvae(
             )
             shape = torch.from_numpy(dataset.body.shape).float().expand(len(roots), -1)
             z = torch.from_numpy(rng.standard_normal(model.sizes.latent)).float().expand(len(roots), -1)
-            drawn = model.static.decode(z, model.static.given(places.place, shape, places.points))
+            drawn = model.static.decode(z, model.static.encode_condition(places.place, shape, places.points))
             made.append(torch.cat([route[index], drawn[:, ROOT_CHANNELS:]], dim=-1))
     return torch.stack(made)
 

@@ -215,7 +215,7 @@ def fit_body(
 
     def loss(index: Tensor) -> dict[str, Tensor]:
         truth = bodies.truth[index]
-        given = net.given(
+        given = net.encode_condition(
             bodies.places.place[index], shape.expand(len(index), -1), bodies.places.points[index]
         )
         mean, log_variance = net.encode(truth, given)

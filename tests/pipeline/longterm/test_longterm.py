@@ -10,7 +10,13 @@ from pipeline.longterm.clip_channels import decode_clip, encode_clips, encode_pl
 from pipeline.longterm.config import LongTermSizes
 from pipeline.longterm.contacts import find_contact_vertices
 from pipeline.longterm.examples import encode_selection, fit_pose_space, sample_static_bodies, select_clips
-from pipeline.longterm.local_scene import FARTHEST_M, NEAREST_M, READ_CHANNELS, LocalScene, read_distances
+from pipeline.longterm.local_scene import (
+    MAX_DISTANCE_M,
+    MIN_DISTANCE_M,
+    READ_CHANNELS,
+    LocalScene,
+    read_distances,
+)
 from pipeline.longterm.motion_synthesis import LongTerm, measure_motion_prior
 from pipeline.longterm.networks import GaitPhase, PointNet, PoseNet, RouteNet, StaticBody, gait_progress
 from pipeline.longterm.short_motions import STEPS
@@ -74,7 +80,7 @@ def test_distances_beside_a_route_are_those_of_the_scene(dataset, clips):
     assert read.shape == (*clips.channels.shape[:2], READ_CHANNELS)
     frames = torch.from_numpy(clips.world_from_clip).float()
     root = torch.einsum("cij,cfj->cfi", frames[:, :3, :3], clips.channels[..., :3]) + frames[:, None, :3, 3]
-    true = dataset.scenes[0].distance.at(root).clamp(NEAREST_M, FARTHEST_M)
+    true = dataset.scenes[0].distance.at(root).clamp(MIN_DISTANCE_M, MAX_DISTANCE_M)
     assert (read[..., 0] / 4 - true).abs().max() < 0.05
     torch.testing.assert_close(
         read[..., READ_CHANNELS // 2], 10 * (0.15 - read[..., 0] / 4).clamp_min(0), atol=1e-4, rtol=0

@@ -89,16 +89,16 @@ def test_a_journey_is_made_and_written(world, tmp_path):
     goals = [Subgoal(np.array([-1.2, np.nan, -1.0])), Subgoal(np.array([1.2, np.nan, -1.0]))]
     made = journeys.travel(world, goals, SETTINGS, np.random.default_rng(0))
     again = journeys.travel(world, goals, SETTINGS, np.random.default_rng(0))
-    np.testing.assert_array_equal(made.moving.world_from_agent, again.moving.world_from_agent)
+    np.testing.assert_array_equal(made.motion.world_from_agent, again.motion.world_from_agent)
     assert made.after.penetration_m <= made.before.penetration_m
     np.testing.assert_allclose(made.subgoals_world[:, [0, 2]], [[-1.2, -1], [1.2, -1]], atol=1e-6)
     assert made.arrival_s[-1] == pytest.approx(made.timestamp_s[-1])
     journey_files.write_journey(tmp_path, made, world.body)
     journey_files.write_frames(
-        tmp_path, made.moving[:30], world.body, strider.room(), rate_hz=10.0, width=64, height=48
+        tmp_path, made.motion[:30], world.body, strider.room(), rate_hz=10.0, width=64, height=48
     )
     take = npz.load(tmp_path / "take.npz")
-    assert take["agent_from_bone"].shape == (len(made.moving), 5, 4, 4)
+    assert take["agent_from_bone"].shape == (len(made.motion), 5, 4, 4)
     about = json.loads((tmp_path / "take.json").read_text())
     assert about["rate_hz"] == 30 and len(about["subgoals_world"]) == 2 and about["after"]["contact"] <= 1
     assert (tmp_path / "take.glb").read_bytes()[:4] == b"glTF"
@@ -141,7 +141,7 @@ def test_recorded_motion_becomes_physical(world, tmp_path):
     journey_files.write_journey(tmp_path, made, world.body)
     assert json.loads((tmp_path / "take.json").read_text())["subgoals_world"] == []
     left = journeys.refine_motion(world, walk, None)
-    assert left.moving is walk and left.before == left.after
+    assert left.motion is walk and left.before == left.after
 
 
 def test_a_model_of_another_version_is_told(world, tmp_path):
