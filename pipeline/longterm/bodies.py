@@ -1,9 +1,8 @@
-"""The body that moves through a scene: a skinned surface, and the numbers that say how it is posed.
+"""Skinned bodies and their pose space.
 
-`SkinnedBody` holds any animal's surface at rest; `PosedSurface` blends it to poses in torch; `PoseSpace`
-turns the bones of a frame into a few numbers p and back (the part that SMPL-X's body prior plays in the
-paper). Poses are bones in the agent frame; channels are those of
-`pipeline.behavior.model.channels_from_bones`.
+`SkinnedBody` is an animal's surface at rest with skinning weights. `PosedSurface` poses it by linear blend
+skinning in torch. `PoseSpace` encodes the bones of a frame as a code p, like the paper's SMPL-X body prior.
+Poses are bones in the agent frame; `pipeline.behavior.model.channels_from_bones` returns their channels.
 """
 
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from pipeline.geometry import rigid, rigid_torch
 from pipeline.geometry.meshes import Mesh
 
 LEVER_M = 0.1
-"""What a radian of a bone's rotation weighs against a metre of its shift in the pose space."""
+"""Length that converts bone rotations in radians to metres in the pose space."""
 
 
 @dataclass(frozen=True)
@@ -32,15 +31,15 @@ class SkinnedBody:
     weights: Float[np.ndarray, "vertex bone"]
     agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
     shape: Float[np.ndarray, "channel"]
-    """numbers that distinguish bodies of one kind (betas of SMPL-X); empty for one animal"""
+    """shape code (betas of SMPL-X); empty for a single animal"""
 
     @property
     def length_m(self) -> float:
-        """The longest side of the surface's box at rest."""
+        """Longest side of the bounding box at rest."""
         return float(np.ptp(self.mesh.vertices, axis=0).max())
 
     def sample_vertices(self, count: int) -> Int[np.ndarray, "vertex"]:
-        """Choose vertices that cover the surface evenly (farthest points, from the first vertex on)."""
+        """Choose vertices by farthest point sampling, starting from the first vertex."""
         points = np.asarray(self.mesh.vertices, np.float64)
         chosen, distance = [0], np.full(len(points), np.inf)
         while len(chosen) < min(count, len(points)):
@@ -50,14 +49,14 @@ class SkinnedBody:
 
 
 def load_body(reconstruction: Path) -> SkinnedBody:
-    """Read the reconstructed animal: `agent.ply` and `skin.npz`. Raises InputError where they are damaged."""
+    """Read the reconstructed animal: `agent.ply` and `skin.npz`. Raises InputError if they are damaged."""
     skin = SKIN.load(reconstruction / "skin.npz", "weights", "agent_from_bone_rest")
     mesh, rest = ply.read_ply(reconstruction / "agent.ply"), skin["agent_from_bone_rest"].astype(np.float64)
     return SkinnedBody(mesh, skin["weights"], rest, np.zeros(0))
 
 
 class PosedSurface(nn.Module):
-    """Some vertices of a body under linear blending, one matrix product for all frames."""
+    """Linear blend skinning of some vertices of a body, one matrix product for all frames."""
 
     blend: Float[Tensor, "vertex bone_column"]
 
@@ -73,14 +72,14 @@ class PosedSurface(nn.Module):
     def forward(
         self, world_from_agent: Float[Tensor, "frame 4 4"], agent_from_bone: Float[Tensor, "frame bone 4 4"]
     ) -> Float[Tensor, "frame vertex 3"]:
-        """Return the vertices in the world."""
+        """Return the posed vertices in the world."""
         world_from_bone = (world_from_agent[:, None] @ agent_from_bone)[..., :3, :]
         columns = world_from_bone.permute(1, 3, 0, 2).reshape(self.blend.shape[1], -1)  # bone*4 frame*3
         return (self.blend @ columns).unflatten(1, (-1, 3)).transpose(0, 1)
 
 
 class PoseSpace(nn.Module):
-    """Poses as p: principal components of the bones' channels, each of unit spread in the data."""
+    """Pose codes p: whitened principal components of the bones' channels."""
 
     rest: Float[Tensor, "bone 4 4"]
     mean: Float[Tensor, "channel"]
@@ -103,30 +102,30 @@ class PoseSpace(nn.Module):
         return len(self.basis)
 
     def fit(self, agent_from_bone: Float[np.ndarray, "frame bone 4 4"]) -> "PoseSpace":
-        """Find mean and components from poses; returns itself."""
+        """Fit mean and components to poses; returns itself."""
         channels = channels_from_bones(agent_from_bone, self.rest.double().numpy())
         scale = np.tile([LEVER_M] * 3 + [1.0] * 3, agent_from_bone.shape[1])
         mean = channels.mean(0)
-        _, spread, rows = np.linalg.svd((channels - mean) * scale, full_matrices=False)
-        retained = min(self.components, len(spread))
-        std = np.maximum(spread[:retained] / np.sqrt(len(channels)), 1e-6)
+        _, singular, rows = np.linalg.svd((channels - mean) * scale, full_matrices=False)
+        retained = min(self.components, len(singular))
+        std = np.maximum(singular[:retained] / np.sqrt(len(channels)), 1e-6)
         rows = rows * np.sign(rows[np.arange(len(rows)), np.abs(rows).argmax(1)])[:, None]
         self.mean[:] = torch.from_numpy(mean)
         self.basis[:retained] = torch.from_numpy(rows[:retained] * std[:, None] / scale)
         self.inverse[:, :retained] = torch.from_numpy((rows[:retained] / std[:, None]).T * scale[:, None])
-        self.explained.fill_(float((spread[:retained] ** 2).sum() / (spread**2).sum()))
+        self.explained.fill_(float((singular[:retained] ** 2).sum() / (singular**2).sum()))
         return self
 
     def encode(self, channels: Float[Tensor, "*batch channel"]) -> Float[Tensor, "*batch component"]:
-        """Turn channels of bones into p."""
+        """Encode channels of bones as p."""
         return (channels - self.mean) @ self.inverse
 
     def decode(self, p: Float[Tensor, "*batch component"]) -> Float[Tensor, "*batch channel"]:
-        """Turn p into channels of bones."""
+        """Decode p to channels of bones."""
         return self.mean + p @ self.basis
 
     def bones(self, channels: Float[Tensor, "*batch channel"]) -> Float[Tensor, "*batch bone 4 4"]:
-        """Turn channels into `agent_from_bone`."""
+        """Return `agent_from_bone` of channels."""
         twist = channels.unflatten(-1, (len(self.rest), 6))
         turn = rigid_torch.so3_exp(twist[..., :3])
         return rigid_torch.make(turn @ self.rest[:, :3, :3], self.rest[:, :3, 3] + twist[..., 3:])

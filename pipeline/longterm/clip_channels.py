@@ -1,8 +1,8 @@
-"""Motions and bodies as the networks of `pipeline.longterm.networks` see them, and back.
+"""Encoding of motions and bodies as channels of `pipeline.longterm.networks`, and decoding.
 
-A clip's frame lies half way between its first and last body. `encode_clips` gives channels (t, r, p) of
-2-second motions and the scene around them; `decode_clip` makes motion of channels; `encode_places` does the
-first for single bodies.
+A clip's frame has its origin half way between its first and last root. `encode_clips` returns channels
+(t, r, p) of two-second motions and the scene around them, `encode_places` the conditions of static bodies;
+`decode_clip` turns channels into motion.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from pipeline.longterm.short_motions import BodyMotion
 from pipeline.longterm.surroundings import MotionScene
 
 COINCIDENT_M = 0.1
-"""Start and end of a clip that are closer than this have no direction from one to the other."""
+"""If start and end of a clip are closer than this, its frame takes the heading of the start."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class Clips:
     channels: Float[Tensor, "clip frame channel"]
     """t, r, p"""
     seen: LocalScene
-    """the scene"""
+    """the scene around each"""
     scene: Int[np.ndarray, "clip"]
-    """index of the scene each is in"""
+    """index of the scene of each"""
 
     def __len__(self) -> int:
         return len(self.scene)
@@ -47,15 +47,15 @@ class Clips:
 
 
 def root_channels(a_from_agent: Float[np.ndarray, "*batch 4 4"]) -> Float[Tensor, "*batch 9"]:
-    """Return t and r."""
-    moved = torch.from_numpy(np.asarray(a_from_agent)).float()
-    return torch.cat([moved[..., :3, 3], rigid_torch.rotation_to_6d(moved[..., :3, :3])], dim=-1)
+    """Return t and r of roots."""
+    root = torch.from_numpy(np.asarray(a_from_agent)).float()
+    return torch.cat([root[..., :3, 3], rigid_torch.rotation_to_6d(root[..., :3, :3])], dim=-1)
 
 
 def pose_channels(
     agent_from_bone: Float[np.ndarray, "*batch bone 4 4"], poses: PoseSpace
 ) -> Float[Tensor, "*batch pose"]:
-    """Return p of LTM 3.2: numbers of the pose, without unit."""
+    """Return the pose code p of LTM 3.2, without unit."""
     rest = poses.rest.double().numpy()
     channels = channels_from_bones(np.asarray(agent_from_bone, np.float64), rest)
     return poses.encode(torch.from_numpy(channels).float())
@@ -66,9 +66,9 @@ def clip_frames(
 ) -> Float[np.ndarray, "clip 4 4"]:
     """Return frames half way between start and end, +y up, +z from start to end, or along the heading."""
     frame = world_from_ego(start_world, "yaw")
-    way = (end_world - start_world)[:, :3, 3] * [1.0, 0.0, 1.0]
-    length = np.linalg.norm(way, axis=1, keepdims=True)
-    forward = np.where(length > COINCIDENT_M, way / np.maximum(length, 1e-9), frame[:, :3, 2])
+    offset = (end_world - start_world)[:, :3, 3] * [1.0, 0.0, 1.0]
+    length = np.linalg.norm(offset, axis=1, keepdims=True)
+    forward = np.where(length > COINCIDENT_M, offset / np.maximum(length, 1e-9), frame[:, :3, 2])
     up = np.broadcast_to([0.0, 1.0, 0.0], forward.shape)
     rotation = np.stack([np.cross(up, forward), up, forward], axis=-1)
     return rigid.make(rotation, (start_world[:, :3, 3] + end_world[:, :3, 3]) / 2)
@@ -82,15 +82,14 @@ def encode_clips(
     points: int,
     rng: np.random.Generator,
 ) -> Clips:
-    """Turn short motions, or only their first and last frames, into channels; ``scene`` is the index of the
-    scene each takes place.
+    """Encode clips, or only their first and last frames; ``scene`` is the index of each one's scene.
 
-    Without ``points`` nothing is seen.
+    With ``points`` 0 the scene is left out.
     """
     world_from_clip = clip_frames(root_world[:, 0], root_world[:, -1])
     root = root_channels(rigid.inverse(world_from_clip)[:, None] @ root_world)
-    drawn = _points(world_from_clip, world_from_clip[:, :3, 3], scene, scenes, REACH_M, points, rng)
-    seen = LocalScene(drawn, distance_fields(world_from_clip, scene, scenes if points else []))
+    sampled = _points(world_from_clip, world_from_clip[:, :3, 3], scene, scenes, REACH_M, points, rng)
+    seen = LocalScene(sampled, distance_fields(world_from_clip, scene, scenes if points else []))
     return Clips(world_from_clip, torch.cat([root, p], dim=-1), seen, scene)
 
 
@@ -100,18 +99,19 @@ def decode_clip(
     poses: PoseSpace,
     ends: Float[np.ndarray, "2 bone 4 4"] | None = None,
 ) -> BodyMotion:
-    """Turn channels of one clip, or of one body, into motion in the world.
+    """Decode the channels of one clip, or of static bodies, to motion in the world.
 
-    What p leaves out of the given poses ``ends`` is added, from the first's to the last's, so that the motion
-    begins and ends in just these.
+    The residual of the given poses ``ends`` outside the pose space is added, interpolated from first to last,
+    so that the motion starts and ends in exactly these poses.
     """
     with torch.no_grad():
         posed = poses.decode(channels[..., ROOT_CHANNELS:])
         if ends is not None:
             rest = poses.rest.double().numpy()
             given = torch.from_numpy(channels_from_bones(np.asarray(ends, np.float64), rest)).float()
-            left = given - poses.decode(poses.encode(given))
-            posed = posed + torch.lerp(left[0], left[1], torch.linspace(0, 1, len(channels))[:, None])
+            residual = given - poses.decode(poses.encode(given))
+            share = torch.linspace(0, 1, len(channels))[:, None]
+            posed = posed + torch.lerp(residual[0], residual[1], share)
         bones = poses.bones(posed)
         rotation = rigid_torch.rotation_from_6d(channels[..., 3:ROOT_CHANNELS])
         clip_from_agent = rigid_torch.make(rotation, channels[..., :3])
@@ -120,7 +120,7 @@ def decode_clip(
 
 @dataclass(frozen=True)
 class EncodedPlaces:
-    """Places of single bodies, in their heading frames."""
+    """The conditions of static bodies, in the heading frames of their places."""
 
     world_from_place: Float[np.ndarray, "body 4 4"]
     place: Float[Tensor, "body 7"]
@@ -135,7 +135,7 @@ def encode_places(
     points: int,
     rng: np.random.Generator,
 ) -> EncodedPlaces:
-    """Describe where single bodies are to be: heading frame, clearance, orientation, scene points."""
+    """Encode the places of static bodies: heading frame, clearance, orientation, scene points."""
     world_from_place = world_from_ego(world_from_agent, "yaw")
     centre = np.asarray(world_from_agent)[:, :3, 3]
     clearance = torch.zeros(len(scene), 1)
@@ -156,8 +156,8 @@ def _points(
     count: int,
     rng: np.random.Generator,
 ) -> Float[Tensor, "clip point 3"]:
-    drawn = np.zeros((len(scene), count, 3), np.float32)
+    sampled = np.zeros((len(scene), count, 3), np.float32)
     for index, each in enumerate(scenes):
         rows = np.flatnonzero(scene == index)
-        drawn[rows] = each.around(frames[rows], centre[rows], reach_m, count, rng)
-    return torch.from_numpy(drawn)
+        sampled[rows] = each.around(frames[rows], centre[rows], reach_m, count, rng)
+    return torch.from_numpy(sampled)

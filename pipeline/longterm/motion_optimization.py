@@ -1,9 +1,8 @@
-"""Make a motion physical: standing feet do not slide, nothing is inside furniture, what touches keeps
-touching.
+"""Motion optimisation for physical plausibility: no foot skate, no penetration, contact preserved.
 
-`optimize_motion` moves positions, orientations and poses of all frames at once by Adam (Wang et al. 2021,
-Sec. 3.4). The same function with the same `MotionOptimizationConfig` serves long-term motion, samples of the
-behaviour model and reconstructed motion. World frame, metres, radians.
+`optimize_motion` optimises positions, orientations and poses of all frames jointly with Adam (Wang et al.
+2021, Sec. 3.4), for long-term motion, samples of the behaviour model and reconstructed motion alike. World
+frame, metres, radians.
 """
 
 from dataclasses import dataclass, replace
@@ -24,21 +23,21 @@ from pipeline.longterm.plausibility import SOLID_M, PlausibilityMeter
 from pipeline.longterm.short_motions import BodyMotion
 
 LEARNING_RATE = 0.004
-"""Of Adam, metres and radians a step; it falls to a tenth over the optimisation."""
+"""Initial learning rate of Adam, metres and radians."""
 RATE_FALL = 0.9
-"""Share of the learning rate that is lost over the optimisation, linearly."""
+"""Share of the learning rate by which it decays linearly over the optimisation."""
 LIFT_FRAMES = 4
-"""Frames before and after one that must be lifted in which the motion rises and sinks."""
+"""Frames before and after a lifted one over which the lift fades in and out."""
 HIGHEST_LIFT_M = 0.2
-"""What has no way up within this is a wall, and the body is not lifted over it."""
+"""A vertex that needs a higher lift is in a wall and is not lifted."""
 LIFT_STEP_M = 0.02
-"""Heights at which a way up is looked for."""
+"""Step between candidate lifts."""
 NEAR_M = 0.05
-"""Feet of a single body that are no further than this from the scene stand on it."""
+"""Feet of a static body within this distance of the scene are in stance."""
 SETTLING_STEPS = 80
-"""Steps that are enough for single bodies."""
+"""Maximum number of steps for static bodies."""
 FRAMES_AT_ONCE = 100
-"""In so many frames at a time the whole surface is looked at."""
+"""Frames per batch when the full surface is posed."""
 
 
 @dataclass(frozen=True)
@@ -46,37 +45,37 @@ class MotionTerms:
     """Weights and scales of the terms; each term is a mean over frames, in metres or square metres."""
 
     foot: float = 5.0
-    """E_foot: a standing foot stays where it stands on average"""
+    """E_foot: distance of a foot in stance from its mean position in that phase"""
     foot_tolerance_m: float = 0.002
-    """nearer than this to that place the pull on the foot fades"""
+    """smoothing of that distance near zero"""
     ground: float = 1.5
-    """a standing foot touches what it stands on"""
+    """distance of a foot in stance from the scene"""
     collision: float = 60.0
-    """E_col, Eq. 5: nothing is inside the scene, on average over vertices"""
+    """E_col, Eq. 5: penetration depth, mean over vertices"""
     collision_growth: float = 0.05
-    """growth of a frame's collision weight after each step of the second half that leaves a vertex inside;
-    the deepest vertex says nothing where a thing's whole breadth is covered, as a tail over a chair's leg"""
+    """growth of a frame's collision weight after each step of the second half with a colliding vertex; depth
+    alone gives no direction where the body spans an object's whole width, like a tail across a chair leg"""
     deepest: float = 6.0
-    """the deepest vertex of a frame is not inside the scene either"""
+    """penetration depth of a frame's deepest vertex"""
     margin_m: float = 0.002
-    """distance kept from what is solid"""
+    """clearance from the scene below which a vertex collides"""
     contact: float = 0.02
-    """E_cont, Eq. 6: contact vertices near the scene touch it"""
+    """E_cont, Eq. 6: robust distance of contact vertices from the scene"""
     contact_scale_m: float = 0.02
-    """distance at which the Geman-McClure function lets go"""
+    """scale of the Geman-McClure function"""
     smooth: float = 180.0
-    """E_smooth, Eq. 7: neighbouring meshes change evenly"""
+    """E_smooth, Eq. 7: squared acceleration of vertices"""
     stay: float = 6.0
-    """stay near the motion that was given"""
+    """squared distance from the given motion"""
 
 
 TERMS = MotionTerms()
-"""What every optimisation uses."""
+"""The weights of every optimisation."""
 
 
 @dataclass(frozen=True)
 class ContactBody:
-    """What a body brings to the optimisation: surface, contacts, and a space of poses."""
+    """A body with its contact vertices and pose space."""
 
     body: SkinnedBody
     contacts: ContactVertices
@@ -84,17 +83,17 @@ class ContactBody:
 
 
 class _Correction(torch.nn.Module):
-    """A motion and what is added to it: shift and turn of the root, and p of the pose."""
+    """A motion with learnable corrections: translation and rotation of the root, and pose code."""
 
-    def __init__(self, moving: BodyMotion, poses: PoseSpace):
+    def __init__(self, motion: BodyMotion, poses: PoseSpace):
         super().__init__()
-        self.root, _ = motion_tensors(moving)
-        bones, rest = np.asarray(moving.agent_from_bone, np.float64), poses.rest.double().numpy()
+        self.root, _ = motion_tensors(motion)
+        bones, rest = np.asarray(motion.agent_from_bone, np.float64), poses.rest.double().numpy()
         self.channels = torch.from_numpy(channels_from_bones(bones, rest)).float()
         self.poses = poses
-        self.shift = torch.nn.Parameter(torch.zeros(len(moving), 3))
-        self.turn = torch.nn.Parameter(torch.zeros(len(moving), 3))
-        self.pose = torch.nn.Parameter(torch.zeros(len(moving), poses.components))
+        self.shift = torch.nn.Parameter(torch.zeros(len(motion), 3))
+        self.turn = torch.nn.Parameter(torch.zeros(len(motion), 3))
+        self.pose = torch.nn.Parameter(torch.zeros(len(motion), poses.components))
 
     def forward(self) -> tuple[Float[Tensor, "frame 4 4"], Float[Tensor, "frame bone 4 4"]]:
         rotation = self.root[:, :3, :3] @ rigid_torch.so3_exp(self.turn)
@@ -103,34 +102,34 @@ class _Correction(torch.nn.Module):
 
 
 def optimize_motion(
-    moving: BodyMotion,
+    motion: BodyMotion,
     contact_body: ContactBody,
     scene: SignedDistance,
     settings: MotionOptimizationConfig,
     *,
     held: Bool[np.ndarray, "frame"] | None = None,
 ) -> BodyMotion:
-    """Return the motion with all constraints weighed against each other; ``held`` frames stay as they are."""
+    """Return the motion that minimizes the weighted sum of all terms; ``held`` frames are fixed."""
     meter = PlausibilityMeter(contact_body.body, contact_body.contacts, scene)
-    stance = meter.stance(moving, should_stand=True)
-    free = torch.ones(len(moving)) if held is None else torch.from_numpy(~held).float()
-    return _minimize(moving, contact_body, scene, settings, TERMS, stance, free, reach=LIFT_FRAMES)
+    stance = meter.stance(motion, should_stand=True)
+    free = torch.ones(len(motion)) if held is None else torch.from_numpy(~held).float()
+    return _minimize(motion, contact_body, scene, settings, TERMS, stance, free, reach=LIFT_FRAMES)
 
 
 def settle_bodies(
     bodies: BodyMotion, contact_body: ContactBody, scene: SignedDistance, settings: MotionOptimizationConfig
 ) -> BodyMotion:
-    """Move single bodies, each on its own, out of what is solid and onto what is under their feet."""
+    """Move static bodies, each independently, out of collision and into contact with the ground."""
     with torch.no_grad():
         feet = PosedSurface(contact_body.body, contact_body.contacts.vertices)(*motion_tensors(bodies))
         near = contact_body.contacts.lowest(scene.at(feet)).numpy() < NEAR_M
-    alone = replace(settings, steps=min(settings.steps, SETTLING_STEPS))
+    settings = replace(settings, steps=min(settings.steps, SETTLING_STEPS))
     terms = replace(TERMS, foot=0.0, smooth=0.0)
-    return _minimize(bodies, contact_body, scene, alone, terms, near, torch.ones(len(bodies)), reach=0)
+    return _minimize(bodies, contact_body, scene, settings, terms, near, torch.ones(len(bodies)), reach=0)
 
 
 def _minimize(
-    moving: BodyMotion,
+    motion: BodyMotion,
     contact_body: ContactBody,
     scene: SignedDistance,
     settings: MotionOptimizationConfig,
@@ -142,21 +141,21 @@ def _minimize(
 ) -> BodyMotion:
     body, contacts = contact_body.body, contact_body.contacts
     chosen = body.sample_vertices(settings.vertices)
-    watched = np.concatenate([chosen, contacts.vertices])
-    surface, both = PosedSurface(body, watched), len(watched)
-    correction = _Correction(moving, contact_body.poses)
+    sampled = np.concatenate([chosen, contacts.vertices])
+    surface, both = PosedSurface(body, sampled), len(sampled)
+    correction = _Correction(motion, contact_body.poses)
     with torch.no_grad():
         given = surface(*correction())
         correction.shift[:, 1] += free * lift_out_of_solid(given[:, len(chosen) :], scene, reach=reach)
     objective = _Objective(contacts, terms, phase_means(stance), len(chosen), given)
-    weight = torch.ones(len(moving), 1)
+    weight = torch.ones(len(motion), 1)
     optimizer = torch.optim.Adam(correction.parameters(), lr=LEARNING_RATE)
     for step in range(settings.steps):
         for group in optimizer.param_groups:
             group["lr"] = LEARNING_RATE * (1 - RATE_FALL * step / settings.steps)
         if step in (settings.steps // 2, 3 * settings.steps // 4):
             inside = _penetrating_vertices(body, correction, scene, both)
-            surface = PosedSurface(body, np.concatenate([watched, inside]))
+            surface = PosedSurface(body, np.concatenate([sampled, inside]))
         points = surface(*correction())
         distance = scene.at(points)
         if step >= settings.steps // 2:
@@ -181,7 +180,7 @@ class _Objective:
     terms: MotionTerms
     phases: tuple[Tensor, Tensor]
     count: int
-    """of sampled vertices, which come first; the contact vertices follow"""
+    """number of surface vertices; the contact vertices follow them"""
     given: Float[Tensor, "frame vertex 3"]
 
     def __call__(
@@ -210,7 +209,7 @@ class _Objective:
 def _penetrating_vertices(
     body: SkinnedBody, correction: _Correction, scene: SignedDistance, most: int
 ) -> Int[np.ndarray, "vertex"]:
-    """Return up to about ``most`` vertices of the surface that are inside the scene in any frame."""
+    """Return up to about ``most`` vertices of the full surface that penetrate the scene in any frame."""
     surface, deepest = PosedSurface(body), torch.full((len(body.mesh.vertices),), np.inf)
     for root, bones in zip(*(each.split(FRAMES_AT_ONCE) for each in correction()), strict=True):
         deepest = torch.minimum(deepest, scene.at(surface(root, bones)).amin(dim=0))
@@ -225,11 +224,10 @@ def _mean(values: Tensor) -> Tensor:
 def lift_out_of_solid(
     touching: Float[Tensor, "frame vertex 3"], scene: SignedDistance, *, reach: int
 ) -> Float[Tensor, "frame"]:
-    """Return how far to raise each frame for contact vertices that are inside of something to come out on
-    top.
+    """Return the upward shift of each frame that brings penetrating contact vertices above the surface.
 
-    The distance alone leads out on the nearest side: from a thin board often downwards. What has no way up
-    within `HIGHEST_LIFT_M` is a wall. Rising and sinking is spread over ``reach`` frames on both sides.
+    The distance gradient leads to the nearest side, which for a thin board is often the lower one. Vertices
+    that need more than `HIGHEST_LIFT_M` are ignored. Lifts fade in and out over ``reach`` frames.
     """
     heights = torch.arange(0, HIGHEST_LIFT_M, LIFT_STEP_M)
     up = torch.tensor([0.0, 1.0, 0.0])
@@ -243,9 +241,9 @@ def lift_out_of_solid(
 
 
 def phase_means(stance: Bool[np.ndarray, "frame foot"]) -> tuple[Int[Tensor, "stand"], Int[Tensor, "stand"]]:
-    """Return which (frame, foot) stand, flat, and the number of the phase that each belongs to."""
-    began = stance & ~np.concatenate([np.zeros_like(stance[:1]), stance[:-1]])
-    number = np.cumsum(began.T.reshape(-1)).reshape(stance.T.shape).T  # counts along one foot after the other
+    """Return the flat indices of (frame, foot) in stance, and the index of the phase of each."""
+    starts = stance & ~np.concatenate([np.zeros_like(stance[:1]), stance[:-1]])
+    number = np.cumsum(starts.T.reshape(-1)).reshape(stance.T.shape).T  # counts along one foot, then the next
     flat = np.flatnonzero(stance.reshape(-1))
     return torch.from_numpy(flat), torch.from_numpy(number.reshape(-1)[flat] - 1)
 
@@ -253,21 +251,21 @@ def phase_means(stance: Bool[np.ndarray, "frame foot"]) -> tuple[Int[Tensor, "st
 def foot_error(
     feet: Float[Tensor, "frame foot 3"],
     phases: tuple[Int[Tensor, "stand"], Int[Tensor, "stand"]],
-    give_m: float,
+    tolerance_m: float,
 ) -> Float[Tensor, "stand"]:
-    """Return the distance of each standing foot from its mean place in that phase (E_foot), even at nothing.
+    """Return the distance of each foot in stance from its phase's mean position (E_foot), smooth at zero.
 
-    A distance and not its square, as in the paper: a foot is then at one place, not only near it.
+    Not squared, so that feet come to rest exactly.
     """
     flat, phase = phases
     points = feet.flatten(0, 1)[flat]
     count = torch.bincount(phase).to(points)[:, None]
     mean = torch.zeros(len(count), 3).index_add(0, phase, points) / count
-    return (((points - mean[phase]) ** 2).sum(-1) + give_m**2).sqrt() - give_m
+    return (((points - mean[phase]) ** 2).sum(-1) + tolerance_m**2).sqrt() - tolerance_m
 
 
 def collision_error(distance_m: Float[Tensor, "*vertex"], margin_m: float) -> Float[Tensor, "*vertex"]:
-    """Return how deep each vertex is inside the scene or its margin, metres (E_col, Eq. 5)."""
+    """Return the depth of each vertex inside the scene or its margin, metres (E_col, Eq. 5)."""
     return (margin_m - distance_m).clamp_min(0)
 
 
@@ -278,10 +276,9 @@ def contact_error(distance_m: Float[Tensor, "*vertex"], scale_m: float) -> Float
 
 
 def smooth_error(points: Float[Tensor, "frame vertex 3"]) -> Float[Tensor, "change vertex"]:
-    """Return the squared change of the difference between neighbouring meshes, square metres (E_smooth, Eq.
-    7).
+    """Return the squared second difference of vertices over frames, square metres (E_smooth, Eq. 7).
 
-    The paper takes the difference itself, which also slows the body down.
+    The paper takes the first difference, which also slows the body down.
     """
     step = points[1:] - points[:-1]
     return ((step[1:] - step[:-1]) ** 2).sum(-1)

@@ -1,8 +1,8 @@
-"""People as bodies: SMPL-X through the `smplx` package, for those who have its model files.
+"""SMPL-X bodies through the `smplx` package, for users who have its model files.
 
-`smplx_body` gives the surface of one person, its joints as bones; `motion_from_parameters` turns recorded
-SMPL-X parameters, hands included, into motion of that body. Corrective blend shapes and faces are left out:
-skinning alone moves the surface.
+`smplx_body` reads a person's surface with joints as bones; `motion_from_parameters` turns recorded SMPL-X
+parameters, including hands, into motion of that body. Pose blend shapes and faces are left out: the surface
+moves by linear blend skinning alone.
 """
 
 import importlib
@@ -21,33 +21,32 @@ from pipeline.longterm.bodies import SkinnedBody
 from pipeline.longterm.short_motions import BodyMotion
 
 SHAPES = 10
-"""betas of the paper"""
-# What is read of a model file.
+"""number of betas in the paper"""
 SURFACE = ("v_template", "f", "weights", "J_regressor", "kintree_table", "shapedirs")
 HANDS = ("hands_meanl", "hands_meanr", "hands_componentsl", "hands_componentsr")
 BODY, FACE, HAND = 63, 9, 45
-"""numbers of rotation vectors: of the body's joints, of jaw and eyes, of one hand's joints"""
+"""lengths of the rotation vectors of the body's joints, of jaw and eyes, and of one hand's joints"""
 
 
 @dataclass(frozen=True)
 class Person:
-    """A body and the tree of its joints."""
+    """A body and its kinematic tree."""
 
     body: SkinnedBody
     parent: Int[np.ndarray, "bone"]
-    """bone above each; -1 of the pelvis"""
+    """parent bones; -1 for the pelvis"""
     pelvis: Float[np.ndarray, "3"]
-    """where the pelvis is at rest in the frame of SMPL-X, metres"""
+    """position of the pelvis at rest in the frame of SMPL-X, metres"""
     hand_mean: Float[np.ndarray, "hand 45"]
-    """pose of the left and the right hand without coefficients, rotation vectors"""
+    """mean pose of the left and the right hand, rotation vectors"""
     hand_components: Float[np.ndarray, "hand component 45"]
-    """what one of their coefficients adds"""
+    """principal components of the hands' poses"""
 
 
 def smplx_body(model: Path, betas: Float[np.ndarray, "shape"] | None = None) -> Person:
-    """Read an SMPL-X model file (npz) and shape it. The agent frame is the pelvis at rest, +y up, +z ahead.
+    """Read an SMPL-X model file (npz) with betas. The agent frame is the pelvis at rest, +y up, +z ahead.
 
-    Raises InputError LTM-003 where the package is missing, LTM-004 where the file is, or is none of SMPL-X.
+    Raises InputError LTM-003 without the package, LTM-004 for a missing file or one that is not SMPL-X.
     """
     try:
         smplx, lbs = importlib.import_module("smplx"), importlib.import_module("smplx.lbs")
@@ -65,8 +64,8 @@ def smplx_body(model: Path, betas: Float[np.ndarray, "shape"] | None = None) -> 
         raise InputError("LTM-004", what, str(model), "give SMPLX_NEUTRAL.npz as it came") from error
     shape = np.zeros(SHAPES) if betas is None else np.asarray(betas, float)[:SHAPES]
     with torch.no_grad():
-        known = layer.shapedirs[:, :, : len(shape)]
-        surface = layer.v_template[None] + lbs.blend_shapes(torch.from_numpy(shape).to(known)[None], known)
+        basis = layer.shapedirs[:, :, : len(shape)]
+        surface = layer.v_template[None] + lbs.blend_shapes(torch.from_numpy(shape).to(basis)[None], basis)
         joints = lbs.vertices2joints(layer.J_regressor, surface)[0].double().numpy()
     vertices = surface[0].numpy() - joints[0].astype(np.float32)
     rest = rigid.make(np.eye(3)[None], joints - joints[0])
@@ -85,26 +84,26 @@ def motion_from_parameters(
     body_pose: Float[np.ndarray, "frame 63"],
     hands: Float[np.ndarray, "frame hand coefficient"] | None = None,
 ) -> BodyMotion:
-    """Return motion of SMPL-X parameters: rotation vectors of the pelvis and of the body's joints.
+    """Return the motion of SMPL-X parameters: rotation vectors of the pelvis and of the body's joints.
 
-    ``hands`` are rotation vectors (45 numbers) or principal coefficients (fewer) of the left and the right
-    hand; without them hands rest. SMPL-X turns a body about its pelvis at rest, which stands away from its
-    origin: the root carries both.
+    ``hands`` are rotation vectors (45 values) or PCA coefficients (fewer) of the left and the right hand; by
+    default hands rest. SMPL-X rotates a body about its pelvis, which is not at its origin; the root includes
+    that offset.
     """
     frames, rest = len(transl), person.body.agent_from_bone_rest
-    turn = np.zeros((frames, len(rest), 3))
-    turn[:, 1 : 1 + BODY // 3] = np.asarray(body_pose, float).reshape(frames, -1, 3)
+    vectors = np.zeros((frames, len(rest), 3))
+    vectors[:, 1 : 1 + BODY // 3] = np.asarray(body_pose, float).reshape(frames, -1, 3)
     if hands is not None:
         if hands.shape[-1] < HAND:
             basis = person.hand_components[:, : hands.shape[-1]]
             hands = person.hand_mean + np.einsum("fhc,hcj->fhj", hands, basis)
-        turn[:, 1 + (BODY + FACE) // 3 :] = np.asarray(hands, float).reshape(frames, -1, 3)
-    local = rigid.rotation_from_vector(turn)
+        vectors[:, 1 + (BODY + FACE) // 3 :] = np.asarray(hands, float).reshape(frames, -1, 3)
+    local = rigid.rotation_from_vector(vectors)
     bones = np.broadcast_to(np.eye(4), (frames, len(rest), 4, 4)).copy()
     for bone in range(1, len(rest)):
-        above = person.parent[bone]
-        offset = rest[bone, :3, 3] - rest[above, :3, 3]
-        bones[:, bone] = bones[:, above] @ rigid.make(local[:, bone], np.broadcast_to(offset, (frames, 3)))
+        parent = person.parent[bone]
+        offset = rest[bone, :3, 3] - rest[parent, :3, 3]
+        bones[:, bone] = bones[:, parent] @ rigid.make(local[:, bone], np.broadcast_to(offset, (frames, 3)))
     pelvis = np.asarray(transl, float) + person.pelvis
     root = rigid.make(rigid.rotation_from_vector(np.asarray(global_orient, float)), pelvis)
     return BodyMotion(root, bones)

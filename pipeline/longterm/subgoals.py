@@ -1,7 +1,7 @@
-"""From sub-goals far apart to places two seconds apart: ways over the free floor, cut into legs.
+"""Path planning: from distant sub-goals to waypoints two seconds apart along paths over the free floor.
 
-`WalkableFloor.of` finds where a body can stand; `plan_waypoints` leads from sub-goal to sub-goal around the
-furniture and returns a place every two seconds. Sub-goals come from the user, the behaviour model or
+`WalkableFloor.of` finds the free floor; `plan_waypoints` plans paths between sub-goals around furniture and
+splits them into two-second legs. Sub-goals come from the user, the behaviour model or
 `sample_visited_subgoals`.
 """
 
@@ -23,72 +23,72 @@ from pipeline.longterm.surroundings import MotionScene
 CELL_M = 0.08
 LEG_S = STEPS / RATE_HZ
 RAISED_M = 0.15
-"""A sub-goal whose body stands higher than this above the floor is on furniture and is reached by a leap."""
+"""A sub-goal whose root is this much higher than on the floor is on furniture, and reached by a jump."""
 LEG_LENGTH_SLACK = 1.35
-"""How much longer than the usual pace a leg may be before another one is needed."""
+"""Maximum length of a leg, relative to the usual pace."""
 SUPPORT_SEARCH_M = 0.3
-"""How far above or below a raised sub-goal what carries a body there is looked for."""
+"""Search range for a supporting surface above and below a raised sub-goal."""
 LOWEST_ROOT = 0.7
-"""A root that travels is free from this share of its usual height upwards."""
+"""A walking body needs free space from this share of its usual root height upwards."""
 NARROW = 0.6
-"""A broad body may come this close to the scene, in heights of its root."""
+"""Upper bound of the required clearance, in root heights."""
 NEAR_FURNITURE_M, BLOCKED_COST = 0.12, 80.0
-"""Free ground costs five times as much at furniture, falling off over this, and blocked ground so much."""
-WAY_SMOOTHING_CELLS = 3.0
-"""Deviation of the Gaussian that rounds the corners of a way on the grid."""
-SHORTEST_WAY_M = 0.05
-"""A shorter way has no direction: the heading before it stays."""
+"""Path cost: 5 beside furniture, decaying to 1 over this distance; and in blocked cells."""
+PATH_SMOOTHING_CELLS = 3.0
+"""Standard deviation of the Gaussian that smooths grid paths."""
+MIN_STEP_M = 0.05
+"""A shorter step defines no heading: the previous one is kept."""
 BEYOND_M = 1.0
-"""No root is further above or below all surfaces of a scene."""
+"""Margin of valid root heights above and below all surfaces of a scene."""
 TURN_M = 0.2
-"""A body that stops keeps this far from where it cannot walk, to have room to turn."""
+"""A body that stops keeps this distance from blocked floor, to have room to turn."""
 LANDING_CLEARANCE = 2.6
-"""A leap begins and ends so many root heights from where no body can walk: it falls full length."""
+"""Preferred clearance, in root heights, where a jump takes off or lands: the body is stretched out."""
 LARGE_TURN_RAD = 1.7
-"""A turn of more than this takes a body at rest two legs."""
+"""A larger turn at rest takes two legs."""
 MORE_LEGS = 4
-"""How many legs a way may have beyond what the pace asks for, so that none crosses furniture."""
+"""Maximum number of legs beyond those that the pace requires, to keep legs out of furniture."""
 
 
 @dataclass(frozen=True)
 class Subgoal:
-    """A place to be at."""
+    """A target position, optionally with heading and time."""
 
     position_world: Float[np.ndarray, "3"]
-    """of the root, metres"""
+    """of the root, metres; height NaN: on the floor"""
     heading_rad: float | None = None
-    """direction of the head about +y, from +z towards +x; None: as it comes"""
+    """heading about +y, from +z towards +x; None: free"""
     time_s: float | None = None
-    """when; None: as fast as usual"""
+    """time of arrival; None: at the usual pace"""
 
 
 @dataclass(frozen=True)
 class Waypoints:
-    """Roots every two seconds, level, and which of them are the sub-goals."""
+    """Level roots every two seconds."""
 
     world_from_agent: Float[np.ndarray, "place 4 4"]
     subgoal: np.ndarray
-    """per sub-goal, the number of its place"""
+    """index of each sub-goal's waypoint"""
 
 
 @dataclass(frozen=True)
 class WalkableFloor:
-    """Where a body can walk, on cells of the ground."""
+    """Grid map of the floor that a body can walk on."""
 
     free: Bool[np.ndarray, "x z"]
     room_m: Float[np.ndarray, "x z"]
-    """distance from where it cannot"""
+    """distance to the nearest blocked cell"""
     corner: Float[np.ndarray, "2"]
     """x and z of the first cell, world"""
     height_m: float
-    """of the floor, world"""
+    """height of the floor, world"""
     lowest_m: float
     highest_m: float
-    """heights between which a root may be, world"""
+    """range of valid root heights, world"""
 
     @classmethod
     def of(cls, scene: MotionScene, motion_prior: MotionPrior, breadth_m: float = 0.16) -> "WalkableFloor":
-        """Find the largest connected floor of a scene that a body, upright as it travels, can walk on."""
+        """Return the largest connected area of floor that a walking body fits on."""
         floor, grid, root_m = scene.floor_m, scene.distance, motion_prior.clearance_m
         low, span = grid.origin.double().numpy(), (np.array(grid.values.shape) - 1) * grid.voxel_m
         count = np.floor(span[[0, 2]] / CELL_M).astype(int) + 1
@@ -110,7 +110,7 @@ class WalkableFloor:
         return self._nearest(self.free, position)
 
     def nearest_turning_place(self, position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-        """Return a position where a body can turn: the given one if it can, else the nearest."""
+        """Return the nearest position with room to turn, the given one if it has."""
         room = self.room_m > TURN_M
         cell = np.array(self._nearest(room if room.any() else self.free, position))
         place = self.corner + CELL_M * cell
@@ -118,18 +118,18 @@ class WalkableFloor:
         return np.asarray(position) if stays else np.array([place[0], position[1], place[1]])
 
     def landing(self, position: Float[np.ndarray, "3"], root_m: float) -> Float[np.ndarray, "3"]:
-        """Return where a leap meets the ground: each metre missing to `LANDING_CLEARANCE` counts as two."""
+        """Return where a jump takes off or lands: nearest, with missing `LANDING_CLEARANCE` counted twice."""
         cells = self._cells(self.room_m > min(TURN_M, self.room_m.max() / 2))
-        off = np.linalg.norm(self.corner + CELL_M * cells - np.asarray(position)[[0, 2]], axis=1)
+        distance = np.linalg.norm(self.corner + CELL_M * cells - np.asarray(position)[[0, 2]], axis=1)
         missing = np.maximum(0, LANDING_CLEARANCE * (root_m - self.height_m) - self.room_m[tuple(cells.T)])
-        place = self.corner + CELL_M * cells[np.argmin(off + 2 * missing)]
+        place = self.corner + CELL_M * cells[np.argmin(distance + 2 * missing)]
         return np.array([place[0], position[1], place[1]])
 
-    def blocked_m(self, way: Float[np.ndarray, "point 3"]) -> float:
-        """Return how much of a polyline does not lead over free floor, metres."""
-        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way[:, [0, 2]], axis=0), axis=1))])
-        where = np.arange(0, along[-1], CELL_M / 4)
-        points = np.stack([np.interp(where, along, way[:, axis]) for axis in (0, 2)], axis=-1)
+    def blocked_m(self, path: Float[np.ndarray, "point 3"]) -> float:
+        """Return the length of a polyline over blocked cells, metres."""
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, [0, 2]], axis=0), axis=1))])
+        query = np.arange(0, along[-1], CELL_M / 4)
+        points = np.stack([np.interp(query, along, path[:, axis]) for axis in (0, 2)], axis=-1)
         cells = np.rint((points - self.corner) / CELL_M).astype(int)
         cells = np.clip(cells, 0, np.array(self.free.shape) - 1)
         return float((~self.free[tuple(cells.T)]).sum() * CELL_M / 4)
@@ -143,18 +143,18 @@ class WalkableFloor:
 
     def _nearest(self, wanted: Bool[np.ndarray, "x z"], position: Float[np.ndarray, "3"]) -> tuple[int, int]:
         cells = self._cells(wanted)
-        off = self.corner + CELL_M * cells - np.asarray(position)[[0, 2]]
-        x, z = cells[np.argmin((off**2).sum(1))]
+        offset = self.corner + CELL_M * cells - np.asarray(position)[[0, 2]]
+        x, z = cells[np.argmin((offset**2).sum(1))]
         return int(x), int(z)
 
     def contains(self, position: Float[np.ndarray, "3"]) -> bool:
-        """Return whether a position is within the scene's edges; one without height, if x and z are."""
+        """Return whether a position is within the scene's bounds; a NaN height is ignored."""
         place, height_m = (np.asarray(position)[[0, 2]] - self.corner) / CELL_M, position[1]
         within = np.isnan(height_m) or self.lowest_m <= height_m <= self.highest_m
         return bool(np.all(place >= 0) and np.all(place <= self.free.shape) and within)
 
     def refuse_outside(self, position: Float[np.ndarray, "3"]) -> None:
-        """Raise SIM-003 for a world position, metres, beyond the scene's edges."""
+        """Raise SIM-003 for a world position, metres, outside the scene's bounds."""
         if not self.contains(position):
             low, high = self.corner, self.corner + CELL_M * np.array(self.free.shape)
             heights = f"y {self.lowest_m:.1f} .. {self.highest_m:.1f} m (floor {self.height_m:.1f} m)"
@@ -166,11 +166,13 @@ class WalkableFloor:
     def path(
         self, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]
     ) -> Float[np.ndarray, "point 2"]:
-        """Return a smooth way over the ground between two positions, away from furniture; x and z, metres."""
+        """Return a smooth least-cost path between two positions, away from furniture; x and z, metres."""
         cost = np.where(self.free, 1 + 4 * np.exp(-self.room_m / NEAR_FURNITURE_M), BLOCKED_COST)
         cells, _ = route_through_array(cost, self.cell(start), self.cell(end))
-        way = self.corner + CELL_M * np.array(cells, float)
-        return gaussian_filter1d(way, WAY_SMOOTHING_CELLS, axis=0, mode="nearest") if len(way) > 2 else way
+        path = self.corner + CELL_M * np.array(cells, float)
+        if len(path) <= 2:
+            return path
+        return gaussian_filter1d(path, PATH_SMOOTHING_CELLS, axis=0, mode="nearest")
 
 
 def plan_waypoints(
@@ -179,7 +181,7 @@ def plan_waypoints(
     scene: MotionScene,
     motion_prior: MotionPrior,
 ) -> Waypoints:
-    """Return places two seconds apart through all sub-goals, from ``start`` or the first of them."""
+    """Return waypoints two seconds apart through all sub-goals, from ``start`` or the first sub-goal."""
     if len(subgoals) < (1 if start is not None else 2):
         remedy = "give at least two, or a start and one"
         raise InputError("SIM-001", "too few sub-goals", f"{len(subgoals)}", remedy)
@@ -203,7 +205,7 @@ def plan_waypoints(
 
 
 def move_into_scene(subgoals: list[Subgoal], scene: MotionScene, motion_prior: MotionPrior) -> list[Subgoal]:
-    """Move sub-goals that a model drew outside of the scene to the nearest place where a body can turn."""
+    """Move sub-goals outside the scene's bounds to the nearest place with room to turn."""
     floor = WalkableFloor.of(scene, motion_prior)
     return [
         goal
@@ -221,15 +223,15 @@ def sample_visited_subgoals(
     cell_m: float = 0.25,
     apart_m: float = 0.5,
 ) -> list[Subgoal]:
-    """Draw sub-goals from visited cells, often visited ones more often, consecutive ones well apart."""
+    """Sample sub-goals from visited cells in proportion to visits, consecutive ones ``apart_m`` apart."""
     places = np.floor(positions_world[:, [0, 2]] / cell_m)
     cells, number, visits = np.unique(places, axis=0, return_inverse=True, return_counts=True)
     number, found = number.reshape(-1), []
     for _ in range(count):
         weight = visits.astype(float)
         if found:
-            away = (cells + 0.5) * cell_m - found[-1].position_world[[0, 2]]
-            weight *= np.linalg.norm(away, axis=1) > apart_m
+            offset = (cells + 0.5) * cell_m - found[-1].position_world[[0, 2]]
+            weight *= np.linalg.norm(offset, axis=1) > apart_m
         weight = weight if weight.sum() > 0 else visits.astype(float)
         chosen = rng.choice(len(cells), p=weight / weight.sum())
         found.append(Subgoal(np.median(positions_world[number == chosen], axis=0)))
@@ -239,7 +241,7 @@ def sample_visited_subgoals(
 def _standing(
     floor: WalkableFloor, scene: MotionScene, position: Float[np.ndarray, "3"], clearance_m: float
 ) -> Float[np.ndarray, "3"]:
-    """Return where a body at a position stands: on furniture that carries it, else where it can turn."""
+    """Return the root of a body standing at a position: on supporting furniture, else where it can turn."""
     root_m = floor.height_m + clearance_m
     grounded = _grounded(position, root_m)
     if grounded[1] > root_m:
@@ -251,26 +253,24 @@ def _standing(
 def _height_on_support(
     scene: MotionScene, position: Float[np.ndarray, "3"], clearance_m: float
 ) -> float | None:
-    """Return the height of the root nearest to a position's at which something carries the body and leaves it
-    room; None: nowhere.
+    """Return the root height nearest to the position's with support below and clearance around; None: none.
 
-    Where an animal has been there may be nothing now, or a board at its belly: furniture is moved, maps are
-    not perfect.
+    A recorded position may have no support or too little room: furniture moves, and maps have errors.
     """
     heights = position[1] - clearance_m + np.arange(-SUPPORT_SEARCH_M, SUPPORT_SEARCH_M, 0.01)
     x, z = (np.full_like(heights, position[axis]) for axis in (0, 2))
     column = np.stack([x, heights, z], axis=-1)
     both = np.stack([column, column + np.array([0, clearance_m, 0])])
-    under, root = scene.distance.at(torch.from_numpy(both).float()).numpy()
-    carries = np.flatnonzero((under[:-1] < 0) & (under[1:] >= 0) & (root[1:] > clearance_m / 2)) + 1
-    if not len(carries):
+    below, root = scene.distance.at(torch.from_numpy(both).float()).numpy()
+    surfaces = np.flatnonzero((below[:-1] < 0) & (below[1:] >= 0) & (root[1:] > clearance_m / 2)) + 1
+    if not len(surfaces):
         return None
-    found = heights[carries] + clearance_m
+    found = heights[surfaces] + clearance_m
     return float(found[np.abs(found - position[1]).argmin()])
 
 
 def _grounded(position: Float[np.ndarray, "3"], root_m: float) -> Float[np.ndarray, "3"]:
-    """Give a position without height, or one near the floor, the root's usual height."""
+    """Set the root's usual height on a position without height or near the floor."""
     position = np.asarray(position, float)
     level = np.isnan(position[1]) or position[1] < root_m + RAISED_M
     return np.array([position[0], root_m if level else position[1], position[2]])
@@ -279,51 +279,46 @@ def _grounded(position: Float[np.ndarray, "3"], root_m: float) -> Float[np.ndarr
 def _leg_ends(
     floor: WalkableFloor, start: np.ndarray, end: np.ndarray, root_m: float, longest_m: float
 ) -> list[Float[np.ndarray, "3"]]:
-    """Return the ends of the legs from one root position to another; onto and off furniture in one leap."""
-    leaps = [abs(place[1] - root_m) > 1e-6 for place in (start, end)]
-    both = zip((start, end), leaps, strict=True)
-    way = floor.path(*(floor.landing(place, root_m) if leap else place for place, leap in both))
-    ground = np.column_stack([way[:, 0], np.full(len(way), root_m), way[:, 1]])
-    first, last = (
-        ground[:0] if leap else place[None] for place, leap in zip((start, end), leaps, strict=True)
-    )
+    """Return the ends of the legs from one root position to another; each jump is one leg."""
+    ends = [(place, abs(place[1] - root_m) > 1e-6) for place in (start, end)]
+    path = floor.path(*(floor.landing(place, root_m) if jumps else place for place, jumps in ends))
+    ground = np.column_stack([path[:, 0], np.full(len(path), root_m), path[:, 1]])
+    first, last = (ground[:0] if jumps else place[None] for place, jumps in ends)
     walked = np.concatenate([first, ground, last])
-    off, onto = [walked[0]] if leaps[0] else [], [end] if leaps[1] else []
-    return [*off, *_split_path(floor, walked, longest_m), *onto]
+    landing, jump = [walked[0]] if ends[0][1] else [], [end] if ends[1][1] else []
+    return [*landing, *_split_path(floor, walked, longest_m), *jump]
 
 
 def _split_path(
-    floor: WalkableFloor, way: Float[np.ndarray, "point 3"], longest_m: float
+    floor: WalkableFloor, path: Float[np.ndarray, "point 3"], longest_m: float
 ) -> list[Float[np.ndarray, "3"]]:
-    """Return the ends of legs along a way: few, and as straight lines least blocked."""
-    fewest = max(1, int(np.ceil(np.linalg.norm(np.diff(way, axis=0), axis=1).sum() / longest_m)))
-    tried = [_resample_path(way, count) for count in range(fewest, fewest + MORE_LEGS + 1)]
-    blocked = [floor.blocked_m(np.array([way[0], *points])) for points in tried]
-    return tried[int(np.argmax(np.array(blocked) <= min(blocked) + CELL_M / 2))]
+    """Return the ends of legs along a path: the fewest whose straight lines are least blocked."""
+    fewest = max(1, int(np.ceil(np.linalg.norm(np.diff(path, axis=0), axis=1).sum() / longest_m)))
+    candidates = [_resample_path(path, count) for count in range(fewest, fewest + MORE_LEGS + 1)]
+    blocked = [floor.blocked_m(np.array([path[0], *points])) for points in candidates]
+    return candidates[int(np.argmax(np.array(blocked) <= min(blocked) + CELL_M / 2))]
 
 
-def _resample_path(stations: Float[np.ndarray, "point 3"], count: int) -> list[Float[np.ndarray, "3"]]:
-    """Return ``count`` points at equal ways along a polyline, the last at its end."""
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(stations, axis=0), axis=1))])
-    where = along[-1] * np.arange(1, count + 1) / count
-    return list(np.stack([np.interp(where, along, stations[:, axis]) for axis in range(3)], axis=-1))
+def _resample_path(path: Float[np.ndarray, "point 3"], count: int) -> list[Float[np.ndarray, "3"]]:
+    """Return ``count`` points at equal arc lengths along a polyline, the last at its end."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    query = along[-1] * np.arange(1, count + 1) / count
+    return list(np.stack([np.interp(query, along, path[:, axis]) for axis in range(3)], axis=-1))
 
 
 def _poses_along_path(
     points: Float[np.ndarray, "place 3"], headings: list[float | None]
 ) -> Float[np.ndarray, "place 4 4"]:
-    """Head every place along the way, where no heading is given; at rest a large turn takes two legs."""
-    turned = []
+    """Return poses heading along the path where no heading is given; large turns at rest take two legs."""
+    yaw_rad = []
     for index, given in enumerate(headings):
-        way = points[min(index + 1, len(points) - 1)] - points[max(index - 1, 0)]
-        if given is None and np.linalg.norm(way[[0, 2]]) < SHORTEST_WAY_M:
-            given = turned[-1] if turned else 0.0
-        turned.append(float(np.arctan2(way[0], way[2])) if given is None else given)
-    for index in range(2, len(turned)):
-        about = (turned[index] - turned[index - 1] + np.pi) % (2 * np.pi) - np.pi
+        tangent = points[min(index + 1, len(points) - 1)] - points[max(index - 1, 0)]
+        if given is None and np.linalg.norm(tangent[[0, 2]]) < MIN_STEP_M:
+            given = yaw_rad[-1] if yaw_rad else 0.0
+        yaw_rad.append(float(np.arctan2(tangent[0], tangent[2])) if given is None else given)
+    for index in range(2, len(yaw_rad)):
+        turn = (yaw_rad[index] - yaw_rad[index - 1] + np.pi) % (2 * np.pi) - np.pi
         rests = np.linalg.norm(points[index - 2 : index + 1] - points[index], axis=1).max() < 1e-6
-        if rests and headings[index - 1] is None and abs(about) > LARGE_TURN_RAD:
-            turned[index - 1] += about / 2
-    vectors = np.zeros((len(turned), 3))
-    vectors[:, 1] = turned
-    return rigid.make(rigid.rotation_from_vector(vectors), points)
+        if rests and headings[index - 1] is None and abs(turn) > LARGE_TURN_RAD:
+            yaw_rad[index - 1] += turn / 2
+    return rigid.make(rigid.rotation_from_yaw(np.array(yaw_rad)), points)
