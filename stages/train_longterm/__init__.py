@@ -1,5 +1,5 @@
-"""The room of long-term motion: learns bodies at sub-goals, routes between them and poses along routes.
+"""Training of long-term motion: static bodies, routes between them, and poses along routes.
 
-`sources` opens motion and parts it, `learning` trains all networks in their order, `training` fits one of
-them, `objectives` holds the losses, `pictures` shows what they do on motion they have not seen.
+`sources` reads and splits motion, `learning` trains all networks in order, `training` fits a single network,
+`objectives` holds the losses, `pictures` evaluates the model on held-out motion.
 """

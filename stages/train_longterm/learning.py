@@ -1,4 +1,4 @@
-"""From motion to a model: what the body touches, its pose space, and all networks in their order."""
+"""Train a model from motion: contact vertices, pose space, then all networks in order."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -32,12 +32,12 @@ from stages.train_longterm.training import LongTermLossWeights, NetworkTrainer
 
 Network = TypeVar("Network", bound=nn.Module)
 DEFAULT_SIZES = LongTermSizes()
-"""Sizes that every build uses; tests take smaller ones."""
+"""Sizes of every build; tests use smaller ones."""
 
 
 @dataclass(frozen=True)
 class TrainedLongTerm:
-    """A trained model, how training went, and the networks that the tables compare with."""
+    """A trained model, its training records, and the ablated networks that the tables compare with."""
 
     model: LongTerm
     records: dict[str, FitRecord]
@@ -51,7 +51,7 @@ def train_networks(
     sizes: LongTermSizes = DEFAULT_SIZES,
     resume: Path | None = None,
 ) -> TrainedLongTerm:
-    """Train the static bodies, RouteNet, PoseNet and the ablations that ``config`` names on some motion."""
+    """Train StaticBody, RouteNet, PoseNet and the ablations that ``config`` names."""
     rng = np.random.default_rng(config.seed)
     sizes = replace(sizes, shape=len(dataset.body.shape))
     poses = fit_pose_space(dataset.stretches, dataset.body.agent_from_bone_rest, sizes.pose)
@@ -77,7 +77,7 @@ def train_networks(
 def train_ablations(
     clips: Clips, trainer: NetworkTrainer, config: Config, sizes: LongTermSizes, route: RouteNet
 ) -> dict[str, AblatedNetworks]:
-    """Train the networks of Table 1 that are asked for and not part of the model; equal routes are shared."""
+    """Train the ablations of Table 1 that ``config`` names; those with the same RouteNet share it."""
     routes, trained = {(True, True, False): route} if config.scene else {}, {}
     names = {"none": (), "rivals": longterm_networks.RIVALS, "all": tuple(longterm_networks.ABLATIONS)}
     for name in names[config.ablations]:
@@ -101,7 +101,7 @@ def train_ablations(
 
 
 def write_ablations(folder: Path, learned: TrainedLongTerm) -> None:
-    """Write `ablations/<name>.safetensors` where there are any."""
+    """Write `ablations/<name>.safetensors`, if there are any."""
     if learned.ablated:
         (folder / "ablations").mkdir()
         for name, made in learned.ablated.items():
@@ -109,7 +109,7 @@ def write_ablations(folder: Path, learned: TrainedLongTerm) -> None:
 
 
 def initialized(make: Callable[[], Network], config: Config) -> Network:
-    """Build a network from the seed, its PointNets from given weights if there are any."""
+    """Build a network from the seed, with pretrained PointNet weights if ``config`` names them."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         net = make()

@@ -1,4 +1,4 @@
-"""The losses of long-term motion: L1 on what is predicted (Eqs. 3, 4), and contact of static bodies."""
+"""The losses of long-term motion: L1 on routes and poses (Eqs. 3, 4), contact of static bodies."""
 
 import torch
 from jaxtyping import Float, Int
@@ -12,7 +12,7 @@ from pipeline.longterm.motion_optimization import collision_error, contact_error
 from pipeline.longterm.networks import ROOT_CHANNELS
 
 TOUCHING_M = 0.02
-"""contact vertices nearer to the scene than this touch it"""
+"""scale of the contact loss"""
 
 
 def route_error(
@@ -27,31 +27,31 @@ def route_error(
 def pose_error(
     made: Float[Tensor, "*batch pose"],
     truth: Float[Tensor, "*batch pose"],
-    lever: Float[Tensor, "pose channel"],
+    basis_m: Float[Tensor, "pose channel"],
 ) -> Float[Tensor, ""]:
-    """Return the mean L1 distance of the bones' channels that p stands for, metres (radians at 0.1 m)."""
-    return ((made - truth) @ lever).abs().mean()
+    """Return the mean L1 distance of the bones' channels decoded from p, metres (radians times 0.1 m)."""
+    return ((made - truth) @ basis_m).abs().mean()
 
 
-def lever_of(poses: PoseSpace) -> Float[Tensor, "pose channel"]:
-    """Return the matrix from p to channels in metres."""
+def metric_basis(poses: PoseSpace) -> Float[Tensor, "pose channel"]:
+    """Return the pose space's basis with all channels in metres."""
     return poses.basis * torch.tensor([LEVER_M] * 3 + [1.0] * 3).repeat(len(poses.rest))
 
 
 def kl_divergence(
     mean: Float[Tensor, "batch latent"], log_variance: Float[Tensor, "batch latent"]
 ) -> Float[Tensor, ""]:
-    """Return the mean KL divergence from the standard normal distribution, per number of z."""
+    """Return the mean KL divergence from the standard normal distribution, per dimension of z."""
     return 0.5 * (mean**2 + log_variance.exp() - 1 - log_variance).mean()
 
 
-def posed(
+def posed_vertices(
     body: Float[Tensor, "batch channel"],
     world_from_place: Float[Tensor, "batch 4 4"],
     poses: PoseSpace,
     surface: PosedSurface,
 ) -> Float[Tensor, "batch vertex 3"]:
-    """Return the vertices of bodies in the world."""
+    """Return the world vertices of bodies given by their channels."""
     place_from_agent = rigid_torch.make(rigid_torch.rotation_from_6d(body[:, 3:ROOT_CHANNELS]), body[:, :3])
     return surface(world_from_place @ place_from_agent, poses.bones(poses.decode(body[:, ROOT_CHANNELS:])))
 
@@ -63,8 +63,9 @@ def scene_errors(
     contacts: ContactVertices,
     count: int,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """Return mean collision and contact error, metres; the last vertices, from ``count`` on, are the contact
-    vertices. Vertices are in the world; ``scene`` numbers the scene of each body.
+    """Return mean collision error (metres) and contact error of bodies; ``scene`` is the scene index of each.
+
+    Vertices are in the world; those from ``count`` on are the contact vertices.
     """
     distance = torch.zeros(vertices.shape[:2])
     for index, each in enumerate(scenes):

@@ -16,20 +16,20 @@ from pipeline.longterm.plausibility import PlausibilityMeter
 from stages.train_longterm.learning import TrainedLongTerm
 
 SHOWN = 8
-"""Clips drawn from above."""
+"""Clips in the top-down plots."""
 TRIED = 60
-"""Held-out clips that are measured."""
+"""Maximum number of held-out clips that are evaluated."""
 CLIP_STRIDE = 15
 """Frames (30 fps) between the starts of held-out clips."""
 STILLS = 12
-"""Places at which a body is drawn."""
+"""Places at which static bodies are sampled."""
 CANDIDATES = 4
-"""Bodies drawn at each of them, of which the best counts."""
+"""Samples at each place, of which the best is kept."""
 HEIGHT_IN, LINE_WIDTH = 5.4, 0.8
 SHOWN_M, SLICE_M = 1.2, (-0.12, 0.2)
-"""What is drawn of the scene around a clip: so far aside, and between these heights from its root."""
+"""Half width of each plot, and the slice of scene heights drawn, relative to the root."""
 ARROW_M, ARROW_FRAMES = 0.15, 15
-"""Length of the lines that show the heading, and the frames between them."""
+"""Length of the heading lines, and frames between them."""
 CAPTIONS = {
     "losses": "Loss of each network over its training, smoothed.",
     "routes": f"Held-out routes in panels of {2 * SHOWN_M:g} m: true blue, generated orange, scene grey.",
@@ -45,7 +45,7 @@ class ModelReport:
 
 
 def evaluate_held_out(learned: TrainedLongTerm, dataset: DatasetSplit, seed: int) -> ModelReport:
-    """Try a model on held-out motion, or where there is none on what it learned from."""
+    """Evaluate a model on held-out motion, or on the training motion if none is held out."""
     where = dataset.held_out or dataset.train
     rng = np.random.default_rng(seed)
     cuts = select_clips(where, rng, stride=CLIP_STRIDE, most=TRIED)
@@ -70,19 +70,19 @@ def evaluate_held_out(learned: TrainedLongTerm, dataset: DatasetSplit, seed: int
 
 
 def _stills(learned: TrainedLongTerm, where: MotionDataset, rng: np.random.Generator) -> tuple[float, float]:
-    """Return the median gap under bodies drawn at held-out places, and how deep they are in the scene."""
+    """Return the median gap and the median penetration depth of bodies sampled at held-out places, metres."""
     stretch, scene = where.stretches[0], where.scenes[where.scene_of[0]]
     places = stretch.world_from_agent[np.linspace(0, len(stretch) - 1, STILLS).astype(int)]
     made = learned.model.bodies(places, where.body, scene, rng, candidates=CANDIDATES)
-    judge = PlausibilityMeter(where.body, learned.model.contacts, scene.distance)
-    gap, depth = judge.gap_and_penetration(made)
+    meter = PlausibilityMeter(where.body, learned.model.contacts, scene.distance)
+    gap, depth = meter.gap_and_penetration(made)
     return float(np.median(gap)), float(np.median(depth))
 
 
 def routes(
     clips: Clips, made: Float[torch.Tensor, "clip frame channel"], where: MotionDataset
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw some clips from above, in their own frames."""
+    """Plot some clips from above, in their own frames."""
     figure, axes = plots.panels(2, SHOWN // 2, width_in=10, height_in=HEIGHT_IN)
     for axis, index in zip(axes.ravel(), np.linspace(0, len(clips) - 1, SHOWN).astype(int), strict=True):
         points = where.scenes[clips.scene[index]].surface.points

@@ -1,8 +1,8 @@
-"""PROX as it is published: scans with signed distances, and fits of SMPL-X to people who move in them.
+"""Reader of the published PROX dataset: scans with signed distances, and SMPL-X fits of people in them.
 
-Read are `scenes/<scene>.ply`, `sdf/<scene>.json` with `sdf/<scene>_sdf.npy`, `cam2world/<scene>.json`, and
-`PROXD/<scene>_<person>_<take>/results/<frame>/000.pkl`. Bodies are fitted in the camera's frame; the scans
-may have any axis up, the one along which people stand.
+It reads `scenes/<scene>.ply`, `sdf/<scene>.json` with `sdf/<scene>_sdf.npy`, `cam2world/<scene>.json`, and
+`PROXD/<scene>_<person>_<take>/results/<frame>/000.pkl`. Fits are in the camera's frame; a scan's up axis is
+the one along which people stand.
 """
 
 import json
@@ -29,12 +29,12 @@ from pipeline.longterm.surroundings import MotionScene
 
 FITS = "PROXD"
 GAP_S = 0.5
-"""a longer time without a fit ends a stretch of motion"""
+"""a longer gap without fits ends a stretch of motion"""
 NECK = 12
-"""joint of SMPL-X that is above the pelvis of whoever stands or sits"""
+"""SMPL-X joint above the pelvis of a standing or sitting person"""
 SHORTEST_S = STEPS / RATE_HZ
 LARGEST_FIT = 1 << 20
-"""bytes; a fit is a few thousand"""
+"""maximum size of a fit's file, bytes; usual ones have a few thousand"""
 _CLOCK = re.compile(r"__(\d+)\.(\d+)\.(\d+)\.(\d+)$")
 _NAMES = ("transl", "global_orient", "body_pose", "left_hand_pose", "right_hand_pose")
 _ALLOWED = {
@@ -42,7 +42,7 @@ _ALLOWED = {
     *((f"{core}.multiarray", name) for core in ("numpy.core", "numpy._core")
       for name in ("_reconstruct", "scalar")),
 }  # fmt: skip
-"""all that arrays are made of: a fit can run nothing else"""
+"""globals that pickled arrays need; a fit cannot load anything else"""
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,9 @@ def is_prox(folder: Path) -> bool:
 
 
 def read(model: Path, folder: Path) -> tuple[Person, list[PersonRecording], dict[str, MotionScene]]:
-    """Read every recording and the scenes in which they were made; the first person's shape is everyone's.
+    """Read all recordings and their scenes; the first person's shape is used for everyone.
 
-    Raises InputError LTM-001 where there is none, LTM-005 where a file is damaged or missing.
+    Raises InputError LTM-001 without recordings, LTM-005 for a damaged or missing file.
     """
     takes = sorted(each for each in (folder / FITS).iterdir() if (each / "results").is_dir())
     if not takes:
@@ -84,17 +84,17 @@ def read(model: Path, folder: Path) -> tuple[Person, list[PersonRecording], dict
 
 
 def _fits(take: Path) -> tuple[Float[np.ndarray, "frame"], dict[str, np.ndarray]]:
-    """Return times (seconds) and parameters of all frames of a recording, in order of time."""
+    """Return times (seconds) and parameters of all frames of a recording, sorted by time."""
     rows, clock = [], []
     for number, frame in enumerate(sorted(each for each in (take / "results").iterdir() if each.is_dir())):
         file = frame / "000.pkl"
         if not file.is_file():
             continue
         rows.append(_fit(file))
-        said = _CLOCK.search(frame.name)
-        hours, minutes, seconds, thousandths = map(int, said.groups()) if said else (0, 0, 0, 0)
-        at = timedelta(hours=hours, minutes=minutes, seconds=seconds, milliseconds=thousandths)
-        clock.append(at.total_seconds() if said else number / RATE_HZ)
+        match = _CLOCK.search(frame.name)
+        hours, minutes, seconds, thousandths = map(int, match.groups()) if match else (0, 0, 0, 0)
+        time = timedelta(hours=hours, minutes=minutes, seconds=seconds, milliseconds=thousandths)
+        clock.append(time.total_seconds() if match else number / RATE_HZ)
     if len(rows) < 2:
         raise _damaged("there are no fits of two frames", take)
     time_s, first = np.unique(clock, return_index=True)
@@ -102,7 +102,7 @@ def _fits(take: Path) -> tuple[Float[np.ndarray, "frame"], dict[str, np.ndarray]
 
 
 class _Arrays(pickle.Unpickler):
-    """Reads pickles of arrays and nothing else."""
+    """Unpickler restricted to arrays."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _ALLOWED:
@@ -132,20 +132,20 @@ def _recording(
 ) -> PersonRecording:
     scan_from_camera = _json(folder / "cam2world" / f"{scene}.json", (4, 4))
     hands = np.stack([table["left_hand_pose"], table["right_hand_pose"]], axis=1)
-    transl, turn, pose = (table[name] for name in _NAMES[:3])
-    moving = motion_from_parameters(person, transl, turn, pose, hands)
-    roots = scan_from_camera @ moving.world_from_agent
-    up = np.einsum("fij,fj->fi", roots[:, :3, :3], moving.agent_from_bone[:, NECK, :3, 3]).mean(0)
+    transl, orient, pose = (table[name] for name in _NAMES[:3])
+    motion = motion_from_parameters(person, transl, orient, pose, hands)
+    roots = scan_from_camera @ motion.world_from_agent
+    up = np.einsum("fij,fj->fi", roots[:, :3, :3], motion.agent_from_bone[:, NECK, :3, 3]).mean(0)
     world_from_scan = rigid.make(_upright(up), np.zeros(3))
-    moving = BodyMotion(world_from_scan @ roots, moving.agent_from_bone)
+    motion = BodyMotion(world_from_scan @ roots, motion.agent_from_bone)
     parts = np.split(np.arange(len(clock)), np.flatnonzero(np.diff(clock) > GAP_S) + 1)
     parts = [part for part in parts if clock[part[-1]] - clock[part[0]] >= SHORTEST_S]
-    motions = tuple(resample_motion(clock[part], moving[part]) for part in parts)
+    motions = tuple(resample_motion(clock[part], motion[part]) for part in parts)
     return PersonRecording(scene, motions, world_from_scan)
 
 
 def _upright(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation that brings the axis nearest to ``up`` to +y, in steps of 90 degrees."""
+    """Return the rotation by multiples of 90 degrees that takes the axis nearest to ``up`` to +y."""
     axis = int(np.abs(up).argmax())
     across = np.eye(3)[(axis + 1) % 3]
     own = np.sign(up[axis]) * np.eye(3)[axis]
@@ -169,7 +169,7 @@ def _scene(
 
 
 def _distances(file: Path, world_from_scan: np.ndarray, scene: MotionScene) -> SignedDistance | None:
-    """Read PROX's signed distances at the voxels of a scene; None where the scan has none."""
+    """Resample PROX's signed distance to the grid of a scene; None if the scan has none."""
     if not file.is_file():
         return None
     known = file.with_name(file.name.replace("_sdf.npy", ".json"))
@@ -182,9 +182,9 @@ def _distances(file: Path, world_from_scan: np.ndarray, scene: MotionScene) -> S
         raise _damaged(f"is no grid of distances ({error})", file) from error
     centres = voxel_centres(scene.low, scene.high, scene.voxel_m)
     points = rigid.apply(rigid.inverse(world_from_scan), centres.reshape(-1, 3))
-    place = (points - low) / (high - low) * (side - 1)
-    read = ndimage.map_coordinates(values, place.T, order=1, mode="nearest").reshape(centres.shape[:3])
-    return SignedDistance(torch.from_numpy(read), torch.from_numpy(scene.low).float(), scene.voxel_m)
+    index = (points - low) / (high - low) * (side - 1)
+    sampled = ndimage.map_coordinates(values, index.T, order=1, mode="nearest").reshape(centres.shape[:3])
+    return SignedDistance(torch.from_numpy(sampled), torch.from_numpy(scene.low).float(), scene.voxel_m)
 
 
 def _json(file: Path, shape: tuple[int, ...], key: str | None = None) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Where motion comes from, parted into what is learned from and what is held out."""
+"""Sources of motion, split into training and held-out motion."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ STUDY_REACH_M = 1.5
 
 
 def recorded(reconstruction: Path, behavior_data: Path) -> DatasetSplit:
-    """Read reconstructed sessions, those of the behaviour test held out. Raises LTM-001 without motion."""
+    """Read reconstructed sessions; behaviour test videos are held out. Raises LTM-001 without motion."""
     split = reconstructed_split(reconstruction, BehaviorData.load(behavior_data))
     if not split.train.stretches:
         remedy = "record longer sessions in which the animal stays in view"
@@ -28,12 +28,12 @@ def recorded(reconstruction: Path, behavior_data: Path) -> DatasetSplit:
 
 
 def people(model: Path, folder: Path) -> DatasetSplit:
-    """Read recorded SMPL-X motion: `scene.ply` and `*.npz` of one person, the last in name order held out.
+    """Read recorded SMPL-X motion: `scene.ply` and `*.npz` of one person; the last file by name is held out.
 
-    Each holds `timestamp_s`, `transl`, `global_orient`, `body_pose` (rotation vectors, world +y up, metres)
-    and `betas`, and may hold `left_hand_pose` and `right_hand_pose` (45 numbers or principal coefficients).
-    A folder laid out as PROX is read as such. Raises InputError LTM-001 where there is none, LTM-003 and
-    LTM-004 where SMPL-X is not there, LTM-005 where PROX is damaged.
+    Each file holds `timestamp_s`, `transl`, `global_orient`, `body_pose` (rotation vectors, world +y up,
+    metres) and `betas`, optionally `left_hand_pose` and `right_hand_pose` (45 values or PCA coefficients). A
+    folder in PROX's layout is read by `prox`. Raises InputError LTM-001 without motion, LTM-003 and LTM-004
+    without SMPL-X, LTM-005 for damaged PROX data.
     """
     if prox.is_prox(folder):
         return _in_scans(model, folder)
@@ -46,12 +46,12 @@ def people(model: Path, folder: Path) -> DatasetSplit:
         npz.load(file, ("timestamp_s", "transl", "global_orient", "body_pose", "betas")) for file in files
     ]
     person = smplx_body(model, loaded[0]["betas"])
-    moved = [
+    fitted = [
         motion_from_parameters(person, each["transl"], each["global_orient"], each["body_pose"], _hands(each))
         for each in loaded
     ]
     motions = tuple(
-        resample_motion(each["timestamp_s"], motion) for each, motion in zip(loaded, moved, strict=True)
+        resample_motion(each["timestamp_s"], motion) for each, motion in zip(loaded, fitted, strict=True)
     )
     roots = np.concatenate([motion.world_from_agent[:, :3, 3] for motion in motions])
     scene = MotionScene.for_motion(ply.read_ply(folder / "scene.ply"), roots, reach_m=STUDY_REACH_M)
@@ -66,7 +66,7 @@ def _hands(table: dict[str, np.ndarray]) -> np.ndarray | None:
 
 
 def _in_scans(model: Path, folder: Path) -> DatasetSplit:
-    """Read PROX, the last recording held out."""
+    """Read PROX; the last recording is held out."""
     person, recordings, scenes = prox.read(model, folder)
     names = list(scenes)
     stretches = [(motion, names.index(each.scene)) for each in recordings for motion in each.motions]

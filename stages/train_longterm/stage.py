@@ -17,7 +17,7 @@ SECONDS_PER_MINUTE = 60
 
 @dataclass(frozen=True)
 class Inputs:
-    """Artifacts to learn from: simulated motion, or a reconstruction with its behaviour data."""
+    """Training artifacts: simulated motion, or a reconstruction with its behaviour data."""
 
     reconstruction: Path | None = None
     behavior_data: Path | None = None
@@ -25,10 +25,9 @@ class Inputs:
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, resume: Path | None = None) -> TrainedLongTerm:
-    """Train every network and write `longterm.safetensors`, `longterm.json` and `ablations/` into ``out``;
-    of several processes the first writes.
+    """Train all networks; the first process writes `longterm.safetensors`, `longterm.json`, `ablations/`.
 
-    Raises InputError LTM-001 to LTM-004 where motion, weights or SMPL-X are missing.
+    Raises InputError LTM-001 to LTM-004 for missing motion, weights or SMPL-X.
     """
     distributed.join("cpu")
     split = _read(inputs, config)

@@ -21,24 +21,24 @@ from pipeline.longterm.networks import ROOT_CHANNELS, BaseNet, PoseNet, RouteNet
 from stages.train_longterm import objectives
 
 GRADIENT_NORM = 1.0
-"""Gradients longer than this are clipped to it."""
+"""Maximum gradient norm."""
 SAVE_EVERY = 200
-"""Steps between checkpoints: a minute at most is lost when training is stopped."""
+"""Steps between checkpoints: at most about a minute of training."""
 SMOOTH_FRAMES = 4.0
-"""Deviation of the Gaussian that makes true routes as smooth as predicted ones, frames of 30 fps."""
+"""Standard deviation of the Gaussian that makes true routes as smooth as predicted ones, frames at 30 fps."""
 CHUNK = 256
-"""Clips at a time where nothing is trained."""
+"""Batch size of inference."""
 BODY_VERTICES = 150
-"""Vertices of the surface that the CVAE's losses look at."""
+"""Surface vertices sampled for the CVAE's losses."""
 MIN_RATE = 1e-3
 """Share of the peak learning rate at both ends."""
 WARMUP = 0.03
-"""Share of the training in which the learning rate rises."""
+"""Share of the training with linear warm-up."""
 
 
 @dataclass(frozen=True)
 class LongTermLossWeights:
-    """What the terms of the losses weigh."""
+    """Weights of the loss terms."""
 
     translation: float = 1.0
     """lambda_t, per metre"""
@@ -51,20 +51,20 @@ class LongTermLossWeights:
     vertices: float = 5.0
     """distance of the CVAE's mesh from the true one, per metre"""
     collision: float = 5.0
-    """CVAE: depth inside the scene, per metre"""
+    """CVAE: penetration depth, per metre"""
     contact: float = 0.02
-    """CVAE: contact vertices near the scene touch it"""
+    """CVAE: robust distance of contact vertices from the scene"""
 
 
 def cosine(progress: float) -> float:
-    """Return the factor on the learning rate: a linear warm-up, then a cosine; never quite 0."""
+    """Return the learning rate factor: linear warm-up times cosine decay, plus `MIN_RATE`."""
     warm = min(1.0, (progress + MIN_RATE) / WARMUP)
     return warm * 0.5 * (1 + np.cos(np.pi * min(progress, 1.0))) + MIN_RATE
 
 
 @dataclass(frozen=True)
 class NetworkTrainer:
-    """What all trainings share."""
+    """Settings shared by the training of all networks."""
 
     poses: PoseSpace
     weights: LongTermLossWeights
@@ -72,7 +72,7 @@ class NetworkTrainer:
     resume: Path | None = None
     device: str = "cpu"
 
-    def fitted(
+    def train(
         self,
         name: str,
         net: nn.Module,
@@ -80,7 +80,7 @@ class NetworkTrainer:
         loss: Callable[[Int[Tensor, "batch"]], dict[str, Float[Tensor, ""]]],
         examples: int,
     ) -> FitRecord:
-        """Fit one network in place to random batches of examples, which several processes share."""
+        """Fit one network in place on random batches, split among processes."""
         optimizer = torch.optim.Adam(net.parameters(), lr=optimizer_config.rate)
 
         def step_loss(step: int, generator: torch.Generator) -> dict[str, Tensor]:
@@ -112,7 +112,7 @@ def fit_route(
     optimizer_config: LongTermOptimizerConfig,
     name: str = "route",
 ) -> FitRecord:
-    """Fit a RouteNet (Eq. 3), its draft alike."""
+    """Fit a RouteNet (Eq. 3); all its stages have the same loss."""
     w = trainer.weights
 
     def loss(index: Tensor) -> dict[str, Tensor]:
@@ -122,30 +122,30 @@ def fit_route(
         terms = {"translation": w.translation * shift}
         return terms | ({"rotation": w.rotation * turn} if net.predicts_rotation else {})
 
-    return trainer.fitted(name, net, optimizer_config, loss, len(clips))
+    return trainer.train(name, net, optimizer_config, loss, len(clips))
 
 
 def _summed_route_errors(
     made: Sequence[Float[Tensor, "clip frame channel"]], truth: Float[Tensor, "clip frame known"]
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """Return translation and rotation error of a route, its draft's added."""
+    """Return translation and rotation errors, summed over the stages."""
     errors = [objectives.route_error(each, truth) for each in made]
     shift, turn = (sum(parts, start=torch.zeros(())) for parts in zip(*errors, strict=True))
     return shift, turn
 
 
 def predicted_routes(net: RouteNet, clips: Clips) -> Float[Tensor, "clip frame 9"]:
-    """Return the routes that a RouteNet makes, which the paper's PoseNet learns along."""
+    """Return the routes that a RouteNet predicts, on which the paper's PoseNet is trained."""
     with torch.no_grad():
         ends, batches = clips.channels[:, [0, -1]], torch.arange(len(clips)).split(CHUNK)
         return torch.cat([net(ends[rows, 0], ends[rows, 1], clips.seen[rows]) for rows in batches])
 
 
 def smoothed_true_routes(clips: Clips) -> Float[Tensor, "clip frame 9"]:
-    """Return the true routes, as smooth as predicted ones."""
+    """Return the true routes, smoothed like predicted ones, with exact ends."""
     route = clips.channels[..., :ROOT_CHANNELS]
-    even = torch.from_numpy(gaussian_filter1d(route.numpy(), SMOOTH_FRAMES, axis=1, mode="nearest"))
-    return orthonormalized(torch.cat([route[:, :1], even[:, 1:-1], route[:, -1:]], dim=1))
+    smooth = torch.from_numpy(gaussian_filter1d(route.numpy(), SMOOTH_FRAMES, axis=1, mode="nearest"))
+    return orthonormalized(torch.cat([route[:, :1], smooth[:, 1:-1], route[:, -1:]], dim=1))
 
 
 def fit_pose(
@@ -156,21 +156,21 @@ def fit_pose(
     optimizer_config: LongTermOptimizerConfig,
     name: str = "pose",
 ) -> FitRecord:
-    """Fit a PoseNet along routes that are held (Eq. 4)."""
-    w, lever = trainer.weights, objectives.lever_of(trainer.poses)
+    """Fit a PoseNet along fixed routes (Eq. 4)."""
+    w, basis_m = trainer.weights, objectives.metric_basis(trainer.poses)
 
     def loss(index: Tensor) -> dict[str, Tensor]:
         truth = clips.channels[index]
         made = net(
             truth[:, 0, ROOT_CHANNELS:], truth[:, -1, ROOT_CHANNELS:], routes[index], clips.seen.points[index]
         )
-        pose = objectives.pose_error(made[..., ROOT_CHANNELS:], truth[..., ROOT_CHANNELS:], lever)
+        pose = objectives.pose_error(made[..., ROOT_CHANNELS:], truth[..., ROOT_CHANNELS:], basis_m)
         terms = {"pose": w.pose * pose}
         if net.predicts_rotation:
             terms["rotation"] = w.rotation * objectives.route_error(made, truth)[1]
         return terms
 
-    return trainer.fitted(name, net, optimizer_config, loss, len(clips))
+    return trainer.train(name, net, optimizer_config, loss, len(clips))
 
 
 def fit_base(
@@ -180,21 +180,21 @@ def fit_base(
     optimizer_config: LongTermOptimizerConfig,
     name: str = "base",
 ) -> FitRecord:
-    """Fit a BaseNet, its draft alike."""
-    w, lever = trainer.weights, objectives.lever_of(trainer.poses)
+    """Fit a BaseNet; all its stages have the same loss."""
+    w, basis_m = trainer.weights, objectives.metric_basis(trainer.poses)
 
     def loss(index: Tensor) -> dict[str, Tensor]:
         truth = clips.channels[index]
         made = net.stages(truth[:, 0], truth[:, -1], clips.seen[index])
         shift, turn = _summed_route_errors(made, truth)
         errors = [
-            objectives.pose_error(each[..., ROOT_CHANNELS:], truth[..., ROOT_CHANNELS:], lever)
+            objectives.pose_error(each[..., ROOT_CHANNELS:], truth[..., ROOT_CHANNELS:], basis_m)
             for each in made
         ]
         pose = sum(errors, start=torch.zeros(()))
         return {"translation": w.translation * shift, "rotation": w.rotation * turn, "pose": w.pose * pose}
 
-    return trainer.fitted(name, net, optimizer_config, loss, len(clips))
+    return trainer.train(name, net, optimizer_config, loss, len(clips))
 
 
 def fit_body(
@@ -206,7 +206,7 @@ def fit_body(
     optimizer_config: LongTermOptimizerConfig,
 ) -> FitRecord:
     """Fit the CVAE: reconstruction, KL divergence, contact and collision (Sec. 3.2)."""
-    w, poses, lever = trainer.weights, trainer.poses, objectives.lever_of(trainer.poses)
+    w, poses, basis_m = trainer.weights, trainer.poses, objectives.metric_basis(trainer.poses)
     chosen = dataset.body.sample_vertices(BODY_VERTICES)
     surface = PosedSurface(dataset.body, np.concatenate([chosen, contacts.vertices]))
     frames = torch.from_numpy(bodies.places.world_from_place).float()
@@ -215,16 +215,16 @@ def fit_body(
 
     def loss(index: Tensor) -> dict[str, Tensor]:
         truth = bodies.truth[index]
-        given = net.encode_condition(
+        condition = net.encode_condition(
             bodies.places.place[index], shape.expand(len(index), -1), bodies.places.points[index]
         )
-        mean, log_variance = net.encode(truth, given)
-        made = net.decode(mean + torch.randn_like(mean) * (log_variance / 2).exp(), given)
-        mesh = objectives.posed(made, frames[index], poses, surface)
+        mean, log_variance = net.encode(truth, condition)
+        made = net.decode(mean + torch.randn_like(mean) * (log_variance / 2).exp(), condition)
+        mesh = objectives.posed_vertices(made, frames[index], poses, surface)
         with torch.no_grad():
-            true_mesh = objectives.posed(truth, frames[index], poses, surface)
+            true_mesh = objectives.posed_vertices(truth, frames[index], poses, surface)
         shift, turn = objectives.route_error(made, truth)
-        pose = objectives.pose_error(made[..., ROOT_CHANNELS:], truth[..., ROOT_CHANNELS:], lever)
+        pose = objectives.pose_error(made[..., ROOT_CHANNELS:], truth[..., ROOT_CHANNELS:], basis_m)
         collision, contact = objectives.scene_errors(mesh, scene[index], distances, contacts, len(chosen))
         return {
             "root": w.translation * shift + w.rotation * turn,
@@ -235,4 +235,4 @@ def fit_body(
             "contact": w.contact * contact,
         }
 
-    return trainer.fitted("body", net, optimizer_config, loss, len(bodies.scene))
+    return trainer.train("body", net, optimizer_config, loss, len(bodies.scene))

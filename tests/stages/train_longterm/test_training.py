@@ -88,7 +88,7 @@ def test_a_body_in_the_block_collides_and_one_in_the_air_has_no_contact(dataset,
     ):
         frame = torch.eye(4)[None].clone()
         frame[0, :3, 3] = torch.tensor(place)
-        mesh = objectives.posed(upright, frame, model.poses, surface)
+        mesh = objectives.posed_vertices(upright, frame, model.poses, surface)
         errors[name] = [
             float(e)
             for e in objectives.scene_errors(
