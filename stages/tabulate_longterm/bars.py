@@ -46,11 +46,11 @@ BARS: tuple[tuple[str, str | tuple[str, str], str, float, Literal["lower", "high
     ("minutes: outside of the room", f"{MINUTES}/outside_room_m", "m", 0.01, "lower"),
     ("minutes: deepest vertex inside something", f"{MINUTES}/deepest_m", "m", 0.02, "lower"),
 )
-"""What is judged: name, metric or pair of metrics, unit, the bar, and which way is better."""
+"""Name, metric or pair of metrics, unit, bar, and direction of improvement of each check."""
 
 
 def checks(figures: Mapping[str, float | None]) -> list[Check]:
-    """Judge the figures by the bars of long-term motion; a pair of metrics is judged by its ratio."""
+    """Check the figures against the bars of long-term motion; a pair of metrics by its ratio."""
 
     def of(metric: str | tuple[str, str]) -> float | None:
         if isinstance(metric, str):

@@ -1,4 +1,4 @@
-"""All methods on the same short motions of one source."""
+"""Comparison of all methods on the same clips of one source of motion."""
 
 import numpy as np
 import torch
@@ -17,18 +17,17 @@ from stages.tabulate_longterm.reading import MotionSource
 CLIP_STRIDE = 10
 """Frames (30 fps) between the starts of held-out clips."""
 EPISODE_FRAMES = 300
-"""Clips that begin within the same ten seconds count as one episode."""
+"""Clips that start within the same ten seconds are one episode."""
 LENGTHS_S, LENGTH_RUNS = (2, 4, 6), 8
-"""Seconds of the longer motions that are compared, the true bodies given every two seconds (Sec. 4.2 of the
-paper), and how many motions there are."""
+"""Lengths of the longer motions, with true bodies every two seconds (paper Sec. 4.2), and their number."""
 ALONG = (0.1, 0.9, 17)
-"""shares of the line that are looked at, and how many: a body may touch something where it starts or ends"""
+"""first and last sample along the line, and their number: a body may touch things at its ends"""
 BLOCKED_M = 0.06
-"""A straight line from start to end that comes nearer than this to anything is not the animal's way."""
+"""A straight line from start to end with less clearance than this is blocked."""
 
 
 def figures(prefix: str, source: MotionSource, config: Config) -> dict[str, float | None]:
-    """Measure every method on held-out short motions: on all, in unseen homes, around obstacles."""
+    """Return the metrics of every method on held-out clips: all, in unseen homes, and around obstacles."""
     dataset, model = source.split.held_out, source.models.ours
     if dataset is None:
         return {}
@@ -39,7 +38,7 @@ def figures(prefix: str, source: MotionSource, config: Config) -> dict[str, floa
         return {}
     clips = encode_selection(dataset, cuts, model.poses, model.sizes.points, rng)
     known = scores.references(cuts.parts(dataset), clips.scene, dataset, model)
-    plain, made = {"truth": scores.scored([each.truth for each in known], known, model)}, {}
+    plain, made = {"truth": scores.score_pairs([each.truth for each in known], known, model)}, {}
     for name, method in methods.methods(source.models, dataset, config.seed).items():
         made[name] = method(clips)
         plain[name] = scores.scores(made[name], clips, known, model, None)
@@ -72,7 +71,7 @@ def figures(prefix: str, source: MotionSource, config: Config) -> dict[str, floa
 def _figures_of_lengths(
     prefix: str, source: MotionSource, cuts: ClipSelection, optimized: tuple[str, ...], config: Config
 ) -> dict[str, float | None]:
-    """Measure optimised motions of several lengths, each as a whole, on the same places."""
+    """Return the metrics of optimised motions of several lengths, each as a whole, from the same starts."""
     dataset, model = source.split.held_out, source.models.ours
     assert dataset is not None
     run = max(LENGTHS_S) * RATE_HZ // STEPS
@@ -84,20 +83,20 @@ def _figures_of_lengths(
     )
     known = scores.references(cuts.parts(dataset), clips.scene, dataset, model)
     every = methods.methods(source.models, dataset, config.seed)
-    made = {name: scores.decoded(every[name](clips), clips, known, model) for name in optimized}
+    made = {name: scores.decode_clips(every[name](clips), clips, known, model) for name in optimized}
     episode, found = episodes(cuts.start, cuts.stretch, EPISODE_FRAMES)[::run], {}
     for seconds in LENGTHS_S:
         parts = seconds * RATE_HZ // STEPS
-        rows = {"truth": scores.scored_whole([each.truth for each in known], known, model, run, parts)}
+        rows = {"truth": scores.score_runs([each.truth for each in known], known, model, run, parts)}
         for name, motions in made.items():
-            rows[f"{name}_opt"] = scores.scored_whole(motions, known, model, run, parts, config.optimization)
+            rows[f"{name}_opt"] = scores.score_runs(motions, known, model, run, parts, config.optimization)
         found |= tables.figures(rows, episode, f"{prefix}_{seconds}s", seed=config.seed)
         progress.log(f"{prefix}: {len(episode)} motions of {seconds} s, optimised")
     return found
 
 
 def select_runs(cuts: ClipSelection, run: int, most: int) -> ClipSelection:
-    """Take short motions that follow each other ``run`` by ``run``, evenly, ``most`` at most."""
+    """Select evenly spread runs of ``run`` consecutive clips, at most ``most`` clips."""
     known = set(zip(cuts.stretch.tolist(), cuts.start.tolist(), strict=True))
     begins = [
         all((stretch, start + number * STEPS) in known for number in range(run))
@@ -110,17 +109,17 @@ def select_runs(cuts: ClipSelection, run: int, most: int) -> ClipSelection:
 
 
 def even_runs(count: int, run: int, most: int) -> Int[np.ndarray, "some"]:
-    """Return the numbers of at most ``most`` of ``count`` things, whole runs of ``run``, evenly chosen."""
+    """Return indices of at most ``most`` of ``count`` items in evenly spread whole runs of ``run``."""
     first = run * np.unique(np.linspace(0, max(count // run - 1, 0), min(most, count) // run).astype(int))
     return (first[:, None] + np.arange(run)).reshape(-1)
 
 
 def blocked(clips: Clips, dataset: MotionDataset) -> Bool[np.ndarray, "clip"]:
-    """Return on which clips the straight line of the root comes nearer than `BLOCKED_M` to anything."""
+    """Return the clips whose straight root path has less clearance than `BLOCKED_M`."""
     share = torch.linspace(*ALONG)[None, :, None]
     line = torch.lerp(clips.channels[:, :1, :3], clips.channels[:, -1:, :3], share).double().numpy()
-    near = [
+    distances = [
         dataset.scenes[scene].distance.at(torch.from_numpy(points))
         for scene, points in zip(clips.scene, rigid.apply(clips.world_from_clip, line), strict=True)
     ]
-    return np.array([float(each.min()) < BLOCKED_M for each in near], bool)
+    return np.array([float(each.min()) < BLOCKED_M for each in distances], bool)

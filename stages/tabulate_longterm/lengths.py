@@ -1,4 +1,4 @@
-"""Minutes of motion through many sub-goals: seams, room, furniture."""
+"""Evaluation of minutes of motion through many sub-goals: seams, penetration, leaving the room."""
 
 from dataclasses import replace
 
@@ -12,32 +12,33 @@ from pipeline.longterm.subgoals import sample_visited_subgoals
 from stages.tabulate_longterm.config import Config
 from stages.tabulate_longterm.reading import MotionSource
 
-WATCHED_VERTICES, FRAMES_AT_ONCE = 200, 300
-"""What is looked at of the surface, for being outside of the room, at a time."""
+SAMPLED_VERTICES, FRAMES_AT_ONCE = 200, 300
+"""Vertices tested for being outside the room, and frames per batch."""
 
 
 def figures(source: MotionSource, config: Config) -> dict[str, float | None]:
-    """Travel through preferred places of the reconstructed scene for minutes and measure what the bars ask
-    for.
+    """Return metrics of minutes of travel through often visited places of the reconstructed scene.
 
-    Sub-goals are due at even times, so that the animal rests at those that it reaches early.
+    Sub-goals are due at even times, so that the animal rests where it arrives early.
     """
     world = source.world
-    been = np.concatenate([stretch.world_from_agent[::3, :3, 3] for stretch in source.split.train.stretches])
+    visited = np.concatenate(
+        [stretch.world_from_agent[::3, :3, 3] for stretch in source.split.train.stretches]
+    )
     rng = np.random.default_rng(config.seed)
-    drawn = sample_visited_subgoals(been, config.subgoals + 1, rng)
+    drawn = sample_visited_subgoals(visited, config.subgoals + 1, rng)
     timed = [
         replace(goal, time_s=config.minutes_s * number / config.subgoals) for number, goal in enumerate(drawn)
     ]
     made = travel(world, timed, config.optimization, rng)
     low, high = world.scene.surface.points.min(0), world.scene.surface.points.max(0)
-    surface, outside = PosedSurface(world.body, world.body.sample_vertices(WATCHED_VERTICES)), 0.0
+    surface, outside = PosedSurface(world.body, world.body.sample_vertices(SAMPLED_VERTICES)), 0.0
     for start in range(0, len(made.motion), FRAMES_AT_ONCE):
         points = surface(*motion_tensors(made.motion[start : start + FRAMES_AT_ONCE])).numpy()
         beyond = np.maximum(np.maximum(low - points, points - high), 0)[..., [0, 2]]
         outside = max(outside, float(beyond.max()))
-    there = made.motion.world_from_agent[np.round(made.arrival_s * RATE_HZ).astype(int), :3, 3]
-    reached = np.linalg.norm((there - made.subgoals_world)[:, [0, 2]], axis=1)
+    arrival = made.motion.world_from_agent[np.round(made.arrival_s * RATE_HZ).astype(int), :3, 3]
+    subgoal_error = np.linalg.norm((arrival - made.subgoals_world)[:, [0, 2]], axis=1)
     found = {
         "seconds": float(made.timestamp_s[-1]),
         "subgoals": float(len(drawn) - 1),
@@ -49,7 +50,7 @@ def figures(source: MotionSource, config: Config) -> dict[str, float | None]:
         "contact": made.after.contact,
         "slide_m_s": made.after.slide_m_s,
         "slide_before_m_s": made.before.slide_m_s,
-        "subgoal_error_m": float(reached.max()),
+        "subgoal_error_m": float(subgoal_error.max()),
     }
     return {
         f"longterm_minutes/{name}": value if np.isfinite(value) else None for name, value in found.items()

@@ -1,4 +1,4 @@
-"""Short motions between given bodies by every method that the tables compare."""
+"""In-betweening between given bodies by every method that the tables compare."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,25 +15,25 @@ from pipeline.longterm.networks import ROOT_CHANNELS
 from pipeline.rivals.longterm_networks import AblatedNetworks
 
 Method = Callable[[Clips], Float[Tensor, "clip frame channel"]]
-"""From clips, of which only first and last frames and the scene may be looked at, to all frames"""
+"""Predicts all frames of clips from their first and last frames and the scene alone."""
 OPTIMIZED = ("ours", "base", "route_cvae", "nearest")
-"""Methods that are also judged after the optimisation."""
+"""Methods that are also evaluated after optimisation."""
 WITHOUT_SCENE = {"ours": "ours_no_scene", "route_t_pose": "route_t_pose_no_scene", "base": "base_no_scene"}
-"""Methods that see the scene, and the same that do not; the routes of `route_tr_pose` are those of ours."""
+"""Methods that see the scene, and their ablations without it; `route_tr_pose` has the routes of ours."""
 COMPARED_WITH = {"base": "ours", "route_cvae": "ours", "nearest": "ours"} | {
     blind: with_scene for with_scene, blind in WITHOUT_SCENE.items()
 }
-"""Methods whose errors beyond another's are reported clip by clip, with intervals."""
+"""Pairs of methods whose difference in error per clip is reported with intervals."""
 
 
 @dataclass(frozen=True)
 class ComparedModels:
-    """All that was trained on one source of motion."""
+    """All models trained on one source of motion."""
 
     ours: LongTerm
     ablated: dict[str, AblatedNetworks]
     bank: Clips
-    """the short motions that were learned from, without scene points"""
+    """the training clips, without scene points"""
 
 
 def methods(models: ComparedModels, dataset: MotionDataset, seed: int) -> dict[str, Method]:
@@ -52,7 +52,7 @@ def methods(models: ComparedModels, dataset: MotionDataset, seed: int) -> dict[s
 def route_cvae(
     model: LongTerm, clips: Clips, dataset: MotionDataset, rng: np.random.Generator
 ) -> Float[Tensor, "clip frame channel"]:
-    """Follow RouteNet's route with a body of the CVAE in every frame, one z per clip (Route + CVAE)."""
+    """Follow RouteNet's route with a CVAE body in every frame, one z per clip (Route + CVAE)."""
     with torch.no_grad():
         route = model.route(clips.channels[:, 0], clips.channels[:, -1], clips.seen)
         made = []
@@ -70,7 +70,7 @@ def route_cvae(
 
 
 def nearest(bank: Clips, clips: Clips) -> Float[Tensor, "clip frame channel"]:
-    """Take from the memory bank the short motion with the most similar ends (after HSNMS)."""
+    """Return the training clips whose ends are nearest to those of each clip (after HSNMS)."""
 
     def ends(some: Clips) -> Float[Tensor, "clip channel"]:
         both = some.channels[:, [0, -1]]

@@ -1,4 +1,4 @@
-"""Opening both sources of motion, with all networks that were trained on each."""
+"""Read both sources of motion, with the networks trained on each."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from stages.tabulate_longterm.methods import ComparedModels
 
 @dataclass(frozen=True)
 class MotionSource:
-    """Motion that was learned from and motion that was not, and what was learned."""
+    """Training and held-out motion, and the models trained on it."""
 
     split: DatasetSplit
     models: ComparedModels
@@ -25,17 +25,17 @@ class MotionSource:
 
     @property
     def world(self) -> LongTermWorld:
-        """The body and the first scene that were learned from."""
+        """The model with the training body and the first training scene."""
         return LongTermWorld(self.models.ours, self.split.train.body, self.split.train.scenes[0])
 
 
 def simulated(world: Path, study: Path) -> MotionSource:
-    """Read simulated motion and what was learned from it."""
+    """Read simulated motion and the models trained on it."""
     return _with_models(simulated_lives.load(world), study, None)
 
 
 def recorded(reconstruction: Path, behavior_data: Path, ablations: Path) -> MotionSource:
-    """Read reconstructed motion and what was learned from it."""
+    """Read reconstructed motion and the models trained on it."""
     data = BehaviorData.load(behavior_data)
     return _with_models(reconstructed_split(reconstruction, data), ablations, data)
 

@@ -27,11 +27,10 @@ UNITS = ("m", "m_s", "m", "m")
 def figures(
     source: MotionSource, model: Path, behavior_data: Path, config: Config, device: str
 ) -> dict[str, float | None]:
-    """Draw one plan per window, make it physical, and compare penetration, sliding feet and distances from
-    the truth.
+    """Sample one plan per window, optimise it, and compare penetration, foot skate and errors.
 
-    `<name>_before_<unit>`, `<name>_<unit>` and `<name>_more_<unit>`, the second less the first, with
-    intervals over episodes.
+    Returns `<name>_before_<unit>`, `<name>_<unit>` and their difference `<name>_more_<unit>`, with intervals
+    over episodes.
     """
     data = source.data
     assert data is not None, "only recorded motion has samples of the behaviour model"
@@ -64,7 +63,7 @@ def rows(
     config: Config,
     device: str,
 ) -> Float[np.ndarray, "window 2 4"]:
-    """Return `NAMES` of each window's plan before and after."""
+    """Return `NAMES` of each window's plan before and after optimisation."""
     architecture, nets, scaling, schedule, _ = behavior.load(model)
     sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
     context, future = data.windows(windows)
@@ -77,8 +76,8 @@ def rows(
     time_s, found = np.arange(count) / RATE_HZ, []
     plans = zip(roots[:, :count], bones[:, :count], future.path_world[:, :count], strict=True)
     for root, bone, truth in progress.track(plans, "samples", total=len(roots)):
-        done, *worth = refine_at_rate(world, time_s, BodyMotion(root, bone), config.optimization)
-        off = [np.linalg.norm(each[:, :3, 3] - truth, axis=1) for each in (root, done.world_from_agent)]
-        both = zip(worth, off, strict=True)
-        found.append([[each.penetration_m, each.slide_m_s, away[-1], away.mean()] for each, away in both])
+        refined, *metrics = refine_at_rate(world, time_s, BodyMotion(root, bone), config.optimization)
+        errors = [np.linalg.norm(each[:, :3, 3] - truth, axis=1) for each in (root, refined.world_from_agent)]
+        both = zip(metrics, errors, strict=True)
+        found.append([[each.penetration_m, each.slide_m_s, error[-1], error.mean()] for each, error in both])
     return np.array(found)

@@ -1,4 +1,4 @@
-"""Figures with intervals, and the tables as people read them."""
+"""Figures with confidence intervals, and the tables as text."""
 
 import re
 from collections.abc import Mapping
@@ -22,10 +22,9 @@ def figures(
     *,
     seed: int,
 ) -> dict[str, float | None]:
-    """Return mean (of `MEDIANS` the median) and 95 % interval, drawn over episodes, of every metric of every
-    method.
+    """Return mean (median for `MEDIANS`) and 95 % interval over episodes of all metrics and methods.
 
-    None where it cannot be measured.
+    None if no clip has a finite value.
     """
     found: dict[str, float | None] = {}
     for method, values in rows.items():

@@ -137,12 +137,12 @@ def test_clips_come_two_by_two_and_a_torn_join_is_measured(source):
     parts = cuts.parts(dataset)
     known = scores.references(parts, np.zeros(6, int), dataset, model)
     seam = scores.METRICS.index("seam_share")
-    whole = scores.scored(parts, known, model)[:, seam]
+    whole = scores.score_pairs(parts, known, model)[:, seam]
     moved = parts[1].world_from_agent.copy()
     moved[1:, 0, 3] += 0.05
-    torn = scores.scored([parts[0], BodyMotion(moved, parts[1].agent_from_bone), *parts[2:]], known, model)[
-        :, seam
-    ]
+    torn = scores.score_pairs(
+        [parts[0], BodyMotion(moved, parts[1].agent_from_bone), *parts[2:]], known, model
+    )[:, seam]
     assert whole.max() < 0.02 < (torn - whole)[:2].min()
     np.testing.assert_array_equal(torn[2:], whole[2:])
 
