@@ -1,5 +1,5 @@
 """Replace the fields by 3D Gaussians and refine them, and the motion, against the pictures.
 
-`views` opens the videos and reads one frame at drawing size; `cover` lays the first Gaussians where pictures
-show most; `refine` holds losses and optimisation; `pictures` shows the result.
+`views` reads videos and frames at rendering resolution; `cover` initializes Gaussians on the surfaces;
+`refine` holds losses and optimisation; `pictures` reports the result.
 """

@@ -25,7 +25,7 @@ class GaussianWeights:
     silhouette: float = 0.3
     """absolute difference of the agent's coverage and its mask"""
     flow: float = 0.05
-    """difference of flow in drawn pixels, at most 4"""
+    """difference of flow in rendered pixels, at most 4"""
     motion: float = 1.0
     """squared corrections of root and bones, in units of 0.1 m and 0.1 rad"""
 
@@ -37,13 +37,13 @@ class Config:
     seed: int = 0
     """of all randomness"""
     steps: int = 1000
-    """frames drawn, one a step"""
+    """number of frames rendered, over all processes"""
     counts: GaussianCounts = GaussianCounts()
     """numbers of Gaussians"""
     cover_frames: int = 240
-    """pictures, over all videos, that decide colors and density of the first Gaussians"""
+    """pictures, over all videos, from which colors and density of the initial Gaussians are computed"""
     long_side_px: int = 192
-    """longer side of drawn pictures, pixels"""
+    """longer side of rendered pictures, pixels"""
     weights: GaussianWeights = GaussianWeights()
     """of the losses"""
     save_every: int = 200

@@ -1,9 +1,9 @@
-"""Cover the reconstruction's surfaces with Gaussians, in the colors of the pictures (`splats`).
+"""Initialize Gaussians on the reconstruction's surfaces, in the colors of the pictures (`splats`).
 
-`sample_surfaces` puts many points on the surface that all videos share and on what single videos saw
-elsewhere (a chair that is moved between sessions). `observe` projects them into some pictures of every video
-that shows them and averages colors, near views most, and fits each video's exposure. `subsample` keeps most
-of them where colors change fast and where cameras looked: there a coarse cover costs most.
+`sample_surfaces` samples points densely on the shared surface and on surfaces of single videos (a chair moved
+between sessions). `observe` projects them into pictures of every video, averages colors weighted by inverse
+squared depth, and fits each video's exposure. `subsample` keeps more points where color gradients are large
+and where cameras looked often: there sparse Gaussians cost most.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,29 +25,29 @@ from stages.refine_gaussians.config import GaussianCounts
 from stages.refine_gaussians.views import AGENT, UNKNOWN, DrawnVideo
 
 CANDIDATES = 6
-"""points that are sampled for each that is kept"""
-REACH_M = 0.05
-"""a point is seen where measured depth is this near at a distance of 1 m, twice that at 2 m"""
-PLAIN = 0.02
-"""color differences between neighbours, 0..1, that count as none"""
-WIDEST = 0.9
-"""Gaussians are no wider than this quantile of their spacing: isolated points stay small"""
-EVEN = 0.4
-"""share of the Gaussians that is spread evenly"""
+"""points sampled per point kept"""
+DEPTH_TOLERANCE = 0.05
+"""a point is visible if it agrees with the measured depth within this share of its depth"""
+BASE_GRADIENT = 0.02
+"""added to color differences between neighbours, 0..1"""
+MAX_SPACING_QUANTILE = 0.9
+"""spacings are clipped to this quantile: Gaussians at isolated points stay small"""
+UNIFORM_SHARE = 0.4
+"""share of the Gaussians that is spread uniformly"""
 SHELL_M = 0.12
-"""unseen points this near to a seen one are its back, and left out"""
+"""unseen points this near to a seen one are its back side and left out"""
 MIN_SEEN = 100
-"""points without which a video's exposure is not fitted"""
+"""visible points required to fit a video's exposure"""
 RIDGE = 0.001
-"""pulls exposures to the identity where colors do not determine them"""
+"""ridge regularization of exposures towards the identity"""
 NEAREST_M = 0.2
-"""nearer points are not looked at"""
+"""near plane: nearer points are ignored"""
 NEIGHBOURS = 6
-"""of a point, over which its color gradient is averaged"""
+"""neighbours over which a point's color gradient is averaged"""
 SPACING_NEIGHBOUR, MIN_SPACING_M = 4, 0.001
-"""the distance to this neighbour is a point's spacing, at least this"""
-CURVE_CELL_M, CURVE_BITS = 0.005, 20
-"""cells of the space-filling curve, and bits of their numbers"""
+"""a point's spacing is the distance to this neighbour, with this lower bound"""
+MORTON_CELL_M, MORTON_BITS = 0.005, 20
+"""cell size of the Morton curve, and bits per axis"""
 
 
 @dataclass(frozen=True)
@@ -55,22 +55,22 @@ class ObservedColors:
     """Colors and visibility of points in the pictures."""
 
     color: Float[np.ndarray, "point 3"]
-    """0..1, in the light of the surface's own colors; those where never seen"""
+    """0..1, at the exposure of the surface's own colors, which unseen points keep"""
     weight: Float[np.ndarray, "point"]
-    """sum of 1 / depth squared over the pictures that show a point"""
+    """sum of 1 / depth squared over the pictures in which a point is visible"""
     through: Float[np.ndarray, "point"]
-    """the same over the pictures that show what lies behind it: it was moved, or never there"""
+    """the same over pictures that see through it: it was moved, or never existed"""
     appearance: Float[np.ndarray, "video 3 4"]
-    """what turns these colors into each video's"""
+    """affine color transform from these colors to each video's"""
 
 
 @dataclass(frozen=True)
 class CoveredScene:
-    """The scene in Gaussians."""
+    """The initial Gaussians of the scene."""
 
     gaussians: Gaussians
     stands: Bool[np.ndarray, "row point"]
-    """which of them each video shows and, in the last row, which all share"""
+    """Gaussians present in each video and, in the last row, those of the shared scene"""
     appearance: Float[np.ndarray, "video 3 4"]
     """each video's exposure"""
 
@@ -82,7 +82,7 @@ def splats(
     frames: int,
     rng: np.random.Generator,
 ) -> Splats:
-    """Cover a reconstruction; the agent's Gaussians take their skinning weights from its body."""
+    """Initialize the Gaussians of a reconstruction; the agent's have the skinning weights of its body."""
     loaded = fields.load(reconstruction)
     codes = [loaded.video_code(video.id) for video in videos if video.appearance is not None]
     room = scene(loaded.scene, codes, counts.scene, videos, frames, rng)
@@ -103,7 +103,7 @@ def scene(
     frames: int,
     rng: np.random.Generator,
 ) -> CoveredScene:
-    """Cover the shared scene and what single videos saw, with colors of about ``frames`` pictures."""
+    """Initialize Gaussians on shared and single videos' surfaces, colored from about ``frames`` pictures."""
     points, layer, stands = sample_surfaces(field, codes, CANDIDATES * number, rng)
     seen = observe(points, stands, videos, frames)
     chosen, spacing_m = subsample(points.points, layer, seen, number, rng)
@@ -115,10 +115,9 @@ def scene(
 def sample_surfaces(
     field: Field, codes: Sequence[int], number: int, rng: np.random.Generator
 ) -> tuple[SurfaceSamples, Int[np.ndarray, "point"], Bool[np.ndarray, "row point"]]:
-    """Sample points on all surfaces: ``number`` on the shared one and as densely on those of single videos.
+    """Sample ``number`` points on the shared surface, and at the same density on those of single videos.
 
-    Returns the points, on whose surface each lies (-1: the shared one) and where it stands, as
-    `CoveredScene.stands`.
+    Returns the points, the video code of each one's surface (-1: shared), and `CoveredScene.stands`.
     """
     shared = marching_cubes.extract_scene(field, -1, field.lattice_m)
     keep_own = list(codes) if field.fused else []
@@ -145,7 +144,7 @@ def sample_surfaces(
 def observe(
     samples: SurfaceSamples, stands: Bool[np.ndarray, "row point"], videos: Sequence[DrawnVideo], frames: int
 ) -> ObservedColors:
-    """Average the pictures' colors at points; fit each video's exposure to the colors that points have."""
+    """Average the pictures' colors at points, and fit each video's exposure to the points' own colors."""
     points, color = samples.points, samples.color
     videos = [video for video in videos if video.appearance is not None]
     total, appearance = np.zeros_like(color), np.tile(np.eye(3, 4), (len(videos), 1, 1))
@@ -153,10 +152,10 @@ def observe(
     every = max(1, sum(len(video.usable_frames()) for video in videos) // frames)
     for video in videos:
         sums, weights = np.zeros_like(color), np.zeros(len(points))
-        for look in _looks(samples, stands[video.appearance], video, every):
-            sums[look.shown] += look.shown_weight[:, None] * look.color
-            weights[look.shown] += look.shown_weight
-            through[look.through] += look.through_weight
+        for view in _observations(samples, stands[video.appearance], video, every):
+            sums[view.shown] += view.shown_weight[:, None] * view.color
+            weights[view.shown] += view.shown_weight
+            through[view.through] += view.through_weight
         shown = weights > 0
         if shown.sum() < MIN_SEEN:
             continue
@@ -174,7 +173,7 @@ def exposure(
     target: Float[np.ndarray, "point 3"],
     weight: Float[np.ndarray, "point"],
 ) -> Float[np.ndarray, "3 4"]:
-    """Fit the affine map of colors from source to target, near the identity where it is undetermined."""
+    """Fit the affine color transform from source to target, regularized towards the identity."""
     share = weight / weight.sum()
     inputs = np.concatenate([source, np.ones((len(source), 1))], axis=1)
     normal = (inputs * share[:, None]).T @ inputs + RIDGE * np.eye(4)
@@ -182,8 +181,8 @@ def exposure(
 
 
 @dataclass(frozen=True)
-class _Look:
-    """What one picture shows: points and what lies behind points, with their weights."""
+class _Observation:
+    """Points visible in one picture and points that it sees through, with their weights."""
 
     shown: Int[np.ndarray, "shown"]
     color: Float[np.ndarray, "shown 3"]
@@ -192,8 +191,10 @@ class _Look:
     through_weight: Float[np.ndarray, "through"]
 
 
-def _looks(samples: SurfaceSamples, stands: np.ndarray, video: DrawnVideo, every: int) -> Iterator[_Look]:
-    """Project the points of a video into some of its frames; back faces and the animal's pixels show none."""
+def _observations(
+    samples: SurfaceSamples, stands: np.ndarray, video: DrawnVideo, every: int
+) -> Iterator[_Observation]:
+    """Project a video's points into every ``every``-th frame, without back faces and the animal's pixels."""
     clip, masks = video.clip, video.masks
     homogeneous = np.pad(samples.points, ((0, 0), (0, 1)), constant_values=1).astype(np.float32)
     for frame in video.usable_frames()[::every]:
@@ -209,10 +210,10 @@ def _looks(samples: SurfaceSamples, stands: np.ndarray, video: DrawnVideo, every
             label = masks[frame][row, column]
             measured = np.where((label == AGENT) | (label == UNKNOWN), 0, measured)
         towards = ((world_from_camera[:3, 3] - samples.points[index]) * samples.normal[index]).sum(-1) > 0
-        shown = (measured > 0) & (np.abs(measured - z) < REACH_M * z) & towards
-        through, weight = measured - z > 2 * REACH_M * z, 1 / z.astype(float) ** 2
+        shown = (measured > 0) & (np.abs(measured - z) < DEPTH_TOLERANCE * z) & towards
+        through, weight = measured - z > 2 * DEPTH_TOLERANCE * z, 1 / z.astype(float) ** 2
         color = clip.color(frame)[row[shown], column[shown]] / 255
-        yield _Look(index[shown], color, weight[shown], index[through], weight[through])
+        yield _Observation(index[shown], color, weight[shown], index[through], weight[through])
 
 
 def subsample(
@@ -222,22 +223,24 @@ def subsample(
     number: int,
     rng: np.random.Generator,
 ) -> tuple[Int[np.ndarray, "chosen"], Float[np.ndarray, "chosen"]]:
-    """Choose about ``number`` points; returns their indices and their spacing on the same surface, metres.
+    """Choose about ``number`` points; return their indices and their spacing on the same surface, metres.
 
-    The error of a cover with spacing s is about (slope of colors * s)^2 times how often it is looked at; for
-    a given number of points it is least where their density goes with the slope and the root of the visits.
-    Points that more pictures saw through than saw are left out.
+    The color error at spacing s is about (gradient * s)^2 times the observation weight. For a fixed number of
+    points it is minimal at a density proportional to the gradient and the square root of the weight. Points
+    that pictures see through more than they see them are left out.
     """
     shown = seen.weight > 0
-    gone = seen.through > seen.weight
-    gone[~shown] |= np.isfinite(KDTree(points[shown]).query(points[~shown], distance_upper_bound=SHELL_M)[0])
+    absent = seen.through > seen.weight
+    absent[~shown] |= np.isfinite(
+        KDTree(points[shown]).query(points[~shown], distance_upper_bound=SHELL_M)[0]
+    )
     near = np.asarray(KDTree(points).query(points, NEIGHBOURS + 1)[1])[:, 1:]
-    slope = np.abs(seen.color[near] - seen.color[:, None]).mean((1, 2)) + PLAIN
+    gradient = np.abs(seen.color[near] - seen.color[:, None]).mean((1, 2)) + BASE_GRADIENT
     visits = seen.weight / max(seen.weight.mean(), 1e-9)
-    density = np.where(gone, 0, slope * np.sqrt(visits))
-    share = EVEN * ~gone / (~gone).sum() + (1 - EVEN) * density / max(density.sum(), 1e-9)
-    share = _capped(number * share, 1.0)
-    order = np.argsort(_along_a_curve(points))
+    density = np.where(absent, 0, gradient * np.sqrt(visits))
+    uniform = UNIFORM_SHARE * ~absent / (~absent).sum()
+    share = _capped(number * (uniform + (1 - UNIFORM_SHARE) * density / max(density.sum(), 1e-9)), 1.0)
+    order = np.argsort(_morton_codes(points))
     steps = np.cumsum(share[order]) + rng.random()
     chosen = order[np.flatnonzero(np.diff(np.floor(steps), prepend=np.floor(steps[0] - share[order[0]])) > 0)]
     fourth_m = np.empty(len(chosen))
@@ -246,21 +249,21 @@ def subsample(
         here = points[chosen[own]]
         distance_m = KDTree(here).query(here, min(SPACING_NEIGHBOUR + 1, len(here)))[0]
         fourth_m[own] = distance_m.reshape(len(here), -1)[:, -1]
-    return chosen, np.clip(fourth_m, MIN_SPACING_M, np.quantile(fourth_m, WIDEST))
+    return chosen, np.clip(fourth_m, MIN_SPACING_M, np.quantile(fourth_m, MAX_SPACING_QUANTILE))
 
 
-def _along_a_curve(points: Float[np.ndarray, "point 3"]) -> np.ndarray:
-    """Return each point's place on a curve through space along which neighbours stay near (Morton's)."""
-    cell = np.floor((points - points.min(0)) / CURVE_CELL_M).astype(np.uint64)
-    place = np.zeros(len(points), np.uint64)
-    for bit in range(CURVE_BITS):
+def _morton_codes(points: Float[np.ndarray, "point 3"]) -> np.ndarray:
+    """Return the Morton code of each point's cell."""
+    cell = np.floor((points - points.min(0)) / MORTON_CELL_M).astype(np.uint64)
+    code = np.zeros(len(points), np.uint64)
+    for bit in range(MORTON_BITS):
         for axis in range(3):
-            place |= ((cell[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return place
+            code |= ((cell[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return code
 
 
 def _capped(share: np.ndarray, most: float) -> np.ndarray:
-    """Cut shares at ``most`` and give the rest to the others."""
+    """Clip shares to ``most`` and redistribute the excess."""
     total = share.sum()
     for _ in range(8):
         share = np.minimum(share * total / share.sum(), most)

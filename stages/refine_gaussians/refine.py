@@ -1,6 +1,6 @@
-"""Refine Gaussians and motion: draw one frame a step, compare color, depth, silhouette and flow.
+"""Refine Gaussians and motion: render one frame per step; losses of color, depth, silhouette and flow.
 
-Of several processes (`pipeline.core.distributed`) each draws a frame of its own, in as many fewer steps.
+Each of several processes (`pipeline.core.distributed`) renders its own frame, in proportionally fewer steps.
 """
 
 import math
@@ -25,23 +25,23 @@ from stages.refine_gaussians.config import GaussianWeights
 from stages.refine_gaussians.views import DrawnVideo, Target, flow_lattice, read
 
 RATES = {"means": 5e-4, "rotation": 2e-3, "log_scale": 1e-2, "opacity_logit": 3e-2, "band0": 1e-2}
-"""learning rates of Adam: metres, quaternions, logarithms of metres, logits, coefficients of harmonics"""
+"""learning rates of Adam: metres, quaternions, log metres, logits, spherical harmonics"""
 EXPOSURE_RATE, MOTION_RATE = 2e-3, 3e-4
-"""of each video's exposure, and of root and bones, metres and radians"""
+"""learning rates of exposures, and of root and bones, metres and radians"""
 BETA2 = 0.99
-"""Adam's second beta for motion, which has no momentum: frames outside the step must not move"""
+"""Adam's second beta for motion, which has no momentum: frames not in the step must not move"""
 LAST_RATE = 0.1
-"""learning rates fall to this share"""
+"""final learning rate as a share of the initial one"""
 DEPTH_UNIT_M, MOTION_UNIT = 0.2, 0.1
-"""units of the losses of depth, and of corrections of motion (metres and radians)"""
+"""units of the depth loss, and of the motion loss (metres and radians)"""
 MAX_FLOW_PX = 100.0
-"""rendered flow is clamped to this, drawn pixels: points at the camera's side project anywhere"""
+"""rendered flow is clamped to this, in rendered pixels: points beside the camera project anywhere"""
 MAX_FLOW_LOSS, MIN_COVERAGE = 4.0, 0.5
-"""flow errors saturate, and count where the Gaussians cover so much of a pixel"""
+"""saturation of flow errors, and coverage from which a pixel has a flow loss"""
 
 
 class MotionDeltas(nn.Module):
-    """Small corrections of roots and bones of all frames, as twists."""
+    """Corrections of roots and bones of all frames, as twists."""
 
     def __init__(self, frames: int, bones: int):
         super().__init__()
@@ -60,7 +60,7 @@ class MotionDeltas(nn.Module):
 
 
 class FrameLoss:
-    """The loss of one random frame, before a background of random color, so that holes cost."""
+    """The loss of one random frame, rendered over a random background color to penalize holes."""
 
     def __init__(
         self,
@@ -83,20 +83,20 @@ class FrameLoss:
         target = read(video, frame, size, self.device)
         camera = self.camera(video, frame)
         cloud = self.cloud(video, frame, camera, target)
-        later = self._later_pixels(video, frame, target, cloud)
-        view = render(cloud, camera, target.intrinsics, *size, backend=self.backend, extra=later)
+        flow = self._projected_flow(video, frame, target, cloud)
+        view = render(cloud, camera, target.intrinsics, *size, backend=self.backend, extra=flow)
         room = torch.ones_like(target.agent) if cloud.agent.any() else ~target.agent
-        everywhere = room if video.appearance is not None else target.agent
-        measured = (target.depth > 0) & everywhere
+        rendered = room if video.appearance is not None else target.agent
+        measured = (target.depth > 0) & rendered
         weights, terms = self.weights, {}
-        behind = torch.rand(3, generator=generator).to(self.device)
-        color = view.color + (1 - view.coverage)[..., None] * behind
-        terms["color"] = weights.color * (color - target.color).abs().mean(-1)[everywhere & target.known]
+        background = torch.rand(3, generator=generator).to(self.device)
+        color = view.color + (1 - view.coverage)[..., None] * background
+        terms["color"] = weights.color * (color - target.color).abs().mean(-1)[rendered & target.known]
         depth_error = ((view.depth - target.depth).abs() / DEPTH_UNIT_M).clamp_max(1)
         terms["depth"] = weights.depth * depth_error[measured]
         terms["silhouette"] = weights.silhouette * (view.agent - target.agent.float()).abs()[target.known]
-        if later is not None:
-            errors = self._flow_errors(video, target, view.extra, view.coverage, everywhere)
+        if flow is not None:
+            errors = self._flow_errors(video, target, view.extra, view.coverage, rendered)
             terms["flow"] = weights.flow * errors
         elif distributed.size() > 1:  # all processes have the same terms
             terms["flow"] = torch.zeros(1, device=self.device)
@@ -121,7 +121,7 @@ class FrameLoss:
         return concatenate(*parts)
 
     def _shows_agent(self, video: DrawnVideo, frame: int, camera_from_world: Tensor, target: Target) -> bool:
-        """Return whether the agent's pose is known and its bounding ball is in view."""
+        """Return whether the agent's pose is known and its bounding sphere is in view."""
         if not video.motion.agent_known[frame]:
             return False
         root = torch.from_numpy(video.motion.world_from_agent[frame]).float().to(self.device)
@@ -142,8 +142,8 @@ class FrameLoss:
         camera_from_world = np.linalg.inv(video.motion.world_from_camera[frame])
         return torch.from_numpy(camera_from_world).float().to(self.device)
 
-    def _later_pixels(self, video: DrawnVideo, frame: int, target: Target, cloud: Cloud) -> Tensor | None:
-        """Return where each Gaussian is seen one frame later, in drawn pixels from where it is now."""
+    def _projected_flow(self, video: DrawnVideo, frame: int, target: Target, cloud: Cloud) -> Tensor | None:
+        """Return the flow of each Gaussian to the next frame, in rendered pixels; None if it is unknown."""
         motion, later = video.motion, frame + 1
         if target.flow_px is None or later >= len(motion.timestamp_s):
             return None
@@ -162,21 +162,21 @@ class FrameLoss:
         return (then - now).clamp(-MAX_FLOW_PX, MAX_FLOW_PX)
 
     def _flow_errors(
-        self, video: DrawnVideo, target: Target, drawn: Tensor, coverage: Tensor, everywhere: Tensor
+        self, video: DrawnVideo, target: Target, flow: Tensor, coverage: Tensor, rendered: Tensor
     ) -> Tensor:
         assert target.flow_px is not None and target.flow_confidence is not None, "a frame without flow"
         rows, columns = target.flow_confidence.shape
         height, width = target.color.shape[:2]
         lattice = flow_lattice(rows, columns, video.clip.color_size, (height, width))
         row, column = (index.to(self.device) for index in lattice)
-        found = drawn[row, column] / coverage[row, column].clamp_min(0.1)[..., None]
+        found = flow[row, column] / coverage[row, column].clamp_min(0.1)[..., None]
         error = functional.huber_loss(found, target.flow_px, reduction="none", delta=1.0).sum(-1)
-        counted = (coverage[row, column] > MIN_COVERAGE) & everywhere[row, column]
-        return (error.clamp_max(MAX_FLOW_LOSS) * target.flow_confidence)[counted]
+        valid = (coverage[row, column] > MIN_COVERAGE) & rendered[row, column]
+        return (error.clamp_max(MAX_FLOW_LOSS) * target.flow_confidence)[valid]
 
 
 def refine(loss: FrameLoss, steps: int, seed: int, resume: Path | None, save_every: int) -> FitRecord:
-    """Optimize Gaussians, exposure and motion in place, on ``steps`` frames in all."""
+    """Optimize Gaussians, exposures and motion in place, on ``steps`` frames in total."""
     splats, deltas = loss.splats, loss.deltas
     groups = [{"params": [splats.appearance], "lr": EXPOSURE_RATE}]
     for gaussians in (splats.scene, splats.agent):
@@ -198,8 +198,8 @@ def refine(loss: FrameLoss, steps: int, seed: int, resume: Path | None, save_eve
 
 
 @torch.no_grad()
-def refined(motion: Motion, deltas: MotionDeltas, first: int) -> Motion:
-    """Return one video's motion with its corrections."""
+def corrected(motion: Motion, deltas: MotionDeltas, first: int) -> Motion:
+    """Return one video's motion with its corrections applied."""
     frame = torch.arange(first, first + len(motion.timestamp_s))
     device = deltas.root.device
     poses = (motion.world_from_agent, motion.agent_from_bone)

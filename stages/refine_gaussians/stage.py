@@ -30,7 +30,7 @@ class Inputs:
 def run(
     inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "cpu", resume: Path | None = None
 ) -> None:
-    """Refine one reconstruction into `out`; of several processes the first writes."""
+    """Refine one reconstruction into `out`; the first process writes."""
     distributed.join(device)
     backend = config.backend
     if backend == "auto":
@@ -66,5 +66,4 @@ def write(folder: Path, splats: Splats, deltas: refine.MotionDeltas, videos: Seq
     for video in videos:
         if video.appearance is not None and video.masks is not None:
             (folder / video.id).mkdir()
-            corrected = refine.refined(video.motion, deltas, video.first)
-            motion.save(folder / video.id / "motion.npz", corrected)
+            motion.save(folder / video.id / "motion.npz", refine.corrected(video.motion, deltas, video.first))

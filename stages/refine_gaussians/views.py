@@ -1,4 +1,4 @@
-"""Videos with their motion, and single frames of them at drawing size: color, depth, mask, flow."""
+"""Videos with their motion, and their frames at rendering resolution: color, depth, mask, flow."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class DrawnVideo:
     """index of its appearance; None: the turnaround, whose world is the agent"""
 
     def drawn_size(self, long_side_px: int) -> tuple[int, int]:
-        """Return height and width of drawn pictures, in the shape of the recording's."""
+        """Return height and width of rendered pictures, in the recording's aspect ratio."""
         height, width = (
             round(side * long_side_px / max(self.clip.color_size)) for side in self.clip.color_size
         )
@@ -53,7 +53,7 @@ class DrawnVideo:
 
 @dataclass(frozen=True)
 class Target:
-    """One frame at drawing size."""
+    """One frame at rendering resolution."""
 
     color: Float[Tensor, "height width 3"]
     depth: Float[Tensor, "height width"]
@@ -63,7 +63,7 @@ class Target:
     """the mask is not unknown"""
     intrinsics: Float[Tensor, "3 3"]
     flow_px: Float[Tensor, "row column 2"] | None
-    """displacement in drawn pixels, on flow's own lattice"""
+    """displacement in rendered pixels, on the flow's own lattice"""
     flow_confidence: Float[Tensor, "row column"] | None
 
 
@@ -88,7 +88,7 @@ def read_videos(
 
 
 def read(video: DrawnVideo, frame: int, size: tuple[int, int], device: str) -> Target:
-    """Read one frame and shrink it to (height, width)."""
+    """Read one frame, resized to (height, width)."""
     clip, small = video.clip, size[::-1]
     color = cv2.resize(clip.color(frame), small, interpolation=cv2.INTER_AREA)
     depth = cv2.resize(usable_depth(clip, frame), small, interpolation=cv2.INTER_NEAREST_EXACT)

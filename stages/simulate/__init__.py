@@ -1,4 +1,4 @@
-"""The behaviour model as a program and as a gymnasium-style environment.
+"""Takes of the behaviour model and of long-term motion.
 
-`simulator` chains plans behind `reset` and `step`, `observers` scripts the person, `rollout` records a take.
+`takes` makes each kind of take, `observers` scripts the person, `rollout` records a simulation.
 """

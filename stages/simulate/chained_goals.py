@@ -1,6 +1,4 @@
-"""Sub-goals for minutes from the behaviour model: one goal after the other, each asked for where the last
-plan ended.
-"""
+"""Sub-goals for minutes of motion from the behaviour model: each is sampled where the last plan ended."""
 
 import numpy as np
 
@@ -12,9 +10,7 @@ from stages.simulate.observers import Observer
 
 
 def chained_goals(simulator: Simulator, observer: Observer, count: int, seed: int) -> list[Subgoal]:
-    """Return the start and ``count`` goals, a plan's length apart; the simulator must play each plan to its
-    end.
-    """
+    """Return the start and ``count`` goals, one per plan; the simulator must play each plan to its end."""
     chaining = simulator.animals.chaining
     assert np.isinf(chaining.observer_motion_ratio) and not chaining.blend_frames, chaining
     state = simulator.reset(seed)

@@ -1,4 +1,4 @@
-"""What a take is made of."""
+"""Input artifacts of a take."""
 
 from dataclasses import dataclass
 from pathlib import Path

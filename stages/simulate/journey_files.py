@@ -1,4 +1,4 @@
-"""The files of a long-term take: motion, animated surface, frames for a video, and what it is worth."""
+"""Files of a long-term take: motion, animated surface, frames for a video, plausibility metrics."""
 
 import json
 from dataclasses import asdict
@@ -23,13 +23,13 @@ from pipeline.longterm.short_motions import RATE_HZ, BodyMotion
 FOCAL = 0.9
 """Focal length of the frames in units of their width."""
 SMOOTHED_FRAMES, TURNED_FRAMES = 12.0, 20.0
-"""Deviations of the Gaussians that smooth what the camera follows, and the side it follows from."""
+"""Standard deviations of the Gaussians that smooth the camera's target and its direction, frames."""
 ASIDE_M, ABOVE_M, OFF_CENTER_M = 1.3, [0.0, 1.4, 0.05], 0.3
-"""Where the camera stands from the animal; nearer to the room's centre than the last, sides fade."""
+"""Camera offset from the animal; nearer to the room's centre than the last, the horizontal offset shrinks."""
 AMBIENT, DIFFUSE = 0.45, 0.55
-"""Shares of light on the animal's fur."""
+"""Ambient and diffuse shading of the animal."""
 FITTED_POSES = 60
-"""Poses of a take that the four weights of its surface are fitted to."""
+"""Poses of a take that the four skinning weights per vertex are fitted to."""
 
 
 def write_journey(folder: Path, journey: Journey, body: SkinnedBody) -> None:
@@ -42,9 +42,9 @@ def write_journey(folder: Path, journey: Journey, body: SkinnedBody) -> None:
         subgoals_world=journey.subgoals_world,
         arrival_s=journey.arrival_s.astype(np.float64),
     )
-    skin = skin_of(body, journey.motion.agent_from_bone)
-    moving = journey.motion
-    action = glb.Action("take", journey.timestamp_s, moving.world_from_agent, moving.agent_from_bone)
+    motion = journey.motion
+    skin = fit_skin(body, motion.agent_from_bone)
+    action = glb.Action("take", journey.timestamp_s, motion.world_from_agent, motion.agent_from_bone)
     (folder / "take.glb").write_bytes(glb.skinned(body.mesh, skin, [action]))
     about = {
         "units": "metres, radians, seconds",
@@ -59,14 +59,14 @@ def write_journey(folder: Path, journey: Journey, body: SkinnedBody) -> None:
 
 
 def write_metrics(folder: Path, before: Plausibility, after: Plausibility, **about: object) -> None:
-    """Write `take.json`: what a take is, and how physical it was before and after it was optimised."""
+    """Write `take.json`: a description of the take, and its plausibility before and after optimisation."""
     metrics = {"before": _finite(before), "after": _finite(after)}
     (folder / "take.json").write_text(json.dumps({**about, **metrics}, indent=1, allow_nan=False) + "\n")
 
 
 def write_frames(
     folder: Path,
-    moving: BodyMotion,
+    motion: BodyMotion,
     body: SkinnedBody,
     scene: Mesh,
     *,
@@ -74,23 +74,23 @@ def write_frames(
     width: int = 480,
     height: int = 360,
 ) -> None:
-    """Write `frames/%06d.jpg`: the scene and the animal, seen by a camera that follows it from above."""
+    """Write `frames/%06d.jpg`: renderings of animal and scene by a camera that follows from above."""
     (folder / "frames").mkdir()
     caster, surface = RayCaster(scene), PosedSurface(body)
     intrinsics = np.array([[FOCAL * width, 0, width / 2], [0, FOCAL * width, height / 2], [0, 0, 1.0]])
-    seen = following(moving.world_from_agent[:, :3, 3], np.median(scene.vertices, axis=0))
-    chosen = np.arange(0, len(moving), max(1, round(RATE_HZ / rate_hz)))
+    cameras = follow_camera(motion.world_from_agent[:, :3, 3], np.median(scene.vertices, axis=0))
+    chosen = np.arange(0, len(motion), max(1, round(RATE_HZ / rate_hz)))
     for number, frame in enumerate(progress.track(chosen, "frames", total=len(chosen))):
-        posed = surface(*motion_tensors(moving[frame : frame + 1]))[0].numpy()
+        posed = surface(*motion_tensors(motion[frame : frame + 1]))[0].numpy()
         animal = Mesh(posed, body.mesh.faces, body.mesh.color)
-        picture = drawn(caster, animal, seen[frame], intrinsics, height, width)
+        picture = render(caster, animal, cameras[frame], intrinsics, height, width)
         images.write_color(folder / "frames" / f"{number:06d}.jpg", picture)
 
 
-def following(
+def follow_camera(
     roots_world: Float[np.ndarray, "frame 3"], centre: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Return a camera that looks down at the animal from the side of the room's centre, moving smoothly."""
+    """Return poses of a smoothly moving camera above the animal, on the side of the room's centre."""
     target = np.asarray(gaussian_filter1d(roots_world, SMOOTHED_FRAMES, axis=0, mode="nearest"))
     away = (centre - target) * [1.0, 0.0, 1.0]
     away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), OFF_CENTER_M)
@@ -98,7 +98,7 @@ def following(
     return rigid.look_at(target + ASIDE_M * away + ABOVE_M, target, np.array([0.0, 1.0, 0.0]))
 
 
-def drawn(
+def render(
     scene: RayCaster,
     animal: Mesh,
     world_from_camera: Float[np.ndarray, "4 4"],
@@ -106,22 +106,22 @@ def drawn(
     height: int,
     width: int,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw the animal in its scene, nearer pixels in front, shaded by how it faces the camera."""
-    back, hits = render_view(scene, world_from_camera, intrinsics, height, width)
-    front, touched = render_view(RayCaster(animal), world_from_camera, intrinsics, height, width)
-    nearer = (front > 0) & ((back == 0) | (front < back))
-    facing = np.abs(touched.interpolate(animal, animal.vertex_normals()) @ world_from_camera[:3, 2])
-    fur = views.shade(animal, touched) * (AMBIENT + DIFFUSE * facing[:, None])
-    picture = views.shade(scene.mesh, hits).reshape(height, width, 3)
-    return np.where(nearer[..., None], fur.reshape(height, width, 3).astype(np.uint8), picture)
+    """Render animal and scene with a depth test; the animal is shaded by its normals."""
+    scene_depth, scene_hits = render_view(scene, world_from_camera, intrinsics, height, width)
+    animal_depth, hits = render_view(RayCaster(animal), world_from_camera, intrinsics, height, width)
+    in_front = (animal_depth > 0) & ((scene_depth == 0) | (animal_depth < scene_depth))
+    facing = np.abs(hits.interpolate(animal, animal.vertex_normals()) @ world_from_camera[:3, 2])
+    shaded = views.shade(animal, hits) * (AMBIENT + DIFFUSE * facing[:, None])
+    picture = views.shade(scene.mesh, scene_hits).reshape(height, width, 3)
+    return np.where(in_front[..., None], shaded.reshape(height, width, 3).astype(np.uint8), picture)
 
 
-def skin_of(body: SkinnedBody, agent_from_bone: Float[np.ndarray, "frame bone 4 4"]) -> glb.Skin:
-    """Fit four weights a vertex to the surface in the poses that differ most."""
+def fit_skin(body: SkinnedBody, agent_from_bone: Float[np.ndarray, "frame bone 4 4"]) -> glb.Skin:
+    """Fit four skinning weights per vertex to the surface in the poses that differ most."""
     rest = body.agent_from_bone_rest
     some = agent_from_bone[weight_refit.farthest_poses(agent_from_bone, FITTED_POSES)]
-    still = torch.eye(4).expand(len(some), 4, 4)
-    posed = PosedSurface(body)(still, torch.from_numpy(some).float()).double().numpy()
+    roots = torch.eye(4).expand(len(some), 4, 4)
+    posed = PosedSurface(body)(roots, torch.from_numpy(some).float()).double().numpy()
     poses = weight_refit.Poses(some @ rigid.inverse(rest), posed)
     vertices = np.asarray(body.mesh.vertices, np.float64)
     four, _ = weight_refit.refit_weights(vertices, body.weights, poses)

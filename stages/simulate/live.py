@@ -1,7 +1,7 @@
-"""The animal live in a browser, computed here (viser, an extra): for networks that a page cannot hold.
+"""Live view in a browser, computed on this machine (viser, an extra): for networks too large for a page.
 
-The server listens on this machine alone and answers its own page only. One visitor drags the person about;
-`run` goes on until it is stopped, or is interrupted, and returns all that happened as a take.
+The server listens on the loopback interface and answers only its own page. One visitor drags the person;
+`run` continues until stopped or interrupted, and returns the take.
 """
 
 import time
@@ -33,7 +33,7 @@ SLIDER_STEP = 0.05
 
 @dataclass(frozen=True)
 class LiveAppearance:
-    """What is shown: the animal's surface and skin (agent frame), the room as binary glTF (world frame)."""
+    """The animal's surface and skin (agent frame), and the room as binary glTF (world frame)."""
 
     mesh: Mesh
     skin: Skin
@@ -76,7 +76,7 @@ class LiveView:
 
     @property
     def port(self) -> int:
-        """Where a browser finds it."""
+        """Port of the server."""
         return self.server.get_port()
 
     def reset(self) -> None:
@@ -150,9 +150,9 @@ class LiveView:
 
 
 def _serving_own_page_only(start: Callable[..., Any], port: int) -> Any:
-    """Start viser's server so that it refuses what other sites send: by itself it looks at no header.
+    """Start viser's server with a check of Host and Origin, which it lacks, against requests of other sites.
 
-    Raises SIM-010 where viser starts its server in another way than by `websockets.asyncio.server.serve`.
+    Raises SIM-010 if viser does not start its server by `websockets.asyncio.server.serve`.
     """
     from websockets.asyncio import server  # late: comes with viser
 

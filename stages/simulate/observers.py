@@ -14,18 +14,13 @@ Observer = Callable[[float, Float[np.ndarray, "3"]], Float[np.ndarray, "3"]]
 CIRCLE_M = 1.2
 """Radius of the circle."""
 ROUND_S, TOWARDS_S = 8.0, 4.0
-"""An approach and the way back, and the approach alone."""
+"""Duration of approach and return, and of the approach alone."""
 UNKNOWN_OBSERVER_M = 100.0
-"""From here on nobody perceives an observer: one who was recorded further off is one of whom nothing is
-known."""
+"""Observers at this distance are not perceived; recordings place unknown observers beyond it."""
 
 
 def scripted(script: ObserverScript, *, center: Float[np.ndarray, "3"], speed_m_s: float = 1.0) -> Observer:
-    """Return an observer: far ``away``, ``still`` at the centre, walking up to the animal every 8 s, or
-    circling.
-
-    ``center`` is a point at the height of the phone.
-    """
+    """Return a scripted observer; ``center`` is its place of rest, at the height of the phone."""
     match script:
         case "away":
             return lambda time_s, animal: center + np.array([UNKNOWN_OBSERVER_M, 0.0, 0.0])
@@ -54,10 +49,9 @@ class ApproachingObserver:
         target = (
             np.array([animal[0], self.center[1], animal[2]]) if time_s % ROUND_S < TOWARDS_S else self.center
         )
-        away = target - self.position
-        distance = float(np.linalg.norm(away))
+        offset = target - self.position
+        distance = float(np.linalg.norm(offset))
         keep = 0.5 if time_s % ROUND_S < TOWARDS_S else 0.0
-        self.position = self.position + away / max(distance, 1e-6) * np.clip(
-            distance - keep, 0.0, self.stride
-        )
+        step = np.clip(distance - keep, 0.0, self.stride)
+        self.position = self.position + offset / max(distance, 1e-6) * step
         return self.position

@@ -26,7 +26,7 @@ class Take:
     observer_world: Float[np.ndarray, "frame 3"]
     goal_world: Float[np.ndarray, "frame 3"]
     blocked: Float[np.ndarray, "frame"]
-    """share of the plan of that time in voxels that are not allowed"""
+    """share of the current plan's frames in voxels that are not allowed"""
 
 
 def rollout(simulator: Simulator, observer: Observer, *, seconds: float, seed: int) -> Take:

@@ -1,5 +1,5 @@
-"""Several animals in one home beside one person: each has networks and a body of its own, perceives the
-others as companions and keeps clear of them. One may be a recorded clip instead, which the others perceive.
+"""Several animals in one home with one person. Each has its own networks and body, perceives the others as
+companions and avoids them. Any of them may be a replayed recording instead.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ from stages.simulate.observers import Observer
 from stages.simulate.rollout import Take, take_of, write_take
 
 Companions = Float[np.ndarray, "companion past_frame 4"] | None
-"""Past world positions and kinds of others, metres; None where there are none"""
+"""Past world positions (metres) and kinds of the other animals; None if there are none"""
 PERSON_RGB = (47, 111, 159)
 COLORS = [(200, 114, 43), (76, 128, 103), (140, 86, 160), (190, 60, 70), (90, 90, 90)] * 3
 """Of animals in order."""
@@ -55,9 +55,7 @@ class HomeAnimal(Protocol):
 
 
 class ReplayedAnimal:
-    """A recorded animal in the place of a simulated one: it goes on from its window to the end of the
-    unbroken stretch of its recording, which is then played again from its beginning.
-    """
+    """A recorded animal: plays from its window to the end of the unbroken stretch, then loops it."""
 
     def __init__(self, data: BehaviorData):
         self.data = data
@@ -69,7 +67,7 @@ class ReplayedAnimal:
         observer: Float[np.ndarray, "3"] | None = None,
         companions: Companions = None,
     ) -> SimulatorState:
-        """Begin at a window; nobody changes what was recorded."""
+        """Begin at a window; observer and companions have no effect."""
         self.track, start = recorded_at(self.data, window)
         broken = np.flatnonzero(~self.track.valid)
         first = int(broken[broken < start].max(initial=-1)) + 1
@@ -96,14 +94,14 @@ class ReplayedAnimal:
 
 
 class SharedHome:
-    """A simulator of all animals of a home, by name; the action is the person's position in the world."""
+    """Simulator of all animals of a home, by name; the action is the person's position in the world."""
 
     def __init__(self, animals: Mapping[str, HomeAnimal]):
         self.animals = animals
 
     def reset(self, seed: int) -> dict[str, SimulatorState]:
-        """Begin at a random training window of the first animal; the others where they were at that time or,
-        where that is not known, at a recorded moment near it, apart from each other's bodies.
+        """Begin at a random training window of the first animal; the others at their windows nearest in time
+        without overlap of bodies.
         """
         rng = np.random.default_rng(seed)
         first, *others = self.animals.values()
@@ -147,8 +145,8 @@ def _nearest_window(
     window: Int[np.ndarray, "1"],
     placed: Float[np.ndarray, "animal 3"],
 ) -> Int[np.ndarray, "1"]:
-    """Return the training window nearest in time to that of another animal, in the same recording if there is
-    one, in which the animal is not inside of those that are ``placed`` (metres, world).
+    """Return the training window nearest in time to another animal's, preferably of the same recording, in
+    which the animal does not overlap those ``placed`` (metres, world).
     """
     (track, start), known = recorded_at(leading, window), data.indices(TRAIN)
     same, time_s = leading.videos[int(leading.video[window[0]])], track.timestamp_s[start]
@@ -167,7 +165,7 @@ def _nearest_window(
 
 
 def rollout_of_all(home: SharedHome, observer: Observer, *, seconds: float, seed: int) -> dict[str, Take]:
-    """Let all animals live for some seconds beside an observer, who turns to the nearest of them."""
+    """Simulate all animals for some seconds with an observer who attends to the nearest of them."""
     states = {name: [state] for name, state in home.reset(seed).items()}
     first = next(iter(states.values()))[0]
     seen = [observer(0.0, first.world_from_agent[:3, 3])]
@@ -181,8 +179,8 @@ def rollout_of_all(home: SharedHome, observer: Observer, *, seconds: float, seed
 
 
 def write_takes(folder: Path, takes: Mapping[str, Take], scene: Mesh) -> None:
-    """Write a take per animal into a folder of its name, and `from_above.jpg`: the room with the tracks of
-    all, each with its name where it begins, and of the person (blue).
+    """Write each animal's take into a folder of its name, and `from_above.jpg`: the room with the labelled
+    tracks of all animals and of the person (blue).
     """
     first = next(iter(takes.values()))
     lowest = min(float(take.world_from_agent[:, 1, 3].min()) for take in takes.values())

@@ -1,4 +1,4 @@
-"""Takes of both kinds, from finished artifacts to something that can be written."""
+"""Make takes of every kind from finished artifacts."""
 
 import json
 from collections.abc import Callable
@@ -36,9 +36,9 @@ from stages.simulate.rollout import rollout, write_take
 from stages.simulate.shared_home import HomeAnimal, ReplayedAnimal, SharedHome, rollout_of_all, write_takes
 
 MOVED_M = 0.25
-"""A sub-goal that is met further off than this counts as moved."""
+"""A sub-goal reached at a distance of more than this counts as moved."""
 DEFAULT_OBSERVER_OFFSET_M = np.array([1.0, 1.4, 0.0])
-"""Where a phone is held of whose observer nothing is known, from the animal's first position."""
+"""Phone position relative to the animal's first position if the recording has no observer."""
 
 UNINTERRUPTED = ReplanningConfig(observer_motion_ratio=np.inf, blend_frames=0)
 """Every plan is played to its end."""
@@ -54,7 +54,7 @@ class FinishedTake:
 
 
 def of_behavior(inputs: Inputs, c: Config, device: str) -> FinishedTake:
-    """Let the animal live beside a scripted observer; optimise the take where asked for and possible."""
+    """Simulate the animal with a scripted observer; optimise the take if configured and possible."""
     data = BehaviorData.load(_required(inputs, "behavior_data"))
     if inputs.home is not None:
         return _elsewhere(inputs, inputs.home, data, c, device)
@@ -107,8 +107,8 @@ def _elsewhere(inputs: Inputs, home: Path, data: BehaviorData, c: Config, device
 
 
 def of_home(inputs: Inputs, animals: Path, c: Config, device: str) -> FinishedTake:
-    """Let all animals of a home live together. Raises InputError SIM-013 for names that it does not have, or
-    where nobody is left, ART-003 where an animal has no model or no windows.
+    """Simulate all animals of a home together. Raises InputError SIM-013 for unknown names or if no animal is
+    left, ART-003 for an animal without model or windows.
     """
     known = sorted(path.name for path in animals.iterdir() if path.is_dir())
     unknown = sorted({*c.absent, *c.replayed} - set(known))
@@ -143,7 +143,7 @@ def of_home(inputs: Inputs, animals: Path, c: Config, device: str) -> FinishedTa
 
 
 def of_recording(inputs: Inputs, c: Config, recording: str) -> FinishedTake:
-    """Make reconstructed motion physical: the longest stretch of a session, at most as long as a take."""
+    """Optimise reconstructed motion: the longest stretch of a session, cut to the length of a take."""
     data = BehaviorData.load(_required(inputs, "behavior_data"))
     if recording not in data.trajectories:
         what, known = f"there is no motion of {recording!r}", f"known: {', '.join(data.videos)}"
@@ -235,7 +235,7 @@ def _simulator(
 
 
 def _observer(simulator: Simulator, c: Config) -> Observer:
-    """Return a person where one stood in the recording that the life begins in, else beside the animal."""
+    """Return the scripted observer, centred where the recording's observer was, else beside the animal."""
     begin = simulator.reset(c.seed).world_from_agent[:3, 3]
     return _recorded_person(simulator.recording, begin, c)
 
