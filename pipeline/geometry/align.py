@@ -1,7 +1,4 @@
-"""Rigid alignment of point sets: closed form (Kabsch) and robust (RANSAC on triplets), and gravity.
-
-`kabsch` answers when correspondences are right, `ransac_rigid` when many are wrong.
-"""
+"""Rigid alignment of point sets: closed form (`kabsch`), and robust to outliers (`ransac_rigid`)."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -9,7 +6,7 @@ from jaxtyping import Bool, Float
 from pipeline.geometry import rigid
 
 SIDE_TOLERANCE = 2.5
-"""sides of corresponding triangles differ by at most so many thresholds: each end errs by one"""
+"""tolerance of side lengths of corresponding triangles, in thresholds: each end may err by one"""
 
 
 def kabsch(
@@ -46,7 +43,7 @@ def ransac_rigid(
     weights: Float[np.ndarray, "point"] | None = None,
     min_side_m: float = 0.2,
 ) -> tuple[Float[np.ndarray, "4 4"], Bool[np.ndarray, "point"]]:
-    """Return ``target_from_source`` and its inliers among correspondences of which many are wrong.
+    """Return ``target_from_source`` and the inliers among correspondences with many outliers.
 
     Triplets are drawn by weight; those whose side lengths disagree or whose sides are shorter than
     ``min_side_m`` are dropped before the closed form. The best hypothesis minimises the truncated distance

@@ -1,6 +1,6 @@
-"""The depth of an animal that one picture shows: it stands where its lowest pixels touch the map.
+"""Depth of an animal in a single picture, from the contact of its lowest pixels with the map.
 
-A body is a box for this: a face that rises from the line of contact towards the camera, and a level back.
+The body is modelled as a box: a vertical face at the contact point towards the camera, and a level back.
 """
 
 from dataclasses import dataclass
@@ -12,22 +12,21 @@ from pipeline.geometry import cameras
 from pipeline.geometry.meshes import RayCaster
 
 LOWEST_SHARE = 0.03
-"""Share of a mask's pixels, from below, that are as likely shadow and soft outline as paws: where the others
-end, the animal stands."""
+"""Share of a mask's lowest pixels that is ignored as shadow or soft outline."""
 LEVEL_COSINE = 0.8
-"""Surface that carries is level above this cosine of its slope."""
+"""Supporting surfaces have a slope with at least this cosine."""
 BORDER_PX = 2
-"""A mask that comes so near to the picture's lower border may go on beyond it, pixels."""
+"""A mask this close to the picture's lower border may be cut off there, pixels."""
 MIN_AREA_PX = 12
 
 
 @dataclass(frozen=True)
 class Contact:
-    """Where something stands."""
+    """The ground contact of an object."""
 
     point_world: Float[np.ndarray, "3"]
     certain: bool
-    """False where its lowest part is hidden, beyond the picture or before something upright."""
+    """False if its lowest part may be outside the picture, or is seen in front of a steep surface."""
 
 
 def find(
@@ -36,7 +35,7 @@ def find(
     world_from_camera: Float[np.ndarray, "4 4"],
     caster: RayCaster,
 ) -> Contact | None:
-    """Find where the lowest pixels of a mask touch the surface; None where they meet none."""
+    """Find where the lowest pixels of a mask touch the surface; None if their ray misses it."""
     rows, columns = np.nonzero(mask)
     if len(rows) < MIN_AREA_PX:
         return None
@@ -60,8 +59,8 @@ def depth_of(
     intrinsics: Float[np.ndarray, "3 3"],
     world_from_camera: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "height width"]:
-    """Return the depth of a body that stands at a point, its back ``back_m`` above, inside a mask; 0 outside
-    and where no ray meets it. Metres, world +y up."""
+    """Return the depth of a body of height ``back_m`` at a contact point inside a mask; 0 outside the mask
+    and where rays miss the body. Metres, world +y up."""
     rows, columns = np.nonzero(mask)
     eye = world_from_camera[:3, 3]
     rays = (
@@ -83,8 +82,7 @@ def depth_of(
 def between(
     timestamp_s: Float[np.ndarray, "frame"], found: list[Contact | None], max_s: float
 ) -> Float[np.ndarray, "frame 3"]:
-    """Return the contact of each frame; where it is not certain, one interpolated between certain ones at
-    most ``max_s`` away, NaN where there is none."""
+    """Return the contact of each frame, interpolated between certain ones; NaN if none is in ``max_s``."""
     certain = np.array([frame for frame, each in enumerate(found) if each is not None and each.certain], int)
     points = np.full((len(found), 3), np.nan)
     if not len(certain):

@@ -1,4 +1,4 @@
-"""Make a surface light: collapse edges, keep colours, and know which vertex came from which."""
+"""Mesh decimation by edge collapse, with colours and vertex correspondence."""
 
 import fast_simplification
 import numpy as np

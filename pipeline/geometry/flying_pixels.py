@@ -1,11 +1,10 @@
-"""Separate depth of thin things from flying pixels, where the sensor itself doubts both."""
+"""Distinguish thin objects from flying pixels in depth images, where the sensor is unsure of both."""
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 SUPPORTERS = 3
-"""neighbours that agree on a surface; along the straight edge of a thing, a pixel that flies between it and
-what lies behind has two"""
+"""neighbours of similar depth on a surface; a flying pixel along a straight edge has two"""
 
 
 def supported(

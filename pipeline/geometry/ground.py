@@ -1,4 +1,4 @@
-"""The level surface under what stands on it, in a world with +y up; and where up is, by a room's planes."""
+"""Fit the ground plane in a world with +y up, and the up direction from a room's planes."""
 
 from dataclasses import dataclass
 
@@ -8,17 +8,17 @@ from jaxtyping import Float
 from pipeline.geometry import align
 
 VOTERS, CANDIDATES = 2000, 1500
-"""surface directions that vote, and directions that they vote on"""
+"""number of normals that vote, and of candidate directions"""
 VOTE_DEG = 6.0
-"""a surface votes for directions that it is square to or along within about this, degrees"""
+"""angular width of a vote for directions parallel or perpendicular to a normal, degrees"""
 FOCUS_MARGIN_M = 0.05
 """points up to this far above the focus count as below it"""
 BIN_M = 0.02
-"""heights are counted in bins of this size"""
+"""bin size of the histogram of heights"""
 BANDS_M = (0.05, 0.03, 0.02)
-"""a plane is refitted to points within these distances, one after the other"""
+"""inlier distances of successive plane fits"""
 AXIS_LIMITS_DEG = (6.0, 4.0)
-"""directions are refitted to surfaces that are square to or along them within these angles, likewise"""
+"""inlier angles of successive direction fits"""
 
 
 @dataclass(frozen=True)
@@ -55,13 +55,13 @@ def fit_ground(
 def floor_direction(
     normals_world: Float[np.ndarray, "point 3"], guess: Float[np.ndarray, "3"], within_deg: float = 40.0
 ) -> Float[np.ndarray, "3"]:
-    """Return the direction within so many degrees of a guess of up that most of a room's surfaces are square
-    to or along.
+    """Return the up direction, within ``within_deg`` of a guess, that agrees with most of a room's normals.
 
-    Floors and tables vote in full, walls by half; the winner of the vote is sharpened by least squares.
+    Normals parallel to it (floors, tables) vote with weight 1, perpendicular ones (walls) with 0.5; the best
+    is refined by least squares.
     """
     voters = np.ascontiguousarray(normals_world[:: max(1, len(normals_world) // VOTERS)])
-    candidates = _cap(guess, np.deg2rad(within_deg), CANDIDATES)
+    candidates = _spherical_cap(guess, np.deg2rad(within_deg), CANDIDATES)
     cosine2 = (voters @ candidates.T) ** 2
     width2 = np.sin(np.deg2rad(VOTE_DEG)) ** 2
     votes = np.exp((cosine2 - 1) / width2).sum(0) + 0.5 * np.exp(-cosine2 / width2).sum(0)
@@ -80,8 +80,10 @@ def floor_direction(
     return up
 
 
-def _cap(centre: Float[np.ndarray, "3"], radius_rad: float, count: int) -> Float[np.ndarray, "direction 3"]:
-    """Return directions spread evenly within an angle of a centre (a spiral), the centre first."""
+def _spherical_cap(
+    centre: Float[np.ndarray, "3"], radius_rad: float, count: int
+) -> Float[np.ndarray, "direction 3"]:
+    """Return directions on a Fibonacci spiral within an angle of a centre, the centre first."""
     share = np.arange(count) / count
     cosine, turn = 1 - share * (1 - np.cos(radius_rad)), np.pi * (3 - np.sqrt(5)) * np.arange(count)
     sine = np.sqrt(1 - cosine**2)

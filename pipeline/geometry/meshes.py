@@ -42,13 +42,13 @@ class Mesh:
 
 
 def _doubled_areas(corner: Float[np.ndarray, "face 3 3"]) -> Float[np.ndarray, "face 3"]:
-    """Return the normals of triangles, twice as long as their areas."""
+    """Return triangle normals with length twice the area."""
     return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
 
 
 @dataclass(frozen=True)
 class Hits:
-    """What rays met: ``distance`` in lengths of the direction (inf: nothing), ``face`` (-1: nothing)."""
+    """First hits of rays: ``distance`` in lengths of the direction (inf: miss), ``face`` (-1: miss)."""
 
     distance: Float[np.ndarray, "ray"]
     face: Int[np.ndarray, "ray"]

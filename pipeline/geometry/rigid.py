@@ -10,9 +10,9 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 PARALLEL = 1e-4
-"""columns of a 6D rotation that stand out by less than this from one another are parallel"""
+"""columns of a 6D rotation with a smaller perpendicular component are parallel"""
 ANY_OTHER = np.array([0.3, 0.2, 0.1])
-"""added to a turned direction, so that it is never parallel to the direction itself"""
+"""offset added to a permuted direction, so that it is never parallel to the original"""
 
 
 def make(

@@ -1,7 +1,7 @@
-"""The scene as a signed distance: how far a point is from the nearest surface, negative inside of things.
+"""Signed distance field of a scene, negative inside solids. World frame, metres.
 
-`from_mesh` measures it on a grid of voxels (distance by dense samples of the surface, sign by a vote of rays,
-which bears open meshes); `SignedDistance.at` reads it between voxels, differentiably. World frame, metres.
+`from_mesh` computes it on a voxel grid: distance from dense surface samples, sign from a vote of rays, which
+tolerates open meshes. `SignedDistance.at` interpolates it differentiably.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ RAYS = np.array(
         for rise in (-0.3, 0.25, 1.0)
     ]
 )
-"""Directions of the vote: all around, more up than down, for things on a floor often have no bottom."""
+"""Ray directions of the vote: all around, more up than down, since scans of furniture often lack a bottom."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class SignedDistance:
     voxel_m: float
 
     def at(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Interpolate trilinearly; beyond the grid the border's value holds."""
+        """Interpolate trilinearly, with border values outside the grid."""
         scale = 2 / (self.voxel_m * (torch.tensor(self.values.shape) - 1)).to(points_world)
         offset = -1 - scale * self.origin.to(points_world)
         place = torch.addcmul(offset, points_world, scale).reshape(1, -1, 1, 1, 3)
@@ -93,38 +93,38 @@ def from_mesh(
     voxel_m: float = 0.04,
     spacing_m: float = 0.015,
 ) -> SignedDistance:
-    """Measure the signed distance of a mesh whose faces look out of what is solid, between two corners of a
-    box.
+    """Compute the signed distance of a mesh with outward faces, in a box between two corners.
 
-    A voxel is inside where more rays first meet the back of a face than the front, far from any surface by
-    what most voxels around say; surfaces with solid on both sides, as fusion leaves them in walls, do not
-    count: they would lead deeper.
+    A voxel is inside if more rays first hit the back of a face than the front; far from surfaces a majority
+    filter corrects it. Surfaces with solid on both sides, which fusion leaves in walls, are ignored, since
+    their gradient would lead deeper.
     """
     grid, surface = voxel_centres(low, high, voxel_m), surface_points(mesh, spacing_m)
     centres, shape = grid.reshape(-1, 3), grid.shape[:3]
-    solid = _agreed(_inside(mesh, centres).reshape(shape), _to_points(surface, grid, voxel_m), voxel_m)
-    surface = _open(surface, solid, np.asarray(low, np.float64), voxel_m)
-    distance = _to_points(surface, grid, voxel_m).reshape(-1)
+    inside, coarse_m = _inside(mesh, centres).reshape(shape), _distance_to_points(surface, grid, voxel_m)
+    solid = _majority(inside, coarse_m, voxel_m)
+    surface = _without_interior(surface, solid, np.asarray(low, np.float64), voxel_m)
+    distance = _distance_to_points(surface, grid, voxel_m).reshape(-1)
     near = np.flatnonzero(distance < 3 * voxel_m)
-    distance[near] = _to_patches(surface, centres[near], spacing_m)
+    distance[near] = _distance_to_patches(surface, centres[near], spacing_m)
     values = torch.from_numpy(np.where(solid, -1.0, 1.0) * distance.reshape(shape)).float()
     return SignedDistance(values, torch.from_numpy(np.asarray(low, np.float64)).float(), voxel_m)
 
 
-def _agreed(
+def _majority(
     solid: Bool[np.ndarray, "x y z"], distance_m: Float[np.ndarray, "x y z"], voxel_m: float
 ) -> Bool[np.ndarray, "x y z"]:
-    """Let the majority decide in boxes through which no surface leads, small ones first."""
+    """Apply a majority filter in boxes that contain no surface, small boxes first."""
     for reach in (1, 2, 4):
         share = ndimage.uniform_filter(solid.astype(np.float32), 2 * reach + 1, mode="nearest")
         solid = np.where(distance_m > np.sqrt(3) * reach * voxel_m, share > 0.5, solid)
     return solid
 
 
-def _open(
+def _without_interior(
     surface: SurfacePoints, solid: Bool[np.ndarray, "x y z"], low: Float[np.ndarray, "3"], voxel_m: float
 ) -> SurfacePoints:
-    """Leave out points with solid on both sides."""
+    """Remove points with solid on both sides."""
 
     def within(side: float) -> np.ndarray:
         index = np.rint((surface.points + side * voxel_m * surface.normals - low) / voxel_m).astype(np.int64)
@@ -134,10 +134,10 @@ def _open(
     return SurfacePoints(surface.points[retained], surface.normals[retained])
 
 
-def _to_points(
+def _distance_to_points(
     surface: SurfacePoints, centres: Float[np.ndarray, "x y z 3"], voxel_m: float
 ) -> Float[np.ndarray, "x y z"]:
-    """Return the distance to a point of the nearest voxel that holds any: fast, and true to half a voxel."""
+    """Return the distance to a point of the nearest voxel with points: fast, accurate to half a voxel."""
     shape = centres.shape[:3]
     index = np.rint((surface.points - centres[0, 0, 0]) / voxel_m).astype(np.int64)
     inside = ((index >= 0) & (index < shape)).all(1)
@@ -151,15 +151,15 @@ def _to_points(
     return np.linalg.norm(centres - surface.points[chosen.reshape(shape)[tuple(nearest)]], axis=-1)
 
 
-def _to_patches(
+def _distance_to_patches(
     surface: SurfacePoints, points: Float[np.ndarray, "point 3"], spacing_m: float
 ) -> Float[np.ndarray, "point"]:
-    """Return the distance to the small flat patch around the nearest point of the surface."""
+    """Return the distance to the planar patch around the nearest surface point."""
     _, nearest = KDTree(surface.points).query(points)
-    away = points - surface.points[nearest]
-    upright = np.abs(np.einsum("pi,pi->p", away, surface.normals[nearest]))
-    tangential = np.sqrt(np.maximum((away**2).sum(1) - upright**2, 0))
-    return np.hypot(upright, np.maximum(tangential - spacing_m, 0))
+    offset = points - surface.points[nearest]
+    normal = np.abs(np.einsum("pi,pi->p", offset, surface.normals[nearest]))
+    tangential = np.sqrt(np.maximum((offset**2).sum(1) - normal**2, 0))
+    return np.hypot(normal, np.maximum(tangential - spacing_m, 0))
 
 
 def _inside(mesh: Mesh, points: Float[np.ndarray, "point 3"]) -> np.ndarray:

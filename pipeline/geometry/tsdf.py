@@ -1,7 +1,6 @@
-"""Truncated signed distance volumes: fuse posed depth and colour, then extract the seen surface (Curless and
-Levoy 1996).
+"""TSDF fusion of posed depth and colour, and extraction of the observed surface (Curless and Levoy 1996).
 
-`enclose` makes an empty volume around points, `Volume.integrate` adds one frame, `Volume.surface` returns the
+`enclose` makes an empty volume around points, `Volume.integrate` fuses a frame, `Volume.surface` extracts the
 mesh.
 """
 
@@ -14,10 +13,9 @@ from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
 
 CORNER_SHARE = 1e-4
-"""added to the trilinear shares of corners: a point on one that has no color takes its neighbors'"""
+"""added to trilinear weights, so that a point at a corner without color takes its neighbours' colors"""
 FREE_GAIN = 0.2
-"""Weight of a ray that passes far in front of what it met, against one that ends here: rims and thin legs
-would be carved away."""
+"""Weight of free-space observations relative to surface ones, so that rims and thin legs are not carved away."""
 
 
 class Volume:

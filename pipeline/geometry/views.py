@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 
 EXTENT, MARGIN_M = (0.002, 0.998), 0.2
-"""quantiles of a mesh that a picture shows, to leave out stray vertices, and what it shows beyond them"""
+"""quantiles of vertices that span a picture, without stray ones, and the margin around them"""
 UNCOLORED = 170
 """grey value of a surface without colors"""
 BACKGROUND = 245
