@@ -1,8 +1,7 @@
-"""One animal for programs that have a clock of their own: robot simulators, game engines, ROS.
+"""One animal for programs with their own clock: robot simulators, game engines, ROS.
 
-`LiveAnimal.open` opens a build; `advance` lets time pass with someone at a place, in steps of any length, and
-returns the pose of then. `pipeline.adapters.mujoco_animal`, `usd_animal` and `ros2_animal` are adapters
-of it.
+`LiveAnimal.open` opens a build; `advance` simulates any time span with the observer at a position and returns
+the pose. `pipeline.adapters.mujoco_animal`, `usd_animal` and `ros2_animal` are adapters of it.
 """
 
 from dataclasses import dataclass
@@ -57,7 +56,7 @@ class LiveAnimal:
 
     @property
     def pose(self) -> AnimalPose:
-        """The pose of now, between the two frames of the simulator that enclose it."""
+        """The current pose, interpolated between the simulator's adjacent frames."""
         share = float(np.clip((self.time_s - self.before.time_s) * RATE_HZ, 0, 1))
         bones = zip(self.before.agent_from_bone, self.after.agent_from_bone, strict=True)
         return AnimalPose(
@@ -67,9 +66,9 @@ class LiveAnimal:
         )
 
     def advance(self, seconds: float, observer_world: Float[np.ndarray, "3"]) -> AnimalPose:
-        """Let time pass with the observer's eyes at a place (world, metres) and return the pose of then.
+        """Advance time with the observer's eyes at a position (world, metres) and return the new pose.
 
-        Raises SIM-012 where time or place are no finite numbers.
+        Raises SIM-012 if time or position are not finite, or time is negative.
         """
         place = np.asarray(observer_world, float)
         if not np.isfinite([seconds, *place]).all() or seconds < 0:
@@ -85,7 +84,7 @@ class LiveAnimal:
 def _between(
     first: Float[np.ndarray, "4 4"], last: Float[np.ndarray, "4 4"], share: float
 ) -> Float[np.ndarray, "4 4"]:
-    """Return the rigid motion that is ``share`` (0..1) of the way from one to the other."""
+    """Interpolate two rigid transforms at ``share`` (0..1)."""
     turn = rigid.vector_from_rotation(first[:3, :3].T @ last[:3, :3])
     place = first[:3, 3] * (1 - share) + last[:3, 3] * share
     return rigid.make(first[:3, :3] @ rigid.rotation_from_vector(turn * share), place)

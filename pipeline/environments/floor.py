@@ -1,4 +1,4 @@
-"""Where a person can walk: columns that were seen between shin and head, with nothing solid there."""
+"""Walkable floor for a person: columns observed between shin and head height without solid voxels."""
 
 from dataclasses import dataclass
 
@@ -27,7 +27,7 @@ class PersonFloor:
 
     @classmethod
     def of(cls, volume: FeatureVolume, roots_world: Float[np.ndarray, "frame 3"]) -> "PersonFloor":
-        """Find the floor, the level below the animal with the most solid voxels; what nobody saw is none."""
+        """Find the floor, the level below the animal with the most solid voxels; unseen is blocked."""
         solid = volume.occupancy == 1
         height = volume.origin[1] + (np.arange(solid.shape[1]) + 1) * volume.voxel_m
         below = height <= np.percentile(roots_world[:, 1], 5)

@@ -1,7 +1,7 @@
-"""The animal of one build in several homes: each home's recorded moments and scenes, then all of them as one.
+"""The animal of one build in several homes, each with recorded starts and scenes.
 
-`settle` gives what begins in one home, the animal's own or another build's; `together` joins homes so that
-one world holds them all and animals in different homes plan in one batch.
+`settle` opens the animal's own home or other builds' homes; `together` joins them, so that animals in
+different homes plan in one batch.
 """
 
 from collections.abc import Sequence
@@ -18,14 +18,14 @@ from pipeline.environments.other_home import ReconstructedHome, move_in
 
 @dataclass(frozen=True)
 class Habitat:
-    """Where an animal lives: moments to begin from, and the scenes they are in."""
+    """Recorded moments in which episodes start, and their scenes."""
 
     data: BehaviorData
     scenes: Scenes
     home_of_video: Int[np.ndarray, "video"]
-    """Number of the home of each recording."""
+    """Index of the home of each recording."""
     share_known: tuple[float, ...]
-    """Per home, share (0..1) of its surface that looks like the home the animal knows."""
+    """Per home, share (0..1) of its surface that looks like the animal's own home."""
 
     @classmethod
     def of_one_home(cls, data: BehaviorData, scenes: Scenes, share_known: float = 1.0) -> "Habitat":
@@ -34,9 +34,9 @@ class Habitat:
 
 
 def settle(build: Path, data: BehaviorData, homes: Sequence[Path]) -> Habitat:
-    """Put the animal of ``build`` and ``data`` into ``homes``, its own home where there are none.
+    """Put the animal of ``build`` and ``data`` into ``homes``, by default its own home.
 
-    Raises what `pipeline.environments.other_home` raises for homes that cannot be used.
+    Raises the errors of `pipeline.environments.other_home` for unusable homes.
     """
     if not homes:
         return _own(build, data)

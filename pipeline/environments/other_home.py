@@ -1,8 +1,8 @@
-"""The animal of one build in the reconstruction of another: both homes in metres, features in its own terms.
+"""The animal of one build in the reconstructed home of another; both homes are in metres.
 
-`ReconstructedHome.of_build` opens what a finished build knows of its home. `move_in` puts an animal into
-another one: features are expressed in the basis that its model learned, recorded moments are set down on the
-other floor, and `share_known` is how much of the other home looks like the one it knows.
+`ReconstructedHome.of_build` opens the home of a finished build. `move_in` puts an animal into another home:
+features are converted to the basis that its model was trained on, recorded moments are placed on the other
+floor, and `share_known` measures how much of the other home looks like its own.
 """
 
 import json
@@ -27,25 +27,24 @@ from pipeline.geometry import rigid, subsampling
 from pipeline.workflow import artifact
 
 ARTIFACTS = ("behavior_data", "feature_basis", "scene_template")
-"""What of a build describes its home."""
+"""Artifacts of a build that describe its home."""
 STARTS = {TRAIN: 64, TEST: 32}
-"""Recorded moments of each split that are set down, evenly chosen."""
+"""Recorded moments of each split that are placed, evenly chosen."""
 PLACE_DRAWS = 200
-"""Places that are tried for a moment before another moment takes its turn."""
+"""Places tried for a moment before it is skipped."""
 PRESENT_M = 20.0
-"""Observers further off than a home is wide were not there, and need no free place."""
+"""Observers farther than this were not in the home and need no free place."""
 APART_M = 0.5
-"""Surface cells nearer to each other than this show the same thing and do not show how alike a home is to
-itself."""
+"""Surface cells nearer than this show the same thing and are not compared within a home."""
 KNOWN_PERCENT = 95.0
-"""Percent of the known home's own cells that count as known, judged by its cells elsewhere."""
+"""Percentage of the own home's cells that count as known, compared with its cells elsewhere."""
 MAX_CELLS = 4000
 """Surface cells of a home that are compared, evenly chosen."""
 
 
 @dataclass(frozen=True)
 class ReconstructedHome:
-    """The one home of a build as behaviour models perceive it, world frame of that build."""
+    """A build's home as behaviour models perceive it, in the world frame of that build."""
 
     volume: FeatureVolume
     marks: UInt8[np.ndarray, "x y z"]
@@ -90,12 +89,12 @@ class ReconstructedHome:
         return cls(volume, table["allowed"], table["stands_m"], basis, describer, floor_m)
 
     def scenes(self) -> Scenes:
-        """Return it as the one scene of all recordings."""
+        """Return the home as the only scene of all recordings."""
         support = Support.of(self.volume, self.marks, self.stands_m)
         return Scenes((self.volume,), (self.marks > 0,), np.zeros(1, int), (support,))
 
     def height_above_top(self, root_world: Float[np.ndarray, "3"], *, moves: bool) -> float:
-        """Return how high above what carries it a root is, metres, within what is usual."""
+        """Return the height of a root above its support, metres, clipped to the animal's usual range."""
         support = Support.of(self.volume, self.marks, self.stands_m)
         assert support is not None, "checked by `load`"
         column = np.floor((root_world[[0, 2]] - support.corner) / support.voxel_m).astype(int)
@@ -193,11 +192,11 @@ def _surface(home: ReconstructedHome) -> tuple[Float[np.ndarray, "cell 17"], Flo
 def set_down(
     data: BehaviorData, own: ReconstructedHome, other: ReconstructedHome, rng: np.random.Generator
 ) -> BehaviorData:
-    """Return recorded moments on the floor of the other home, turned and shifted as a whole.
+    """Place recorded moments on the floor of the other home, each moved rigidly as a whole.
 
-    Each is a recording of its own, named `<recording>-<first frame>`, whose known frames are valid.
-    The animal is as high above the floor as it was above what carried it; the observer keeps its height above
-    the floor and stands on it where it was there at all. Raises SIM-011 where no moment fits in.
+    Each becomes a recording `<recording>-<first frame>` whose past frames are valid. The animal keeps its
+    height above its support, the observer its height above the floor; an observer who was present stands on
+    the floor. Raises SIM-011 if no moment fits.
     """
     tracks: dict[str, Trajectory] = {}
     splits: list[int] = []
@@ -243,7 +242,7 @@ def _placed(
     floor: Float[np.ndarray, "place 3"],
     rng: np.random.Generator,
 ) -> Trajectory | None:
-    """Turn and shift a moment to a place on the floor where its past is free; None where none is found."""
+    """Move a moment to a random floor place where its past is not in collision; None if none is found."""
     past = int(moment.valid.sum())
     now = moment.world_from_agent[past - 1, :3, 3]
     step = now - moment.world_from_agent[past - 2, :3, 3]

@@ -1,4 +1,4 @@
-"""One person, or robot, beside one animal, for Gymnasium."""
+"""Gymnasium environment of one person, or robot, and one animal."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""A pair from above: what is blocked grey, the person green, the animal blue, its plan and goal orange."""
+"""Top-down view of a pair: blocked cells grey, person green, animal blue, its plan and goal orange."""
 
 import cv2
 import numpy as np
@@ -44,7 +44,7 @@ def bird_view(world: AnimalWorld, row: int) -> UInt8[np.ndarray, "400 400 3"]:
 
 
 class PictureWindow:
-    """Pictures on a screen, where there is one; elsewhere they are drawn and not shown."""
+    """Window that shows pictures; without a display they are drawn but not shown."""
 
     def __init__(self) -> None:
         import matplotlib.pyplot as plt  # late: only `render_mode="human"` needs a window

@@ -11,14 +11,14 @@ from pipeline.environments.config import RewardName
 REACHED_M = 0.7
 """Distance at which the animal counts as reached: an arm's length."""
 REACHED_REWARD, FLEEING_COST = 5.0, 5.0
-"""What ends an `approach`, in metres of progress; twice as much, and PPO may learn to keep away."""
+"""Terminal reward and cost of `approach`, metres of progress; if doubled, PPO may learn to stay away."""
 FOLLOW_M = 1.2
 """Distance at which `follow` is best."""
 
 
 @dataclass(frozen=True)
 class StepOutcome:
-    """What a step brought, per person."""
+    """Outcome of a step, per person."""
 
     distance_before_m: Float[np.ndarray, "person"]
     distance_m: Float[np.ndarray, "person"]

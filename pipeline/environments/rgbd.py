@@ -1,4 +1,4 @@
-"""What a person's camera sees: colour and depth of the reconstruction, with the animal as it stands there.
+"""RGB-D camera of a person: colour and depth of the reconstruction with the posed animal.
 
 The camera is at eye height and looks ahead and down. Scene and animal are the surfaces of the artifact
 `reconstruction`, the animal posed by its bones (dual-quaternion blending, as in the reconstruction itself).
@@ -21,21 +21,21 @@ from pipeline.geometry.views import shade
 from pipeline.workflow import artifact
 
 HEIGHT_PX, WIDTH_PX = 48, 64
-"""Of a picture: a policy's network reads it as a whole."""
+"""Size of a picture, small enough for a policy network."""
 FIELD_RAD = np.deg2rad(80.0)
 """Horizontal field of view, that of a phone's wide camera."""
 PITCH_RAD = np.deg2rad(20.0)
-"""How far the camera looks down: from standing height, at an animal on the floor 4 m off."""
+"""Downward pitch of the camera: from eye height towards an animal on the floor 4 m away."""
 FAR_M = 10.0
-"""Largest depth; further surfaces are as far."""
+"""Maximum depth; larger depths are clipped."""
 AGENT_FACES = 2000
-"""Triangles kept of the animal: half a pixel each at a metre."""
+"""Triangles of the decimated animal: half a pixel each at one metre."""
 FOCAL_PX = WIDTH_PX / 2 / np.tan(FIELD_RAD / 2)
 INTRINSICS = np.array([[FOCAL_PX, 0, WIDTH_PX / 2], [0, FOCAL_PX, HEIGHT_PX / 2], [0, 0, 1]])
 
 
 class RgbdCamera:
-    """Surfaces of homes and the one animal that lives in them."""
+    """Renders the surfaces of homes and their animal."""
 
     def __init__(
         self,
@@ -72,8 +72,8 @@ class RgbdCamera:
         world_from_agent: Float[np.ndarray, "4 4"],
         agent_from_bone: Float[np.ndarray, "bone 4 4"],
     ) -> tuple[UInt8[np.ndarray, "48 64 3"], Float[np.ndarray, "48 64"]]:
-        """Look from a place (metres) towards a heading about +y (radians, 0 along +z). Return colour, and
-        z-depth in metres (0 where nothing is).
+        """Render from a position (metres) at a heading about +y (radians, 0 along +z): colour, and z-depth in
+        metres (0: no surface).
         """
         level = np.cos(PITCH_RAD)
         ahead = np.array([np.sin(heading) * level, -np.sin(PITCH_RAD), np.cos(heading) * level])

@@ -1,4 +1,4 @@
-"""What is observed and what can be done, as Gymnasium spaces."""
+"""Observation and action spaces for Gymnasium."""
 
 from collections.abc import Sequence
 from typing import assert_never
@@ -37,8 +37,8 @@ def person_observation_space(observations: Sequence[Seen]) -> gymnasium.spaces.D
 
 
 def person_observation(world: AnimalWorld) -> dict[str, Shaped[np.ndarray, "person ..."]]:
-    """Return what all persons observe, first axis person: the animal and their own velocity in their frames,
-    what blocks the way, and pictures with depth (metres, 0 = nothing).
+    """Return all persons' observations, first axis person: the animal, their velocity and occupancy in their
+    own frames, and pictures with depth (metres, 0: no surface).
     """
     parts: dict[str, np.ndarray] = {}
     for seen in world.config.observations:
@@ -58,5 +58,5 @@ def person_observation(world: AnimalWorld) -> dict[str, Shaped[np.ndarray, "pers
 
 
 def person_action_space(world: AnimalWorld) -> gymnasium.spaces.Box:
-    """Return ahead, left and turn of a person, or ahead and turn of a robot, as shares of the top speed."""
+    """Return (forward, left, turn) of a person or (forward, turn) of a robot, relative to top speed."""
     return gymnasium.spaces.Box(-1.0, 1.0, (world.action_size,), np.float32)

@@ -1,7 +1,6 @@
-"""Many persons beside many animals, for the algorithms of Stable-Baselines3 (extra `rl`).
+"""Vectorized environment for Stable-Baselines3 (extra `rl`).
 
-Gymnasium's vector interface begins an ended episode in the next step, Stable-Baselines3 in the same one; so
-it has an adapter of its own.
+It resets a finished episode in the same step, Gymnasium's vector interface in the next one.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Many persons beside many animals at once, for Gymnasium's vector interface; animals plan in batches."""
+"""Vectorized environment for Gymnasium; animals plan in batches."""
 
 from pathlib import Path
 from typing import Any

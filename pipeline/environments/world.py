@@ -1,8 +1,8 @@
-"""Many persons and animals at once: one pair per row, planning in batches, each pair restarting on its own.
+"""A batch of person-animal pairs that plan together and restart independently.
 
-`AnimalWorld.load` opens a build; `reset` begins some pairs, `step` moves all by 0.1 s and returns what
-happened. Persons are moved by actions, animals by the behaviour model through `AnimalBatch`, which plans only
-where a plan ends or the person has moved noticeably: `plans_per_step` is that rate.
+`AnimalWorld.load` opens a build, `begin` starts pairs, `restart` some, `step` advances all by 0.1 s. Actions
+move persons; the behaviour model moves animals through `AnimalBatch`, which replans only when a plan ends or
+the person has moved noticeably, at the rate `plans_per_step`.
 """
 
 from collections.abc import Sequence
@@ -32,9 +32,9 @@ from pipeline.workflow import artifact
 EYE_M = 1.4
 """Height of a person's phone above the floor, metres."""
 CLOSE_M = 2.4
-"""Distance from the person within which an animal that gets away counts as fleeing."""
+"""Distance from the person within which an animal that moves away counts as fleeing."""
 START_DRAWS = 30
-"""Places that are tried for a person's start before one in something solid is taken."""
+"""Places tried for a person's start before a blocked one is accepted."""
 SPLITS = {"train": TRAIN, "test": TEST}
 
 
@@ -217,7 +217,7 @@ class AnimalWorld:
         return (self.distance_m < CLOSE_M) & flees(path, self.animal_position, self.eyes)
 
     def _walk(self, action: Float[np.ndarray, "person command"]) -> None:
-        """Move persons, along walls where they would walk into them."""
+        """Move persons; at walls they slide along them."""
         persons, c = self.persons, self.config
         persons.heading = persons.heading + action[:, -1] * c.turn_rad_s / RATE_HZ
         left = action[:, 1] if self.action_size == 3 else np.zeros(len(action))

@@ -15,7 +15,7 @@ from pipeline.geometry.meshes import Mesh
 CORNER_SHARE = 1e-4
 """added to trilinear weights, so that a point at a corner without color takes its neighbours' colors"""
 FREE_GAIN = 0.2
-"""Weight of free-space observations relative to surface ones, so that rims and thin legs are not carved away."""
+"""Weight of free-space observations against surface ones, to keep rims and thin legs."""
 
 
 class Volume:
