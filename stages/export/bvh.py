@@ -1,7 +1,7 @@
-"""Motion capture files: flat (six channels a joint, exact), and a fitted tree (rotations about pivots).
+"""BVH files: a flat hierarchy (six channels per joint, exact), and a fitted tree (rotations about pivots).
 
-The tree: for each pair of bones the point that both carry most alike over all motions (least squares) is
-their pivot; a minimum spanning tree over what is left apart joins the bones; its loss is reported.
+The pivot of two bones is the point that moves most alike with both over all motions (least squares); the tree
+is the minimum spanning tree over the residuals. Its loss is reported.
 """
 
 import itertools
@@ -20,7 +20,7 @@ from stages.export.writing import ExportRecord
 
 _ORDER = "ZXY"
 _ROOT_CHANNELS = "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation"
-_TURN_CHANNELS = "CHANNELS 3 Zrotation Xrotation Yrotation"
+_ROTATION_CHANNELS = "CHANNELS 3 Zrotation Xrotation Yrotation"
 _END_SITE = ("End Site", "{", "OFFSET 0 0 0.02", "}")
 _PULL_TO_MIDDLE = 1e-4
 _FITTED_FRAMES = 400
@@ -42,12 +42,12 @@ def write(folder: Path, agent: Agent) -> ExportRecord:
     rest, names = agent.skin.agent_from_bone_rest, list(agent.skin.bone_names)
     recorded = np.concatenate([action.agent_from_bone for action in agent.actions])
     chosen = subsampling.evenly(len(recorded), _FITTED_FRAMES)
-    tree = fitted_tree(recorded[chosen] @ rigid.inverse(rest), rest)
+    tree = fit_tree(recorded[chosen] @ rigid.inverse(rest), rest)
     exact, lost = [], []
     for action in agent.actions:
         flat_file, tree_file = (folder / f"{action.name}.{kind}.bvh" for kind in ("flat", "tree"))
         flat_file.write_text(flat(action, names))
-        tree_file.write_text(treelike(action, tree, rest, names))
+        tree_file.write_text(hierarchical(action, tree, rest, names))
         truth = (action.world_from_agent[:, None] @ action.agent_from_bone)[..., :3, 3]
         exact.append(read_places(flat_file, names) - truth)
         lost.append(read_places(tree_file, [f"{name}_centre" for name in names]) - truth)
@@ -60,10 +60,10 @@ def write(folder: Path, agent: Agent) -> ExportRecord:
     return ExportRecord("own writer", loss, "own reader, with forward kinematics", remark)
 
 
-def fitted_tree(
+def fit_tree(
     posed_from_rest: Float[np.ndarray, "frame bone 4 4"], rest: Float[np.ndarray, "bone 4 4"]
 ) -> Tree:
-    """Find pivots and the tree whose joints are left least apart."""
+    """Fit pivots, and the tree with the smallest residuals at its joints."""
     count = posed_from_rest.shape[1]
     pivots, gap = np.zeros((count, count, 3)), np.zeros((count, count))
     for first, second in itertools.combinations(range(count), 2):
@@ -79,7 +79,7 @@ def fitted_tree(
 
 
 def _pivot(first: np.ndarray, second: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the point at rest that two moving bones keep nearest together, and what is left, metres²."""
+    """Return the pivot of two moving bones at rest, and its mean squared residual, metres²."""
     turn, shift = first[:, :3, :3] - second[:, :3, :3], first[:, :3, 3] - second[:, :3, 3]
     middle = rest[:, :3, 3].mean(0)
     gram = np.einsum("fki,fkj->ij", turn, turn) / len(turn) + _PULL_TO_MIDDLE * np.eye(3)
@@ -90,7 +90,7 @@ def _pivot(first: np.ndarray, second: np.ndarray, rest: np.ndarray) -> tuple[np.
 
 
 def flat(action: Action, names: list[str]) -> str:
-    """Every bone beneath the root with six channels: nothing is lost."""
+    """Return BVH text with every bone a child of the root with six channels: lossless."""
     lines = ["HIERARCHY", "ROOT agent", "{", "OFFSET 0 0 0", _ROOT_CHANNELS]
     for name in names:
         lines += [f"JOINT {name}", "{", "OFFSET 0 0 0", _ROOT_CHANNELS, *_END_SITE, "}"]
@@ -99,15 +99,15 @@ def flat(action: Action, names: list[str]) -> str:
     return _text([*lines, "}"], action, channels.reshape(len(poses), -1))
 
 
-def treelike(action: Action, tree: Tree, rest: Float[np.ndarray, "bone 4 4"], names: list[str]) -> str:
-    """A joint per bone, at its pivot; all zero is the pose at rest. An end `<bone>_centre` is its centre."""
+def hierarchical(action: Action, tree: Tree, rest: Float[np.ndarray, "bone 4 4"], names: list[str]) -> str:
+    """Return BVH text with a joint at each pivot; zero is the rest pose. An end `<bone>_centre` is its centre."""
     lines = ["HIERARCHY"]
     root = tree.order[0]
     written: list[int] = []
 
     def put(bone: int, offset: np.ndarray) -> None:
         written.append(bone)
-        kind, channels = ("ROOT", _ROOT_CHANNELS) if bone == root else ("JOINT", _TURN_CHANNELS)
+        kind, channels = ("ROOT", _ROOT_CHANNELS) if bone == root else ("JOINT", _ROTATION_CHANNELS)
         lines.extend([f"{kind} {names[bone]}", "{", _offset(offset), channels])
         for child in (other for other in tree.order if tree.parent[other] == bone):
             put(child, tree.pivot_agent[child] - tree.pivot_agent[bone])
@@ -126,7 +126,7 @@ def treelike(action: Action, tree: Tree, rest: Float[np.ndarray, "bone 4 4"], na
 
 
 def read_places(path: Path, names: list[str]) -> Float[np.ndarray, "frame joint 3"]:
-    """Read a file as a player does and return where the named joints are, metres."""
+    """Read a file by forward kinematics and return the positions of the named joints, metres."""
     head, _, body = path.read_text().partition("MOTION")
     rows = np.array([[float(value) for value in line.split()] for line in body.strip().splitlines()[2:]])
     stack: list[np.ndarray] = []

@@ -81,7 +81,7 @@ def write_colmap(folder: Path, frames: list[CameraFrame], room: Mesh) -> ExportR
 
 
 def _opened(model: Path, frames: list[CameraFrame]) -> float:
-    """Open the model with COLMAP and return how far cameras are from where they belong, metres."""
+    """Open the model with COLMAP and return the largest error of camera positions, metres."""
     found = pycolmap.Reconstruction(str(model))
     places = {image.name: image.projection_center() for image in found.images.values()}
     assert len(places) == len(frames), (len(places), len(frames))

@@ -1,7 +1,6 @@
-"""MuJoCo: one mocap body a bone that carries the animal's skin, and the room as boxes.
+"""MuJoCo: one mocap body per bone with the animal's skin bound to them, and the room as boxes.
 
-A mocap body is moved by the simulation's user: `motions.npz` holds, per motion, what to put into
-`data.mocap_pos` and `data.mocap_quat` at each key.
+`motions.npz` holds the keys of `data.mocap_pos` and `data.mocap_quat` for each motion.
 """
 
 from pathlib import Path
@@ -105,7 +104,7 @@ def _room(room: Int[np.ndarray, "box 2 3"], occupancy: Occupancy) -> list[str]:
 
 
 def _posed(mujoco: Any, path: Path, motions: dict[str, np.ndarray], name: str) -> float:
-    """Compile the file, pose it, return how far bodies are from where they belong, metres."""
+    """Compile the file, pose it, and return the largest error of body positions, metres."""
     compiled = mujoco.MjModel.from_xml_path(str(path))
     assert compiled.nskin == 1, "the animal's skin"
     data = mujoco.MjData(compiled)

@@ -101,7 +101,7 @@ def _keys(pxr: Any, animation: Any, joints: list[str], action: Action) -> None:
 
 
 def _opened(pxr: Any, path: Path, action: Action) -> float:
-    """Open the file as a player would; return how far joints of one pose are from their places, metres."""
+    """Open the file and return the largest error of joint positions in one pose, metres."""
     stage = pxr.Usd.Stage.Open(str(path))
     cache = pxr.UsdSkel.Cache()
     cache.Populate(pxr.UsdSkel.Root(stage.GetPrimAtPath("/agent")), pxr.Usd.PrimDefaultPredicate)

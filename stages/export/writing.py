@@ -1,4 +1,4 @@
-"""What every export says about itself in `export.json`; and how optional libraries are met."""
+"""`export.json`, and imports of optional libraries."""
 
 import importlib
 import importlib.metadata
@@ -12,16 +12,16 @@ from pipeline.core.errors import InputError
 
 @dataclass(frozen=True)
 class ExportRecord:
-    """What stands in `export.json`."""
+    """The contents of `export.json`."""
 
     library: str
-    """what wrote it, with its version"""
+    """library that wrote the files, with its version"""
     loss_mm: dict[str, float]
-    """distances between what is written and the reconstruction, by name; empty where nothing is lost"""
+    """distances between the files and the reconstruction, by name; empty if lossless"""
     opened_with: str
-    """the tool that read it back while it was written"""
+    """tool that read the files back as a check"""
     remark: str = ""
-    """what its reader has to know"""
+    """units, axes and other notes for readers"""
 
 
 def extra(module: str, package: str) -> ModuleType:

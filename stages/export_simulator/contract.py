@@ -1,4 +1,4 @@
-"""Assemble in one table what the page and every other player of the simulator must know: `simulator.json`."""
+"""Assemble `simulator.json`, the contract between the simulator and its players."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,19 +13,17 @@ from stages.export_simulator.export import SimulatorParts
 from stages.export_simulator.reading import BehaviorAssets
 
 VERSION = 3
-"""Of the contract's keys; players refuse another."""
+"""Version of the contract's keys; players refuse others."""
 GOAL_CHOICES = (1, 4, 16)
-"""Goals that a visitor may let the animal consider at once."""
+"""Numbers of goals sampled at once that a visitor can choose from."""
 GOALS = 4
-"""Goals that are considered until a visitor chooses: a fan wide enough to see apart."""
+"""Default number of goals: enough to show their spread."""
 FINE_STEPS = 50
-"""Denoising steps of the finer of both choices, as in the paper."""
+"""Denoising steps of the finer setting, as in the paper."""
 _WALKING_M_S = 0.15
-"""A root faster than this walks; slower it shifts its weight."""
+"""Root speed above which the animal walks; below it shifts its weight."""
 _DEFAULT_PACE_M_S = 0.4
-"""Pace of an animal that no recording shows walking."""
-
-
+"""Pace of an animal without recorded walking."""
 MIN_SUPPORTED = 0.9
 """Share of recorded frames above something solid or filled floor below which the page and the report warn."""
 _UNSUPPORTED = "Little of this floor was recorded: the animal may float or sink."
@@ -109,7 +107,7 @@ def rigid_rows(a_from_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "
 
 
 def gait(motions: list[SessionClip]) -> dict[str, float]:
-    """Return how fast the animal walks when it walks, and how high its root then is: medians of all."""
+    """Return median speed and root height while walking."""
     places = [motion.world_from_agent[:, :3, 3] for motion in motions]
     steps = zip(places, motions, strict=True)
     velocity = [np.gradient(place[:, [0, 2]], motion.timestamp_s, axis=0) for place, motion in steps]

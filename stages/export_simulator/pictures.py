@@ -1,4 +1,4 @@
-"""Pictures for the report: where animal and person have been in the room, from above and in space."""
+"""Pictures for the report: trajectories and occupancy of animal and person in the room."""
 
 import matplotlib
 import numpy as np
@@ -65,7 +65,7 @@ def _splatted(
     behind: Float[np.ndarray, "height width"],
     radius_px: int = 4,
 ) -> Float[np.ndarray, "height width"]:
-    """Return the greatest value of the points that no surface hides, around where they are seen."""
+    """Splat the values of visible points into the picture, keeping the maximum per pixel."""
     pixel, depth = cameras.project(rigid.apply(rigid.inverse(world_from_camera), points), intrinsics)
     column, row = pixel.astype(int).T
     height, width = behind.shape
@@ -78,7 +78,7 @@ def _splatted(
 
 
 def visits(mesh: Mesh, floor_m: float, motions: list[SessionClip]) -> UInt8[np.ndarray, "height width 3"]:
-    """Lay over the pale room how long the animal (amber) and the person (blue) were where."""
+    """Overlay the time that animal (amber) and person (blue) spent in each place on the pale room."""
     room = views.bird_view(mesh, floor_m=floor_m, height_m=_HEADROOM_M)
     image = _PALE * room.image + (1 - _PALE) * views.BACKGROUND
     edges = [np.arange(side + 1) for side in image.shape[1::-1]]

@@ -59,7 +59,7 @@ def orient_towards(mesh: Mesh, inside: Float[np.ndarray, "3"]) -> Mesh:
 
 
 def _corners_normals(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of every face, and its normal as long as twice its area."""
+    """Return the corners of each face, and its normal with length twice the area."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     return corners, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
@@ -93,7 +93,7 @@ def skinned_splats(
 
 
 def _weightiest(gaussians: Float[np.ndarray, "point 62"], max_points: int) -> Int[np.ndarray, " selected"]:
-    """Choose the sound Gaussians that cover most, heaviest first."""
+    """Choose the valid Gaussians with the largest opacity times area, in descending order."""
     opacity, size = _opacity(gaussians), np.exp(gaussians[:, _LOG_SCALE].astype(np.float64))
     sound = np.isfinite(gaussians).all(1) & (opacity >= 1 / 255)
     weight = np.where(sound, opacity * np.sort(size, axis=1)[:, 1:].prod(1), -1)
