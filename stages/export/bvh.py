@@ -100,7 +100,7 @@ def flat(action: Action, names: list[str]) -> str:
 
 
 def hierarchical(action: Action, tree: Tree, rest: Float[np.ndarray, "bone 4 4"], names: list[str]) -> str:
-    """Return BVH text with a joint at each pivot; zero is the rest pose. An end `<bone>_centre` is its centre."""
+    """Return BVH text with a joint at each pivot; zero is rest. An end `<bone>_centre` is its centre."""
     lines = ["HIERARCHY"]
     root = tree.order[0]
     written: list[int] = []

@@ -102,8 +102,8 @@ def test_what_was_carried_away_is_left_out(wall):
 
 
 def test_most_gaussians_lie_where_colours_change(wall, monkeypatch):
-    monkeypatch.setattr(cover, "PLAIN", 0.01)
-    monkeypatch.setattr(cover, "EVEN", 0.1)
+    monkeypatch.setattr(cover, "BASE_GRADIENT", 0.01)
+    monkeypatch.setattr(cover, "UNIFORM_SHARE", 0.1)
     seen = cover.observe(wall, EVERYWHERE, [film(0), film(1)], FRAMES)
     kept, spacing_m = cover.subsample(wall.points, SHARED, seen, 2000, np.random.default_rng(0))
     assert abs(len(kept) - 2000) < 40
