@@ -1,9 +1,9 @@
 """Artifacts: folders that exist whole or not at all.
 
 `create` yields a hidden temporary folder beside the final one; when the block ends well it writes
-`manifest.json` (sha256 of every file), syncs the disk and renames. `opened` and `read_manifest` are
-how everyone else looks at one. What varies between runs (seconds, host, commit) is a record, never
-part of an artifact. Standard library only: the planner and the runner use this file too.
+`manifest.json` (sha256 of every file), syncs the disk and renames. `opened` and `read_manifest` read a
+finished one. What varies between runs (seconds, host, commit) is kept in a record, never in an artifact.
+Standard library only: the planner and the runner use this file too.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ from pipeline.workflow import dag
 
 MANIFEST = "manifest.json"
 STAMP = ".ok"
-"""Touched by the runner when an artifact is known to be up to date; what Make looks at."""
+"""Stamp file that the runner writes once an artifact is up to date; Make compares its age."""
 _VERSIONS = ("numpy", "scipy", "torch", "opencv-contrib-python-headless", "pycolmap", "onnxruntime")
 
 
@@ -35,7 +35,7 @@ class Manifest:
     stage: str
     """Program that wrote it."""
     key: str | None
-    """Hash of everything that decides its content; None when a stage was run by hand."""
+    """Cache key: hash of everything that determines its content; None if a stage was run by hand."""
     content: str
     """Hash of the names and bytes of its files."""
     inputs: dict[str, str]
@@ -43,15 +43,15 @@ class Manifest:
     config: dict[str, Any]
     """The stage's full configuration, defaults included."""
     versions: dict[str, str]
-    """Python and the libraries that decide numbers."""
+    """Versions of Python and of the libraries that affect numerical results."""
     files: dict[str, str]
     """sha256 per file, by path inside the folder."""
     version: int = 1
-    """Of its stage's files and their meaning, see `dag.Node.version`."""
+    """File format version of its stage, see `dag.Node.version`."""
 
 
 def read_manifest(folder: Path) -> Manifest | None:
-    """Return the manifest of `folder`, or None where there is no finished artifact."""
+    """Return the manifest of `folder`, or None if there is no finished artifact."""
     try:
         manifest = Manifest(**json.loads((folder / MANIFEST).read_bytes()))
     except (FileNotFoundError, NotADirectoryError, ValueError, TypeError, RecursionError):
@@ -60,7 +60,7 @@ def read_manifest(folder: Path) -> Manifest | None:
 
 
 def _is_sound(manifest: Manifest) -> bool:
-    """Return whether every field holds what it should."""
+    """Return whether every field has the right type."""
     texts, tables = (manifest.stage, manifest.content), (manifest.inputs, manifest.versions, manifest.files)
     return (
         all(isinstance(text, str) for text in texts)
@@ -83,12 +83,12 @@ def opened(folder: Path, name: str) -> Manifest:
 
 
 def version_of(stage: str) -> int:
-    """Return the present version of a stage's files and their meaning."""
+    """Return the current file format version of a stage."""
     return max((node.version for node in dag.FLOW if node.stage.rpartition(".")[2] == stage), default=1)
 
 
 def refuse_other_version(folder: Path) -> None:
-    """Raise `InputError` ART-007 where `folder` is a finished artifact of another version."""
+    """Raise `InputError` ART-007 if `folder` is a finished artifact of another version."""
     made = read_manifest(folder)
     if made is not None and made.version != version_of(made.stage):
         what = f"{made.stage} wrote it in version {made.version}; this is version {version_of(made.stage)}"
@@ -96,7 +96,7 @@ def refuse_other_version(folder: Path) -> None:
 
 
 def require(build: Path, *names: str, remedy: str) -> None:
-    """Raise ART-003 with ``remedy`` where a build lacks an artifact, ART-007 for one of another version."""
+    """Raise ART-003 with ``remedy`` if a build lacks an artifact, ART-007 for one of another version."""
     for name in names:
         if not (build / name).is_dir():
             raise InputError("ART-003", f"has no {name}", str(build), remedy)
@@ -132,13 +132,13 @@ def create(
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """Return the sha256 of every file under `folder` by its relative path, but manifest and stamp."""
+    """Return the sha256 of every file under `folder` by relative path, except manifest and stamp."""
     names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     return {name: digest_of_file(folder / name) for name in names if name not in (MANIFEST, STAMP)}
 
 
 def damaged(folder: Path) -> list[str]:
-    """Return the files of the finished artifact at `folder` that are not what was written, or are gone."""
+    """Return the files of the finished artifact at `folder` that are missing or fail their checksum."""
     manifest, found = read_manifest(folder), digests(folder)
     return [name for name, digest in manifest.files.items() if found.get(name) != digest] if manifest else []
 
@@ -160,18 +160,18 @@ def digest_of(value: Any) -> str:
 
 
 def clean(*outs: Path) -> None:
-    """Remove what writers of these artifacts and files that died have left; the caller holds the lock."""
+    """Remove temporary files left by killed writers of these paths; the caller holds the lock."""
     for out in outs:
-        for left in (*out.parent.glob(f".{out.name}.tmp*"), *out.parent.glob(f".{out.name}.old.*")):
-            if left.is_dir():
-                shutil.rmtree(left, ignore_errors=True)
+        for leftover in (*out.parent.glob(f".{out.name}.tmp*"), *out.parent.glob(f".{out.name}.old.*")):
+            if leftover.is_dir():
+                shutil.rmtree(leftover, ignore_errors=True)
             else:
-                left.unlink(missing_ok=True)
+                leftover.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
-def held(lock: Path, waiting: str = "") -> Iterator[None]:
-    """Hold a kernel lock: it dies with its owner. Where another has it, say `waiting` and wait."""
+def locked(lock: Path, waiting: str = "") -> Iterator[None]:
+    """Hold an exclusive `flock`, released when the process dies. If taken, print `waiting` and block."""
     lock.parent.mkdir(parents=True, exist_ok=True)
     with lock.open("a") as file:
         try:
@@ -184,8 +184,8 @@ def held(lock: Path, waiting: str = "") -> Iterator[None]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of those libraries in use that decide numbers."""
-    import importlib.metadata  # late: the planner does without
+    """Return the versions of Python and of the installed libraries that affect numerical results."""
+    import importlib.metadata  # imported late: the planner does not need it
 
     found = {"python": ".".join(map(str, sys.version_info[:3]))}
     for name in _VERSIONS:
@@ -195,9 +195,9 @@ def versions() -> dict[str, str]:
 
 
 def write_if_changed(path: Path, text: str, *, sync: bool = True) -> bool:
-    """Replace a small file atomically; leave it, and so its age, alone when it says the same already.
+    """Replace a small file atomically; keep it and its modification time if the content is the same.
 
-    Writers of the same file hold a lock, so that what one that died has left is overwritten by the next.
+    Writers of the same file hold a lock, so the next one overwrites the leftovers of one that was killed.
     Without `sync` the caller flushes the disk itself (`sync_disk`) before anything relies on the file.
     """
     data = text.encode()
@@ -216,7 +216,7 @@ def write_if_changed(path: Path, text: str, *, sync: bool = True) -> bool:
 
 
 def _replace(temporary: Path, out: Path) -> None:
-    """Give `temporary` its final name; a reader sees the old artifact, none, or the new one, no mixture."""
+    """Rename `temporary` to `out`; a reader sees the old artifact, none, or the new one, never a mixture."""
     old = out.with_name(f".{out.name}.old.{os.getpid()}")
     if out.exists():
         out.rename(old)

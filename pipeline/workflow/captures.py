@@ -1,4 +1,4 @@
-"""What lies in `captures/<agent>/`: from names and the recipe's `[videos]` to recordings with roles.
+"""The recordings in `captures/<agent>/`: their roles, from file names and the recipe's `[videos]`.
 
 `find` looks at the disk, `assign` decides roles and split; both raise `InputError` before anything is
 written. User file names go into `videos.json` and nowhere else. Standard library only.
@@ -30,16 +30,16 @@ _NEEDED: dict[Flow, tuple[tuple[Role, str], ...]] = {
     "trajectories": (("session", "one or more tables of its motion, CSV or NPZ"),),
 }
 SHOWN_LETTERS, LONGEST_NAME_BYTES = 40, 200
-"""of a recording: file systems end at 255, and sidecars are named after it"""
+"""of a recording's name: file systems allow 255 bytes, and sidecars append to it"""
 _ANIMAL = re.compile(r"[a-z][a-z0-9-]{0,30}\Z")
 _NAMED = re.compile(r"turnaround_([a-z][a-z0-9-]*)")
 TABLES = (".csv", ".npz")
-"""Kinds of files that hold motion."""
+"""Suffixes of tables of motion."""
 
 
 @dataclass(frozen=True)
 class Remarks:
-    """What the user says about one recording, in the recipe's `[videos]` or in a sidecar; None: nothing."""
+    """What the user says about one recording, in the recipe's `[videos]` or in a sidecar; None: not given."""
 
     role: str | None = None
     """`walkthrough`, `turnaround`, `session` or `heldout`; otherwise the name decides."""
@@ -54,38 +54,38 @@ class Remarks:
 
 
 def find(folder: Path, flow: Flow = "recordings") -> list[str]:
-    """Return the names of the recordings in `folder` that are understood, or of the tables of motion."""
+    """Return the names of the recordings of known formats in `folder`, or of the tables of motion."""
     understood = format_of if flow == "recordings" else _is_table
-    return [path.name for path in _shown(folder) if understood(path)]
+    return [path.name for path in _visible(folder) if understood(path)]
 
 
-def _shown(folder: Path) -> list[Path]:
-    """Return what lies in a folder, by name, but hidden files."""
+def _visible(folder: Path) -> list[Path]:
+    """Return the entries of a folder except hidden ones, sorted by name."""
     found = sorted(folder.iterdir()) if folder.is_dir() else []
     return [path for path in found if not path.name.startswith(".")]
 
 
-def not_understood(folder: Path, flow: Flow = "recordings") -> list[str]:
-    """Return the names of whatever else lies there."""
+def unknown_files(folder: Path, flow: Flow = "recordings") -> list[str]:
+    """Return the names of all other visible entries."""
     found, kinds = find(folder, flow), {"", *(f".{kind}" for node in dag.FLOW for kind in node.sidecars)}
     known = {*found, *(f"{name}{kind}{SIDECAR}" for name in found for kind in kinds)}
     known |= {name for node in dag.FLOW for name in node.extra_inputs}
-    return [path.name for path in _shown(folder) if path.name not in known]
+    return [path.name for path in _visible(folder) if path.name not in known]
 
 
 def named(path: Path, flow: Flow = "recordings") -> str:
-    """Return a stranger's name for a message: with what is amiss with it, where that is known."""
+    """Return an unknown file's name for a message, with the reason why it is unusable if known."""
     if not path.exists():
         return f"{path.name!r} (a link that leads nowhere)"
     inner = find(path, flow)
     return f"{path.name!r} (move {inner[0]!r} out of it: that is one)" if inner else repr(path.name)
 
 
-def refuse_strangers(folder: Path, flow: Flow = "recordings") -> None:
-    """Raise CAP-003 where something was put into `folder`, but nothing that a flow can begin with."""
-    strangers = [name for name in not_understood(folder, flow) if not name.endswith(SIDECAR)]
-    if strangers:
-        named_all = ", ".join(named(folder / name, flow) for name in strangers)
+def refuse_unknown_files(folder: Path, flow: Flow = "recordings") -> None:
+    """Raise CAP-003 if `folder` has files, but no recording that the flow can start from."""
+    unknown = [name for name in unknown_files(folder, flow) if not name.endswith(SIDECAR)]
+    if unknown:
+        named_all = ", ".join(named(folder / name, flow) for name in unknown)
         what = f"holds no recording of a known format, only {named_all}"
         known = "tables of motion, CSV or NPZ"
         if flow == "recordings":
@@ -95,13 +95,13 @@ def refuse_strangers(folder: Path, flow: Flow = "recordings") -> None:
 
 
 def extra_inputs(agent: str, names: Sequence[str], *, artifacts: bool = True) -> list[Path]:
-    """Return those files of these names beside an agent's recordings that exist, and finished artifacts."""
+    """Return the existing files and finished artifacts of these names beside an agent's recordings."""
     paths = (Path("captures", agent, name) for name in names)
     return [path for path in paths if path.is_file() or (artifacts and (path / MANIFEST).is_file())]
 
 
 def sidecars(agent: str, file: str, names: Sequence[str]) -> dict[str, Path]:
-    """Return, by name, those files that belong to one recording and exist."""
+    """Return the existing sidecar files of one recording by name."""
     paths = {name: Path("captures", agent, f"{file}.{name}{SIDECAR}") for name in names}
     return {name: path for name, path in paths.items() if path.is_file()}
 
@@ -109,7 +109,7 @@ def sidecars(agent: str, file: str, names: Sequence[str]) -> dict[str, Path]:
 def remarks(
     folder: Path, names: Sequence[str], overrides: Mapping[str, Any], where: str
 ) -> dict[str, Remarks]:
-    """Return what the user says about each recording; the recipe's word counts more than a sidecar's."""
+    """Return what the user says about each recording; the recipe overrides sidecars."""
     config.refuse_unknown(overrides, names, where=f"{where}: [videos]", kind="recording")
     said = {}
     for name in names:
@@ -136,8 +136,8 @@ def assign(
 ) -> tuple[Video, ...]:
     """Give every recording its id, role, split and clock.
 
-    `known_ids`, by file name, stay; none is given to another file. Raises CAP-040 (something is missing),
-    CAP-041 (a remark that cannot be), CAP-043 (two turnarounds that do not name two animals).
+    `known_ids`, by file name, are kept and never reused. Raises CAP-040 (a role is missing), CAP-041 (an
+    impossible remark), CAP-043 (two turnarounds that do not name two animals).
     """
     roles: dict[str, Role] = {name: role_of(name, remark, where) for name, remark in said.items()}
     for role, what in missing_roles(list(roles.values()), flow):
@@ -167,7 +167,7 @@ def is_mapped(folder: Path, video: Video) -> bool:
 
 
 def role_of(name: str, remark: Remarks, where: str) -> Role:
-    """Return a recording's role: the user's word, else the beginning of its name. Raises CAP-041."""
+    """Return a recording's role: as the user says, else by the prefix of its name. Raises CAP-041."""
     for role in ROLES:
         if role == remark.role or (remark.role is None and name.lower().startswith(role)):
             return role
@@ -225,7 +225,7 @@ def _splits(sessions: Sequence[str], said: Mapping[str, Remarks], where: str) ->
 
 
 def _animals(turnarounds: Sequence[str], said: Mapping[str, Remarks], where: str) -> dict[str, str]:
-    """Return whose turnarounds these are; nobody's in particular where there is only one."""
+    """Return the animal of each turnaround; empty if there is only one."""
     if len(turnarounds) < 2:
         return {}
     found: dict[str, str] = {}

@@ -36,7 +36,7 @@ class InputField:
     name: str
     required: bool
     several: bool
-    """A folder per recording, trial or variant instead of one path."""
+    """One folder per recording, trial or variant instead of one path."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,13 +47,13 @@ class Task:
     config: Any
     """The stage's own `Config`."""
     out: Path
-    """Where the artifact will stand."""
+    """Path of the artifact."""
     video: str | None
-    """Id of the recording, for stages that treat one at a time."""
+    """Id of the recording, for stages that process one at a time."""
     videos: tuple[Video, ...]
     """All recordings of the agent; empty when run by hand without `--videos`."""
     resume: Path | None
-    """Folder for checkpoints; None: a killed run begins again."""
+    """Folder for checkpoints; None: a killed run starts over."""
     threads: int
     key: str | None
     paths: dict[str, Path]
@@ -68,7 +68,7 @@ class Task:
         return devices.choose(self.requested_device)
 
     def input(self, name: str) -> Path:
-        """Return the folder of the finished artifact `name`, or the plain file or folder where it is none."""
+        """Return the folder of the finished artifact `name`, or a plain file or folder as it is."""
         path = self.paths[name]
         if name in dag.NODES:
             return self._opened(path, name)
@@ -77,7 +77,7 @@ class Task:
         return path
 
     def field(self, field: InputField) -> Path | dict[str, Path] | None:
-        """Return what a field of the stage's `Inputs` holds; None for an optional one that was not given."""
+        """Return the value of a field of the stage's `Inputs`; None for an optional one not given."""
         if field.name not in self.paths:
             return None
         if not field.several:
@@ -100,7 +100,7 @@ class Task:
         return self._per_video(need)
 
     def recording(self) -> Video | None:
-        """Return the recording to treat; None where the stage was run by hand without saying which."""
+        """Return the recording to process; None if the stage was run by hand without `--video`."""
         if self.video is None:
             return None
         for video in self.videos:
@@ -131,7 +131,7 @@ class Task:
 
     @contextmanager
     def create(self) -> Iterator[Path]:
-        """Yield the folder to fill; it becomes the artifact if, and only if, the block ends well."""
+        """Yield the folder to fill; it becomes the artifact if, and only if, the block succeeds."""
         stage, settings = self.stage.rpartition(".")[2], dataclasses.asdict(self.config)
         made = artifact.create(self.out, stage=stage, config=settings, inputs=self.contents, key=self.key)
         with made as folder:
@@ -181,7 +181,7 @@ def main(
 
 
 def input_fields(inputs: type) -> tuple[InputField, ...]:
-    """Return the fields of a stage's `Inputs`; one of a type that `main` does not know is a fault."""
+    """Return the fields of a stage's `Inputs`; an unsupported type is a programming error."""
     kinds = {Path: False, Mapping[str, Path]: True}
     found = []
     for name, hint in typing.get_type_hints(inputs).items():
@@ -193,7 +193,7 @@ def input_fields(inputs: type) -> tuple[InputField, ...]:
 
 
 def _program(run: Callable[..., object]) -> str:
-    """Return the name of the stage program that `run` belongs to, as the flow declares it."""
+    """Return the name of the stage program that defines `run`, as declared in the flow."""
     parts = run.__module__.split(".")
     return ".".join(parts[1:-1]) if parts[0] == "stages" else Path(sys.argv[0]).parent.name
 
@@ -209,7 +209,7 @@ def _run(run: Callable[..., object], inputs: type, fields: Sequence[InputField],
         "video": task.recording,
     }
     known = {name: offer() for name, offer in offered.items() if name in accepted}
-    # of the processes that torchrun started, the first alone publishes the artifact
+    # of the processes that torchrun started, only rank 0 publishes the artifact
     leads = os.environ.get("RANK", "0") == "0" or "TORCHELASTIC_RUN_ID" not in os.environ
     with task.create() if leads else tempfile.TemporaryDirectory() as folder:
         run(given, task.config, Path(folder), **known)
@@ -257,7 +257,7 @@ def _parser(
 
 
 class _Parser(argparse.ArgumentParser):
-    """Refuses a command line with a coded error in place of the usage."""
+    """Rejects an invalid command line with a coded error instead of the usage."""
 
     def error(self, message: str) -> typing.NoReturn:
         raise InputError("RUN-004", message, self.prog, "see --help")
@@ -304,7 +304,7 @@ def _task(
 
 
 def _limit_threads(threads: int) -> None:
-    """Hold every library that is loaded, or will be, to `threads`."""
+    """Limit every library, loaded now or later, to `threads`."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = str(threads)
     if "torch" in sys.modules:

@@ -1,7 +1,7 @@
-"""The one declaration of the flow: which program makes which artifact, from what, for which recordings.
+"""The declaration of the DAG: which program makes which artifact, from what, for which recordings.
 
-`plan` expands it for an agent's recordings, `run` runs one job of it, and Make and Snakemake see
-only what `plan` wrote. Standard library only, no side effects.
+`plan` expands it for an agent's recordings, `run` runs one job of it, and Make and Snakemake see only the
+plan. Standard library only, no side effects.
 """
 
 from dataclasses import dataclass, field
@@ -10,13 +10,13 @@ from typing import Literal
 from pipeline.core.videos import Role, Split, Video
 
 Flow = Literal["recordings", "trajectories"]
-"""Where an agent's flow begins: at recordings of it, or at tables of its motion."""
+"""What an agent's flow starts from: recordings of it, or tables of its motion."""
 BUILTIN: dict[Flow, str] = {"recordings": "synthetic_capture", "trajectories": "synthetic_lives"}
-"""What stands in where `captures/<agent>/` is empty."""
+"""What replaces recordings if `captures/<agent>/` is empty."""
 VIEWED: tuple[Role, ...] = ("walkthrough", "turnaround", "session")
 """Roles that models may see; the held-out phone is for `evaluate` alone."""
 AGENT: tuple[Role, ...] = ("turnaround", "session")
-"""Roles in which the animal is meant to be seen."""
+"""Roles of recordings that show the animal."""
 BOTH: tuple[Flow, ...] = ("recordings", "trajectories")
 REGISTRATION_VARIANTS = ("no_localizer", "no_feature_metric", "no_odometry", "regression_only", "totalrecon")
 """Variants of an agent that Table 1 compares its registration with."""
@@ -35,33 +35,31 @@ READ_BY_PAGES = ("reconstruction", "splats", "behavior", "behavior_data")
 
 @dataclass(frozen=True)
 class Need:
-    """One input of a node; of an input that exists per recording, which recordings."""
+    """One input of a node; for an artifact per recording, of which recordings."""
 
     artifact: str
     roles: tuple[Role, ...] | None = None
-    """None: every recording that has it."""
+    """None: all recordings that have it."""
     splits: tuple[Split, ...] = ("train", "test", "none")
     part: str | None = None
-    """Subfolder that is read, where it is not the whole artifact."""
+    """Subfolder that is read; None: the whole artifact."""
     option: str | None = None
     """Command line option without dashes; the artifact's name if None."""
     variants: tuple[str, ...] = ()
-    """Variants of the agent whose artifact of this name is read as well; --variants is the folder of all."""
+    """Variants of the agent whose artifact is read as well, given as the folder `--variants`."""
     flow: Flow | None = None
-    """The flow in which it is an input; None: in all that the node is part of."""
+    """The only flow in which it is an input; None: all flows of the node."""
     measured: bool = False
-    """Only recordings with depth of their own, and the walk-through: what the map itself is made from."""
+    """Only recordings with their own depth, and the walk-through: those that the map is built from."""
     per_animal: bool = False
-    """In a home of several animals its part holds a folder per animal, of which one's own is read."""
+    """In a home of several animals `part` has a subfolder per animal, of which the animal's own is read."""
     others: bool = False
-    """Not one's own but that of every other animal of the home, of all of them where it is made once; the
-    folder of all animals is given."""
+    """That of every other animal (all animals if the node is shared), given as the folder of all animals."""
     homes: Literal["any", "own", "other"] = "any"
-    """Only where the table of the node names further `homes`, builds of the same animal: one's own, or each
-    of theirs, of which the folder of all builds is given."""
+    """If the table names `homes`, other builds of the animal: its own artifact, or theirs in `build/`."""
 
     def wants(self, video: Video, made_of: tuple[Role, ...]) -> bool:
-        """Return whether a recording is meant; `made_of` are the artifact's own roles."""
+        """Return whether a recording is an input; `made_of` are the roles of the needed artifact."""
         roles = made_of if self.roles is None else self.roles
         return video.role in roles and video.split in self.splits and not (self.measured and video.mapped)
 
@@ -75,46 +73,46 @@ class Node:
     """Program: `python -m stages.<stage>`."""
     needs: tuple[Need | str, ...] = ()
     roles: tuple[Role, ...] = ()
-    """One job per recording of these roles; none: one job in all."""
+    """One job per recording of these roles; empty: a single job."""
     role_dependencies: tuple[Role, ...] = ()
-    """Roles whose set and split decide the result although no per-recording input depends on them."""
+    """Roles whose recordings and split affect the result without being an input per recording."""
     fixed: dict[str, object] = field(default_factory=dict)
     """Keys of the configuration that distinguish two nodes of one program."""
     version: int = 1
-    """Raise it when results change although no code does, or what files mean: readers refuse others."""
+    """Format version: raise it when results or the meaning of files change. Readers refuse other versions."""
     threads: int = 1
     gpu: int = 0
     memory_mb: int = 3000
-    """What a scheduler reserves; not a limit."""
+    """Memory that a scheduler reserves; not a limit."""
     memory_mb_per_1000_frames: int = 0
-    """What it reserves in addition, for the frames of all recordings that the job reads."""
+    """Additional memory for the frames of all recordings that the job reads."""
     seconds_per_frame: float = 0.02
-    """Of those frames, on two cores without a GPU; what a scheduler grants is several times as long."""
+    """Per frame read, on two cores without a GPU; the scheduler's limit is several times as long."""
     resumable: bool = False
-    """Owns a folder for checkpoints that survives a kill."""
+    """Has a folder for checkpoints that survives a kill."""
     distributed: bool = False
-    """Several processes, each with a GPU of its own, can do it together."""
+    """Can run as several processes with a GPU each."""
     extra_inputs: tuple[str, ...] = ()
-    """Files in the capture folder that it reads where they exist, each as `--<stem>`; artifacts likewise, but
-    not for variants, which are compared with what begins from nothing."""
+    """Optional files or artifacts in the capture folder, passed as `--<stem>`; variants ignore artifacts, as
+    they are compared with runs from scratch."""
     sidecars: tuple[str, ...] = ()
     """The same per recording: `<recording>.<name>.toml`, as `--<name>`."""
     flows: tuple[Flow, ...] = ("recordings",)
-    """The flows that it is part of."""
+    """Flows that contain it."""
     trials: Literal["none", "each", "all"] = "none"
     """Only for `make behavior-tables`: one job per trial (a method with a seed), or one over all."""
     table: str | None = None
-    """The recipe's table that configures it, where it is another node's too."""
+    """The recipe's table that configures it, if shared with another node."""
     on_demand: bool = False
-    """Made only where it is requested by its name, or needed by something that is."""
+    """Made only if requested by name, or needed by something that is."""
     mapped: bool = False
-    """Made only of recordings whose depth comes from the map."""
+    """Made only from recordings whose depth comes from the map."""
     stands_in_for: str | None = None
-    """Artifact in whose place others read this one, of those recordings."""
+    """Artifact that it replaces as an input of other nodes, for those recordings."""
     of_several: bool = False
-    """Made, and read, only in a home of several animals, once for all of them."""
+    """Made and read only in a home of several animals, once for all of them."""
     begins_animal: bool = False
-    """In a home of several animals each of them has its own, and its own of all that is made from it."""
+    """In a home of several animals it and everything downstream is made per animal."""
 
     @property
     def several(self) -> bool:
@@ -129,6 +127,7 @@ def merging(*artifacts: str, roles: tuple[Role, ...] | None = None) -> tuple[Nee
 
 TRUTH = Need("synthetic_capture", part="truth", option="truth", per_animal=True)
 RECORDING = Need("synthetic_capture", part="recordings", option="recording")
+WALK = Need("frames", roles=("walkthrough",), option="walk")
 OF_HOMES = (
     *(Need(name, homes="own", flow="recordings") for name in HOME_ARTIFACTS[1:]),
     *(Need(name, option="homes", homes="other", flow="recordings") for name in HOME_ARTIFACTS),
@@ -198,10 +197,7 @@ FLOW: tuple[Node, ...] = (
     Node(
         "video_poses",
         "register_videos",
-        (
-            *("frames", "masks", "features", *TEMPLATES, *LOCALIZERS),
-            Need("frames", roles=("walkthrough",), option="walk"),
-        ),
+        ("frames", "masks", "features", *TEMPLATES, *LOCALIZERS, WALK),
         roles=("session",),
         gpu=1,
         seconds_per_frame=0.08,
@@ -367,13 +363,13 @@ NODES = {node.artifact: node for node in FLOW}
 
 
 def table_of(node: Node) -> str:
-    """Return the recipe's table that configures `node`: its program's, or its own where they share one."""
+    """Return the recipe's table that configures `node`: the program's, or its own if that is shared."""
     shared = sum(other.stage == node.stage and other.table is None for other in FLOW) > 1
     return node.table or (node.artifact if shared or "." in node.stage else node.stage)
 
 
 def nodes_of(flow: Flow, *, trials: bool = False, several: bool = False) -> tuple[Node, ...]:
-    """Return the nodes of one flow, in order; those of tables or ``several`` animals only if so."""
+    """Return the nodes of one flow in order, those for trials or ``several`` animals only on request."""
     return tuple(
         node
         for node in FLOW
@@ -382,13 +378,13 @@ def nodes_of(flow: Flow, *, trials: bool = False, several: bool = False) -> tupl
 
 
 def folder_of(name: str, video: Video) -> str:
-    """Return the artifact that holds `name` of one recording: another one where its depth is the map's."""
+    """Return the artifact that holds `name` of a recording: its stand-in if its depth is the map's."""
     stand_ins = (node.artifact for node in FLOW if node.stands_in_for == name)
     return next(stand_ins, name) if video.mapped else name
 
 
 def needs_of(node: Node, flow: Flow | None = None) -> tuple[Need, ...]:
-    """Return the node's inputs, in declared order; those of one flow only, if given."""
+    """Return the node's inputs in declared order, only those of ``flow`` if given."""
     needs = tuple(Need(need) if isinstance(need, str) else need for need in node.needs)
     return tuple(need for need in needs if flow is None or need.flow in (None, flow))
 

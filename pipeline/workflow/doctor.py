@@ -1,4 +1,4 @@
-"""`make doctor`: look at this machine and say what a build would miss.
+"""`make doctor`: check what this machine lacks for a build.
 
 Each check returns one finding; the exit code is 2 when something that every build needs is missing.
 """
@@ -56,14 +56,14 @@ def libraries() -> Finding:
 
 
 def opengl() -> Finding:
-    """Look for the system libraries that meshes need."""
+    """Check the system libraries for meshes."""
     missing = [name for name in ("GL", "OpenGL") if ctypes.util.find_library(name) is None]
     text = f"missing lib{', lib'.join(missing)}" if missing else "found"
     return Finding("OpenGL", "fail" if missing else "ok", text)
 
 
 def meshes() -> Finding:
-    """Import pymeshlab, in a process of its own, as the stage that uses it does."""
+    """Import pymeshlab in a separate process, as the stage that uses it does."""
     found = subprocess.run([sys.executable, "-c", "import pymeshlab"], capture_output=True, text=True)
     if found.returncode == 0:
         return Finding("pymeshlab", "ok", "imports")
@@ -82,7 +82,7 @@ def processors() -> Finding:
 
 
 def lock() -> Finding:
-    """Compare the lock that the environment was made from with what this machine has."""
+    """Compare the lock file of the environment with this machine."""
     try:
         kind = Path(".venv", "lock").read_text().strip()
     except OSError:
@@ -102,14 +102,14 @@ def memory() -> Finding:
 
 
 def disk() -> Finding:
-    """Check the free space where builds stand."""
+    """Check the free disk space for builds."""
     free_gb = shutil.disk_usage(".").free / 2**30
     text = f"{free_gb:.0f} GB free (wanted: {NEEDED_DISK_GB})"
     return Finding("disk", "ok" if free_gb >= NEEDED_DISK_GB else "warn", text)
 
 
 def browser() -> Finding:
-    """Look for the browser that the page test drives, and what its driver links; builds do without."""
+    """Check the browser of the page test and its system libraries; builds do not need them."""
     found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), "")
     missing = [] if found else ["chromium"]
     if sys.platform == "linux" and ctypes.util.find_library("atomic") is None:

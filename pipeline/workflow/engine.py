@@ -1,6 +1,7 @@
-"""What the Snakefile knows of the flow: homes, targets, and per rule its inputs and resources.
+"""What the Snakefile needs of the DAG: homes, targets, and the inputs and resources of each rule.
 
-The process that the user starts plans; jobs elsewhere only read their line. Standard library only.
+The process that the user starts writes the plan; jobs elsewhere only read their line of it. Standard
+library only.
 """
 
 import csv
@@ -18,17 +19,17 @@ from pipeline.core.errors import InputError
 from pipeline.workflow import artifact, dag, jobs
 
 FRAMES_UNKNOWN = 1000
-"""Frames reckoned per recording that has not been extracted yet: 100 s at 10 Hz."""
+"""Assumed number of frames of a recording before extraction: 100 s at 10 Hz."""
 MIN_RUNTIME_MIN = 60
-"""What every job is granted on its first attempt, minutes."""
+"""Minimum time limit of a job on its first attempt, minutes."""
 RUNTIME_FACTOR = 4
-"""How much slower than the measured machine a node may be."""
+"""How much slower than the measured machine a compute node may be."""
 MEMORY_GROWTH = 1.5
 """Memory of each attempt, relative to the one before."""
 _known: dict[tuple[str, str], dict[str, Any]] = {}
-"""Planned jobs that this process has read, by home and id."""
+"""Cache of planned jobs, by home and id."""
 HOME = r"[a-z0-9][a-z0-9_-]*(?:/(?:variants|animals)/[a-z0-9][a-z0-9_-]*)?"
-"""The homes that a rule's output may belong to."""
+"""Pattern of the homes in a rule's output."""
 
 
 def homes(config: Mapping[str, Any]) -> list[str]:
@@ -57,14 +58,14 @@ def plan(homes: list[str]) -> None:
 
 
 def targets(homes: list[str]) -> list[str]:
-    """Return the stamps that a build of these homes asks for: all that no other of its jobs waits for."""
+    """Return the stamps that a build of these homes requests: those that no other of its jobs depends on."""
     wanted: dict[str, None] = {}
     for home in map(jobs.Home.parse, homes):
-        for job in json.loads(jobs.listing(home).read_text()):
+        for job in json.loads(jobs.jobs_file(home).read_text()):
             _known[job["home"], job["id"]] = job
             wanted |= {} if job["on_demand"] else {job["stamp"]: None}
-    waited_for = {each for job in _known.values() if job["stamp"] in wanted for each in job["after"]}
-    return [stamp for stamp in wanted if stamp not in waited_for]
+    dependencies = {each for job in _known.values() if job["stamp"] in wanted for each in job["after"]}
+    return [stamp for stamp in wanted if stamp not in dependencies]
 
 
 def output(node: dag.Node) -> str:
@@ -83,7 +84,7 @@ def job_pattern(node: dag.Node) -> str:
 
 
 def inputs(node: dag.Node) -> Callable[[Any], list[str]]:
-    """Return a function from a rule's wildcards to the stamps that its job waits for."""
+    """Return a function from a rule's wildcards to the stamps that its job depends on."""
 
     def of(wildcards: Any) -> list[str]:
         return _job(wildcards.home, _id(node, wildcards))["after"]
@@ -103,7 +104,7 @@ def memory_mb(node: dag.Node) -> Callable[..., int]:
 
 
 def runtime_min(node: dag.Node) -> Callable[..., int]:
-    """Return a function from wildcards and attempt to the time that the job is granted, minutes."""
+    """Return a function from wildcards and attempt to the time limit of the job, minutes."""
 
     def of(wildcards: Any, attempt: int) -> int:
         seconds = RUNTIME_FACTOR * node.seconds_per_frame * _frames(wildcards.home, _id(node, wildcards))
@@ -118,13 +119,13 @@ def _id(node: dag.Node, wildcards: Any) -> str:
 
 def _job(home: str, id: str) -> dict[str, Any]:
     if (home, id) not in _known:
-        _known[home, id] = jobs.planned(jobs.Home.parse(home), id)
+        _known[home, id] = jobs.read_job(jobs.Home.parse(home), id)
     return _known[home, id]
 
 
 @functools.cache
 def _frames(home: str, id: str) -> int:
-    """Return how many frames the recordings hold that a job reads, as far as they have been extracted."""
+    """Return the number of frames that a job reads; estimated for recordings not extracted yet."""
     folders = [each["path"] for each in _job(home, id)["inputs"] if each["name"].startswith("frames/")]
     return sum(map(_frames_in, folders)) or FRAMES_UNKNOWN
 

@@ -1,6 +1,6 @@
-"""What there is to make: the declaration expanded for one agent's recordings, job by job.
+"""The jobs of a build: the DAG expanded for one agent's recordings.
 
-Standard library only, nothing is written here: `plan` writes it down, `run` does the jobs.
+Standard library only, without side effects: `plan` writes the jobs, `run` runs them.
 """
 
 import functools
@@ -21,12 +21,12 @@ from pipeline.workflow.recipes import HOMES, NAME, NAME_RULE, Trial
 
 @dataclass(frozen=True)
 class Home:
-    """Where artifacts stand: an agent's own folder, one of its variants', or one of its several animals'."""
+    """Where artifacts are stored: the folder of an agent, a variant, or one of several animals."""
 
     agent: str
     variant: str | None = None
     tables: bool = False
-    """A plan of its own, for `make behavior-tables`, whose artifacts stand among the agent's."""
+    """A separate plan for `make behavior-tables`, whose artifacts are in the agent's folder."""
     animal: str | None = None
 
     @classmethod
@@ -49,12 +49,12 @@ class Home:
 
     @functools.cached_property
     def folder(self) -> Path:
-        """Return where its artifacts stand."""
+        """Return the folder of its artifacts."""
         return Path("build", str(self).removesuffix("/tables"))
 
     @property
     def plan(self) -> Path:
-        """Return where its plan stands."""
+        """Return the folder of its plan."""
         return Path("build", str(self), "plan")
 
     @functools.cached_property
@@ -70,12 +70,12 @@ class Input:
     name: str
     path: str
     part: str | None
-    """Prefix of the files that count, where it is not the whole artifact."""
+    """Subfolder that is read; None: the whole artifact."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One artifact to make, with all that `run` needs to know."""
+    """One artifact to make, with everything that `run` needs."""
 
     id: str
     artifact: str
@@ -86,7 +86,7 @@ class Job:
     out: str
     inputs: tuple[Input, ...]
     keys: tuple[str, ...]
-    """Files that, with the inputs, decide the result."""
+    """Files that determine the result together with the inputs."""
     arguments: tuple[str, ...]
     threads: int
     gpu: int
@@ -97,11 +97,11 @@ class Job:
 
     @property
     def stamp(self) -> str:
-        """Return the file that Make looks at."""
+        """Return the stamp file, Make's target."""
         return f"{self.out}/{artifact.STAMP}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as plain JSON types, with its stamp."""
+        """Return the job as plain JSON types, with its stamp."""
         return {**vars(self), "inputs": [vars(each) for each in self.inputs], "stamp": self.stamp}
 
 
@@ -112,21 +112,21 @@ class Plan:
     home: Home
     videos: tuple[Video, ...]
     builtin: bool
-    """Whether there are no recordings and the built-in capture stands in."""
+    """Whether the built-in capture replaces missing recordings."""
     tables: dict[str, dict[str, Any]]
     """Per artifact: its stage's table, with the variant's changes."""
     touched: frozenset[str]
-    """Artifacts that the variant makes anew; all of them for an agent itself."""
+    """Artifacts that the variant makes itself; for an agent, all."""
     flow: Flow = "recordings"
     trials: tuple[Trial, ...] = ()
     animals: tuple["Plan", ...] = ()
-    """Of a home of several animals: each one's plan, with its own turnaround alone."""
+    """Plan of each animal in a home of several, each with its own turnaround only."""
     others: tuple[str, ...] = ()
-    """Of one animal's plan: the names of the others; of a home of several: of all."""
+    """Names of the other animals in an animal's plan, of all animals in the plan of a home of several."""
 
     @property
     def nodes(self) -> tuple[Node, ...]:
-        """Return what is to be made, in flow order; in a home of several animals what they share."""
+        """Return the nodes to make, in flow order; in a home of several animals the shared ones."""
         several = bool(self.animals or self.home.animal)
         found = dag.nodes_of(self.flow, trials=self.home.tables, several=several)
         found = tuple(node for node in found if self.builtin or node.artifact not in dag.BUILTIN.values())
@@ -137,12 +137,12 @@ class Plan:
         return found
 
     def home_of(self, name: str) -> Home:
-        """Return where the artifact `name` stands."""
+        """Return the home of the artifact `name`."""
         return self.home if name in self.touched else self.home.base
 
 
 def of_animal() -> frozenset[str]:
-    """Return the artifacts that each of several animals has of its own: the first, and all made from it."""
+    """Return the artifacts made per animal in a home of several: the first such node and all downstream."""
     found: set[str] = set()
     for node in dag.FLOW:
         needs = [need.artifact for need in dag.needs_of(node) if not need.others]
@@ -152,9 +152,9 @@ def of_animal() -> frozenset[str]:
 
 
 def touched_by(tables: Mapping[str, Any], changed: Mapping[str, Any], mapped: bool) -> frozenset[str]:
-    """Return what an overlay changes: the artifacts with another table, and all that is made from them.
+    """Return the artifacts that an overlay changes: those with another table, and everything downstream.
 
-    Of ``mapped`` recordings also what their artifacts stand in for, so that both lie in one home.
+    With ``mapped`` recordings also the artifacts that these replace, so that both are in one home.
     """
     found: set[str] = set()
     for _ in range(2 if mapped else 1):
@@ -168,7 +168,7 @@ def touched_by(tables: Mapping[str, Any], changed: Mapping[str, Any], mapped: bo
 
 
 def with_animals(plan: Plan) -> Plan:
-    """Add a plan per animal where there are several."""
+    """Add a plan per animal if there are several."""
     names = [video.animal for video in plan.videos if video.animal]
     if names and plan.home != plan.home.base:
         what = f"{plan.home.agent} is a home of several animals, of which there are no variants and tables"
@@ -188,7 +188,7 @@ def with_animals(plan: Plan) -> Plan:
 
 
 def jobs(plan: Plan) -> list[Job]:
-    """Expand the declaration for the plan's recordings and trials, in flow order."""
+    """Expand the DAG for the plan's recordings and trials, in flow order."""
 
     def parts(node: Node) -> list[Video | Trial | None]:
         if node.trials == "each":
@@ -204,23 +204,23 @@ def jobs(plan: Plan) -> list[Job]:
     return shared + [job for each in plan.animals for job in jobs(each) if job.home == str(each.home)]
 
 
-def followed(all_jobs: Sequence[Job]) -> dict[str, list[str]]:
-    """Return per stamp the stamps that an engine waits for: of its inputs those that no other input has.
+def direct_dependencies(all_jobs: Sequence[Job]) -> dict[str, list[str]]:
+    """Return the direct dependencies of each stamp, without those that another input implies.
 
-    An input of an input is older anyway; thousands of recordings have tens of thousands of such inputs.
+    This transitive reduction saves tens of thousands of edges for thousands of recordings.
     """
     inputs = {job.stamp: dict.fromkeys(f"{i.path}/{artifact.STAMP}" for i in job.inputs) for job in all_jobs}
     found = {}
     for stamp, mine in inputs.items():
         implied: set[str] = set()
         for theirs in (inputs.get(each, {}) for each in mine):
-            implied |= mine.keys() & theirs.keys()  # as fast as the shorter of both
+            implied |= mine.keys() & theirs.keys()  # linear in the smaller of the two
         found[stamp] = [each for each in mine if each not in implied]
     return found
 
 
 def deciding_videos(plan: Plan, node: Node) -> list[Video]:
-    """Return the recordings whose set and split decide the result of a node that is one job for all."""
+    """Return the recordings whose set and split affect the result of a node with a single job."""
     if node.roles:
         return []
     deciding = {(role, split) for role in node.role_dependencies for split in SPLITS}
@@ -230,14 +230,14 @@ def deciding_videos(plan: Plan, node: Node) -> list[Video]:
     return [video for video in plan.videos if (video.role, video.split) in deciding]
 
 
-def listing(home: Home) -> Path:
-    """Return the file that holds the jobs of a plan, one per line."""
+def jobs_file(home: Home) -> Path:
+    """Return the file with the jobs of a plan, one per line."""
     return home.plan / "dag.json"
 
 
-def planned(home: Home, job_id: str) -> dict[str, Any]:
-    """Return a planned job: of thousands its line alone is read. Raises RUN-001."""
-    path = listing(home)
+def read_job(home: Home, job_id: str) -> dict[str, Any]:
+    """Read a planned job, parsing only its line of thousands. Raises RUN-001."""
+    path = jobs_file(home)
     try:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
             start = text.find(f'\n{{"id": {json.dumps(job_id)},'.encode()) + 1
@@ -252,12 +252,12 @@ def planned(home: Home, job_id: str) -> dict[str, Any]:
 
 
 def redo_mark(home: str, job_id: str) -> Path:
-    """Return the file whose presence has `run` do a job although its key is unchanged."""
+    """Return the marker file that makes `run` repeat a job although its key is unchanged."""
     return Path("build", home, "plan", "redo", job_id)
 
 
 def lock_file(home: str, job_id: str) -> Path:
-    """Return the file whose kernel lock a runner holds while it does a job."""
+    """Return the lock file of a job, held by the runner."""
     return Path("build", home, "plan", "locks", job_id)
 
 
@@ -266,7 +266,7 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
     video = part if isinstance(part, Video) else None
     trial = part if isinstance(part, Trial) else None
     out = home.folder / node.artifact / (part.id if part else "")
-    inputs, arguments, deciding = _needed(plan, node, part)
+    inputs, arguments, deciding = _read_by(plan, node, part)
     named = f"{node.artifact}.{trial.id}" if trial else node.artifact
     arguments += ["--config", str(home.plan / f"configs/{named}.json"), "--out", str(out)]
     listed = (home if home.animal else home.base).plan / "videos.json"
@@ -302,8 +302,8 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
     )
 
 
-def _needed(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[Input], list[str], list[str]]:
-    """Return what a job reads, the options that name it, and ids of the recordings that decide its result."""
+def _read_by(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[Input], list[str], list[str]]:
+    """Return a job's inputs, the options for them, and the ids of the recordings that affect its result."""
     folder, video = Path("captures", plan.home.agent), part if isinstance(part, Video) else None
     inputs: list[Input] = []
     arguments: list[str] = []
@@ -336,7 +336,7 @@ def _needed(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[In
 
 
 def _inputs(plan: Plan, need: Need, node: Node, part: Video | Trial | None) -> Iterator[Input]:
-    """Yield the artifacts that one need of one job means."""
+    """Yield the artifacts that satisfy one need of a job."""
     source = dag.NODES[need.artifact]
     folder = plan.home_of(need.artifact).folder / need.artifact
     if need.others:

@@ -1,4 +1,4 @@
-"""The planner: recipe + recordings + declaration -> `build/<home>/plan/`, which engines and `run` read.
+"""The planner: recipe + recordings + DAG -> `build/<home>/plan/`, which engines and `run` read.
 
     python -SE -m pipeline.workflow.plan plan HOME...
     python -SE -m pipeline.workflow.plan redo HOME ARTIFACT        have one artifact made again
@@ -8,8 +8,8 @@
 
 HOME is an agent, <agent>/variants/<name>, or <agent>/tables; TAKEN are names that no animal may have.
 
-Every check of the user's input happens before anything is written. Where what decides an artifact has
-changed, its stamp is removed, so that an engine looks at it. Standard library only: it runs at every `make`.
+All user input is checked before anything is written. The stamp of an artifact is removed if its key has
+changed, so that an engine runs its job. Standard library only: the planner runs at every `make`.
 """
 
 import functools
@@ -28,20 +28,20 @@ from pipeline.workflow.jobs import (
     Job,
     Plan,
     deciding_videos,
-    followed,
+    direct_dependencies,
     jobs,
-    listing,
+    jobs_file,
     redo_mark,
     touched_by,
     with_animals,
 )
 
 CODE_CACHE = Path("build", "code-cache.json")
-"""What the planner read of the code, for all homes; lost, it only costs time."""
+"""Cache of the parsed source code, shared by all homes; safe to delete."""
 
 
 def read(home: Home, cache: sources.Cache) -> Plan:
-    """Check recipe and recordings and return the plan; changes nothing on disk."""
+    """Check recipe and recordings and return the plan, without writing anything."""
     recipe, where = recipes.read(Path("agents", f"{home.agent}.toml"))
     flow = recipes.flow(recipe.get(recipes.FLOW_TABLE, {}), where)
     overlay = {}
@@ -60,7 +60,7 @@ def read(home: Home, cache: sources.Cache) -> Plan:
         said = captures.remarks(folder, names, recipe.get(recipes.VIDEOS_TABLE, {}), where)
         hashes = {name: sources.recording_digest(folder / name, digest_of) for name in names}
     else:
-        captures.refuse_strangers(folder, flow)
+        captures.refuse_unknown_files(folder, flow)
         said = recipes.builtin_remarks(flow, recipe, where)
         hashes = dict.fromkeys(said)
     videos = captures.assign(said, _known_ids(home.base), hashes, str(folder) if names else where, flow)
@@ -75,7 +75,7 @@ def read(home: Home, cache: sources.Cache) -> Plan:
 
 
 def write(plan: Plan, cache: sources.Cache, code: sources.Cache) -> None:
-    """Write the plan's files, each only if it changed."""
+    """Write the plan's files that have changed."""
     all_jobs = jobs(plan)
     base = plan.home.base.plan
     ids = _known_ids(plan.home.base) | {video.file: video.id for video in plan.videos}
@@ -83,29 +83,29 @@ def write(plan: Plan, cache: sources.Cache, code: sources.Cache) -> None:
     _write(base / "videos.json", _json([asdict(video) for video in plan.videos]))
     for video in plan.videos:
         _write(base / f"keys/video.{video.id}.json", _json({"role": video.role, "sha256": video.sha256}))
-    for name, file in _further_files(plan):
-        digested = file / artifact.MANIFEST if file.is_dir() else file
-        digest = cache.get(digested, artifact.digest_of_file)
+    for name, file in _extra_files(plan):
+        hashed = file / artifact.MANIFEST if file.is_dir() else file
+        digest = cache.get(hashed, artifact.digest_of_file)
         _write(base / "keys" / name, _json({"sha256": digest}))
     for each in (plan, *plan.animals):
         for name, trial in {(job.artifact, job.trial) for job in all_jobs if job.home == str(each.home)}:
             _write_key(each, code, name, trial)
-    after, lines = followed(all_jobs), []
+    after, lines = direct_dependencies(all_jobs), []
     for number, job in enumerate(all_jobs, start=1):
         place = {"place": f"{number} of {len(all_jobs)}", "after": after[job.stamp]}
         lines.append((job.home, json.dumps(job.as_dict() | place)))
     for each in (plan, *plan.animals):
         homes = {home for home, _ in lines} if each is plan else {str(plan.home), str(each.home)}
-        its = ",\n".join(line for home, line in lines if home in homes)
-        _write(listing(each.home), f"[\n{its}\n]\n")
+        own_lines = ",\n".join(line for home, line in lines if home in homes)
+        _write(jobs_file(each.home), f"[\n{own_lines}\n]\n")
     for each in plan.animals:
         _write(each.home.plan / "videos.json", _json([asdict(video) for video in each.videos]))
     _write(plan.home.plan / "rules.mk", _rules(plan, all_jobs, after))
     stamps.remove_outdated(all_jobs)
 
 
-def _further_files(plan: Plan) -> Iterator[tuple[str, Path]]:
-    """Yield the user's further files that decide something, each with the name of its key file."""
+def _extra_files(plan: Plan) -> Iterator[tuple[str, Path]]:
+    """Yield the user's other files that affect results, each with the name of its key file."""
     agent = plan.home.agent
     for node in dag.FLOW:
         for file in captures.extra_inputs(agent, node.extra_inputs):
@@ -116,12 +116,12 @@ def _further_files(plan: Plan) -> Iterator[tuple[str, Path]]:
 
 
 def _write(path: Path, text: str) -> None:
-    """Write one of the plan's many files; the disk is flushed once, after all of them."""
+    """Write a file of the plan if it changed; the disk is flushed once, after all of them."""
     artifact.write_if_changed(path, text, sync=False)
 
 
 def _write_key(plan: Plan, code: sources.Cache, name: str, trial: str | None) -> None:
-    """Write the table of one artifact, or of one trial of it, and what decides it beside its inputs."""
+    """Write the configuration and the key file of an artifact, or of one trial of it."""
     node, table = dag.NODES[name], plan.tables[name]
     overlay = next((each.overlay for each in plan.trials if each.id == trial), {})
     if trial and dag.table_of(node) == recipes.TRIED_TABLE:
@@ -144,8 +144,8 @@ def _write_key(plan: Plan, code: sources.Cache, name: str, trial: str | None) ->
 
 
 def mark_redo(home: Home, name: str) -> None:
-    """Have the artifact `name` of `home` made again by the next build, although nothing changed."""
-    known = json.loads(listing(home).read_text())
+    """Mark the artifact `name` of `home` to be made again by the next build."""
+    known = json.loads(jobs_file(home).read_text())
     marked = [job for job in known if job["artifact"] == name]
     if not marked:
         raise InputError("REC-007", f"no artifact {name!r}", str(home), f"artifacts: {', '.join(dag.NODES)}")
@@ -155,14 +155,14 @@ def mark_redo(home: Home, name: str) -> None:
 
 
 def inputs(home: Home, names: Sequence[str], *, together: bool = False) -> str:
-    """Return `--name path` of finished artifacts, each where a variant or its agent has it.
+    """Return `--name path` of finished artifacts, from the variant or its agent.
 
     In a home of several animals ``together`` gives `--animals` instead. Raises REC-007, REC-008.
     """
     animals = [str(each.animal) for each in _animal_homes(home.base)]
     if home.animal and home.animal not in animals:
         raise InputError("REC-007", "no such animal", str(home), f"animals: {', '.join(animals) or 'one'}")
-    known = {job["artifact"]: Path(job["out"]) for job in json.loads(listing(home).read_text())}
+    known = {job["artifact"]: Path(job["out"]) for job in json.loads(jobs_file(home).read_text())}
     unknown = [name for name in names if name not in known]
     if unknown:
         remedy = f"artifacts: {', '.join(known)}"
@@ -181,7 +181,7 @@ def inputs(home: Home, names: Sequence[str], *, together: bool = False) -> str:
 
 
 def new_agent(name: str, taken: Sequence[str] = ()) -> None:
-    """Write the recipe and the capture folder of a new animal; an existing recipe stays as it is."""
+    """Create the recipe and the capture folder of a new animal; an existing recipe is kept."""
     home = Home.parse(name)
     if name in taken:
         raise InputError("REC-004", f"`make {name}` means something else already", remedy="take another name")
@@ -197,7 +197,7 @@ def new_agent(name: str, taken: Sequence[str] = ()) -> None:
 
 
 def _known_ids(base: Home) -> dict[str, str]:
-    """Return the ids handed out so far, by file name; a file that holds anything else counts as lost."""
+    """Return the ids assigned so far by file name; none if the file is missing or invalid."""
     try:
         known = json.loads((base.plan / "ids.json").read_text())
     except (FileNotFoundError, ValueError):
@@ -208,7 +208,7 @@ def _known_ids(base: Home) -> dict[str, str]:
 
 
 def _rules(plan: Plan, all_jobs: list[Job], after: Mapping[str, Sequence[str]]) -> str:
-    """Return the Make rules: one stamp per job, one target per artifact, and the agent's own."""
+    """Return the Make rules: a stamp per job, a target per artifact, and one for the agent."""
     name, home = plan.home.agent, plan.home
     lines = ["# written by pipeline/workflow/plan.py"]
     stamped: dict[str, list[str]] = {}
@@ -239,25 +239,25 @@ def _json(value: Any) -> str:
     return json.dumps(value, indent=1, sort_keys=True) + "\n"
 
 
-def _read_before(path: Path) -> dict[str, Any]:
-    """Return what earlier runs of the planner read; lost, it only costs time."""
+def _load_cache(path: Path) -> dict[str, Any]:
+    """Return the cache of earlier runs of the planner; empty if it is missing or invalid."""
     try:
         known = json.loads(path.read_text())
     except (FileNotFoundError, ValueError):
         return {}
-    return known if sources.fits(known) else {}
+    return known if sources.is_valid_cache(known) else {}
 
 
-def _read_marks(home: Home, code: sources.Cache) -> str:
-    """Hash name, size and time of all that a plan is made from."""
+def _input_fingerprint(home: Home, code: sources.Cache) -> str:
+    """Hash names, sizes and times of all files that a plan depends on."""
     recipe = Path("agents", f"{home.agent}.toml")
-    own = [sources.mark(recipe)] if recipe.is_file() else []
+    own = [sources.stat_fingerprint(recipe)] if recipe.is_file() else []
     folders = ("agents/variants", f"captures/{home.agent}")
-    return artifact.digest_of([code.marks, own, *map(sources.marks, folders)])
+    return artifact.digest_of([code.fingerprint, own, *map(sources.folder_fingerprint, folders)])
 
 
-def _written_marks(home: Home) -> str:
-    """Hash the times of a plan's files; of the folders with a file per job or key, their own."""
+def _output_fingerprint(home: Home) -> str:
+    """Hash the modification times of a plan's files, and of its folders with a file per job or key."""
     found = []
     animals = (each.plan for each in _animal_homes(home.base))
     for plan in dict.fromkeys((home.base.plan, home.plan, *animals)):
@@ -268,46 +268,46 @@ def _written_marks(home: Home) -> str:
 
 
 def _animal_homes(base: Home) -> list[Home]:
-    """Return the homes of the animals for which something was planned before."""
+    """Return the homes of the animals planned before."""
     found = sorted((base.folder / "animals").glob("*/plan"))
     return [replace(base, animal=path.parent.name) for path in found]
 
 
 def _plan(home: Home, code: sources.Cache) -> None:
-    """Plan `home`, and its agent, unless nothing that a plan is made from has changed."""
+    """Plan `home` and its agent, unless nothing that a plan depends on has changed."""
     home = home.base if home.animal else home
     for each in dict.fromkeys((home.base, home, *_animal_homes(home.base))):
         stamps.remove_impossible(each)
-    read_marks, state = _read_marks(home, code), home.plan / "state.json"
+    fingerprint, state = _input_fingerprint(home, code), home.plan / "state.json"
     try:
         before = json.loads(state.read_text())
-        if before["read"] == read_marks and before["written"] == _written_marks(home):
+        if before["read"] == fingerprint and before["written"] == _output_fingerprint(home):
             print(*before["messages"], sep="\n", end="\n" if before["messages"] else "")
             return
     except (FileNotFoundError, ValueError, KeyError, TypeError):
         pass
-    code.known = code.known or _read_before(CODE_CACHE)
-    cache = sources.Cache(_read_before(home.plan / "cache.json"))
+    code.known = code.known or _load_cache(CODE_CACHE)
+    cache = sources.Cache(_load_cache(home.plan / "cache.json"))
     planned = [read(each, cache) for each in dict.fromkeys((home.base, home))]
-    with artifact.held(home.base.folder / "plan.lock"):
+    with artifact.locked(home.base.folder / "plan.lock"):
         for plan in planned:
             write(plan, cache, code)
         _write(home.plan / "cache.json", json.dumps(cache.fresh, sort_keys=True))
         artifact.sync_disk(home.plan)
         messages = _messages(planned[0], home)
         print(*messages, sep="\n", end="\n" if messages else "", flush=True)
-        done = {"read": read_marks, "written": _written_marks(home), "messages": messages}
+        done = {"read": fingerprint, "written": _output_fingerprint(home), "messages": messages}
         artifact.write_if_changed(state, _json(done))
 
 
 def _messages(plan: Plan, home: Home) -> list[str]:
-    """Return what the user should know of the recordings."""
+    """Return messages to the user about the recordings."""
     folder = Path("captures", home.agent)
     if plan.builtin:
         return [f"[{home}] nothing in {folder}/: building from the built-in synthetic capture"]
-    strangers = captures.not_understood(folder, plan.flow)
+    unknown = captures.unknown_files(folder, plan.flow)
     unused = [v.file for v in plan.videos if v.role == "heldout" and v.synchronized_with is None]
-    named = (captures.named(folder / stranger, plan.flow) for stranger in strangers)
+    named = (captures.named(folder / name, plan.flow) for name in unknown)
     clock = "measures nothing until the recipe's [videos] sets its synchronized_with"
     return [
         *(f"[{home}] not a recording, left alone: {name}" for name in named),
@@ -319,12 +319,13 @@ def main(arguments: list[str]) -> int:
     """Run the command line of the planner; returns its exit code."""
     match arguments:
         case ["plan", *homes] if homes:
-            marks = [sources.marks(f"{sources.CODE}/{folder}") for folder in ("pipeline", "stages")]
-            code = sources.Cache(marks=artifact.digest_of(marks))
+            folders = (f"{sources.CODE}/{name}" for name in ("pipeline", "stages"))
+            fingerprint = artifact.digest_of([sources.folder_fingerprint(folder) for folder in folders])
+            code = sources.Cache(fingerprint=fingerprint)
             for home in map(Home.parse, homes):
                 _plan(home, code)
             if code.fresh:
-                with artifact.held(CODE_CACHE.with_suffix(".lock")):
+                with artifact.locked(CODE_CACHE.with_suffix(".lock")):
                     _write(CODE_CACHE, json.dumps(code.fresh, sort_keys=True))
         case ["redo", home, name]:
             mark_redo(Home.parse(home), name)

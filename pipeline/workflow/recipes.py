@@ -1,7 +1,7 @@
-"""The recipe of an agent and the overlays of its variants: which tables and keys there may be.
+"""The recipe of an agent and the overlays of its variants, checked against the known tables and keys.
 
-`read` refuses what no stage knows; `flow`, `builtin_remarks` and `trials` draw from it what the planner must
-know before any stage runs. Standard library only.
+`read` refuses unknown tables and keys; `flow`, `builtin_remarks` and `trials` return what the planner needs
+before any stage runs. Standard library only.
 """
 
 import re
@@ -23,7 +23,7 @@ HOMES = "homes"
 BASE = "base"
 """The key at the top of a variant that names the variant whose keys it starts from."""
 OURS = "ats"
-"""The method that all others of the tables are compared with."""
+"""The method that all others in the tables are compared with."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Trial:
     id: str
     """`<method>-<seed>`."""
     overlay: dict[str, Any]
-    """Keys of the trained stage's table that differ."""
+    """Changed keys of the trained stage's table."""
 
 
 def read(path: Path) -> tuple[dict[str, Any], str]:
@@ -55,7 +55,7 @@ def read(path: Path) -> tuple[dict[str, Any], str]:
 
 
 def _base(name: object, path: Path) -> dict[str, Any]:
-    """Return the keys of the variant that the one at `path` starts from, which has no base itself."""
+    """Return the keys of the base of the variant at `path`; a base has no base itself."""
     other = path.with_name(f"{name}.toml")
     if not isinstance(name, str) or not other.is_file() or BASE in config.read_table(other):
         others = path.parent.glob("*.toml")
@@ -66,7 +66,7 @@ def _base(name: object, path: Path) -> dict[str, Any]:
 
 
 def _checked(recipe: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return a recipe in which every table and key is known and every value possible."""
+    """Return a recipe after checking that all tables and keys are known and all values possible."""
     stages = {dag.table_of(node): node for node in reversed(dag.FLOW)}
     config.refuse_unknown(recipe, {*stages, VIDEOS_TABLE, FLOW_TABLE}, where=str(path), kind="table")
     for name, table in recipe.items():
@@ -85,7 +85,7 @@ def _checked(recipe: dict[str, Any], path: Path) -> dict[str, Any]:
 
 
 def _remarks(recording: str, table: Any, where: str) -> captures.Remarks:
-    """Return what is said of a recording. Raises REC-001 and REC-002 for unknown keys and wrong types."""
+    """Return the remarks on a recording. Raises REC-001 and REC-002 for unknown keys and wrong types."""
     if not isinstance(table, dict):
         what = f"{recording!r}: {config.shown(table)} is no table"
         raise InputError("REC-002", what, where, f"write [{VIDEOS_TABLE}.{recording!r}]")
@@ -93,7 +93,7 @@ def _remarks(recording: str, table: Any, where: str) -> captures.Remarks:
 
 
 def flow(table: Mapping[str, Any], where: str) -> Flow:
-    """Return where the agent's flow begins, as the recipe's `[flow]` says."""
+    """Return what the agent's flow starts from, by the recipe's `[flow]`."""
     config.refuse_unknown(table, ("begins_at",), where=f"{where}: [flow]")
     begins = table.get("begins_at", "recordings")
     if not isinstance(begins, str) or begins not in dag.BUILTIN:
@@ -103,7 +103,7 @@ def flow(table: Mapping[str, Any], where: str) -> Flow:
 
 
 def refuse_homes(agent: str, table: Mapping[str, Any], where: str) -> None:
-    """Raise REC-002 for `homes` that are no other builds, ART-003 for builds that are not there yet."""
+    """Raise REC-002 for `homes` that do not name other builds, ART-003 for builds that do not exist yet."""
     for name in table.get(HOMES, ()):
         if not NAME.match(name) or name == agent:
             what = f"{HOMES}: {name!r} is no other build"
@@ -113,7 +113,7 @@ def refuse_homes(agent: str, table: Mapping[str, Any], where: str) -> None:
 
 
 def trials(table: Mapping[str, Any]) -> Iterator[Trial]:
-    """Yield every trained method of the tables with every seed; a method is a variant of that name."""
+    """Yield every trained method of the tables with every seed; a method is the variant of that name."""
     settings = {**_defaults(TABLES_STAGE), **table}
     count, methods = _count(settings, "seeds", TABLES_STAGE), settings.get("methods", ())
     if not isinstance(methods, list | tuple) or not all(isinstance(method, str) for method in methods):
@@ -137,7 +137,7 @@ def trial_ids(methods: Sequence[str], seeds: int) -> tuple[str, ...]:
 
 
 def merged(table: Mapping[str, Any], overlay: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the table with the overlay's keys, table by table where tables lie in it."""
+    """Return the table with the overlay's keys, merging nested tables recursively."""
     inner = {
         key: merged(table[key], value)
         for key, value in overlay.items()
@@ -147,7 +147,7 @@ def merged(table: Mapping[str, Any], overlay: Mapping[str, Any]) -> dict[str, An
 
 
 def builtin_remarks(begins: Flow, recipe: Mapping[str, Any], where: str) -> dict[str, captures.Remarks]:
-    """Return the built-in capture's recordings; an override may change them as it may a user's."""
+    """Return the remarks on the built-in recordings, with overrides as for a user's recordings."""
     node, overrides = dag.NODES[dag.BUILTIN[begins]], recipe.get(VIDEOS_TABLE, {})
     settings = {**_defaults(node.stage), **recipe.get(dag.table_of(node), {})}
     if begins == "recordings":

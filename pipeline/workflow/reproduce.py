@@ -1,10 +1,11 @@
-"""Build again from a report's crate, and name what differs first. `make reproduce CRATE=path` calls both:
+"""Rebuild from a report's crate and name the first difference. `make reproduce CRATE=path` calls both:
 
     python -SE -m pipeline.workflow.reproduce begin CRATE             recipe, recordings of `again_<hash>`
     python -SE -m pipeline.workflow.reproduce compare CRATE AGENT     exit 1 where something differs
 
-Recordings are found by hash among the captures here, clicks, prompts and a former reconstruction beside them.
-Same code, environment and CPU: equal bit for bit; else metrics that moved are listed. Standard library only.
+Recordings are found by hash in the local captures; clicks, prompts and a former reconstruction beside them.
+With the same code, environment and CPU results are bit-identical; else changed metrics are listed. Standard
+library only.
 """
 
 import glob
@@ -25,7 +26,7 @@ from pipeline.workflow.sources import recording_digest
 
 FILE = "ro-crate-metadata.json"
 SHOWN_METRICS = 20
-"""Of those that moved, the ones that moved most."""
+"""Number of changed metrics to list, the most changed ones."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +34,9 @@ class Crate:
     """A build as its report describes it."""
 
     recordings: tuple[Video, ...]
-    """their `sha256` is None for the built-in capture"""
+    """`sha256` is None for the built-in capture"""
     artifacts: dict[str, artifact.Manifest]
-    """by name, `masks/v002`, in flow order; without their files"""
+    """by name such as `masks/v002`, in flow order; without their files"""
     metrics: dict[str, float | None]
 
 
@@ -73,7 +74,7 @@ def begin(crate: Crate, agents: Path, captured: Path, builds: Path) -> str:
     if missing := [video.file for video, digest in wanted.items() if digest not in known]:
         remedy = "put the recordings with these hashes into captures/<any agent>/"
         raise InputError("CRT-002", "recordings of the crate are not here", ", ".join(missing), remedy)
-    # Names of a crate, which may hide or say anything, make no paths; ids do.
+    # A crate is untrusted and may hide names: build paths from ids instead.
     files = {video.id: f"{video.id}{known[digest].suffix}" for video, digest in wanted.items()}
     said = {}
     for video, digest in wanted.items():
@@ -89,7 +90,7 @@ def begin(crate: Crate, agents: Path, captured: Path, builds: Path) -> str:
 
 
 def _link(path: Path, file: str, links: Path) -> None:
-    """Link a recording, under the name `file`, and what beside it decides results."""
+    """Link a recording under the name `file`, and the files beside it that affect results."""
     wanted = {extra: path.with_name(extra) for node in dag.FLOW for extra in node.extra_inputs} | {file: path}
     for sidecar in path.parent.glob(f"{glob.escape(path.name)}.*{captures.SIDECAR}"):
         wanted[file + sidecar.name.removeprefix(path.name)] = sidecar
@@ -101,7 +102,7 @@ def _link(path: Path, file: str, links: Path) -> None:
 
 
 def recipe(crate: Crate) -> str:
-    """Return the settings of all artifacts as a recipe; the plan sets what differs between recordings."""
+    """Return the settings of all artifacts as a recipe, without those that the plan sets per recording."""
     tables: dict[str, dict[str, Any]] = {}
     for name, each in crate.artifacts.items():
         node = dag.NODES.get(name.partition("/")[0])
@@ -115,13 +116,13 @@ def recipe(crate: Crate) -> str:
 
 
 def differing(crate: Crate, build: Path) -> list[str]:
-    """Return the names of artifacts whose bytes are not the crate's, or that are missing, in flow order."""
+    """Return the names of artifacts that are missing or differ from the crate's, in flow order."""
     contents = {name: artifact.content_of(artifact.digests(build / name)) for name in crate.artifacts}
     return [name for name, each in crate.artifacts.items() if each.content != contents[name]]
 
 
 def compare(crate: Crate, build: Path) -> Iterator[str]:
-    """Yield what differs: the first artifact, its versions and settings, then the metrics that moved most."""
+    """Yield the differences: the first artifact, its versions and settings, then the most changed metrics."""
     wrong = differing(crate, build)
     if not wrong:
         return
@@ -154,7 +155,7 @@ def _properties(rows: list[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _toml(table: Mapping[str, Any], path: list[str]) -> str:
-    """Write a table and those within it; what is None keeps its default."""
+    """Return a table and its nested tables as TOML; None keeps the default."""
     inner = [_toml(value, [*path, key]) for key, value in table.items() if isinstance(value, Mapping)]
     plain = {key: value for key, value in table.items() if not isinstance(value, Mapping | None)}
     lines = [

@@ -1,8 +1,8 @@
-"""The runner, which engines call: do one job so that its artifact is complete or absent.
+"""The runner, called by engines: run one job so that its artifact is complete or absent.
 
     python -SE -m pipeline.workflow.run [OPTIONS] HOME JOB      for example `toy masks.v002`
 
-lock -> key -> unchanged? stamp -> clean up after the dead -> run the stage program, which publishes
+lock -> remove leftovers of killed runs -> key -> unchanged? stamp -> run the stage program, which publishes
 atomically -> record -> stamp -> key changed meanwhile? once more. Exit codes: the stage's own (2 bad input,
 75 stopped but resumable, 76 diverged), 128 + n when signal n ended it. --processes: as many per machine fit
 one model together (torchrun); across machines --launcher starts torchrun on each, for example
@@ -34,15 +34,15 @@ from pipeline.core.errors import InputError, exit_code, printable
 from pipeline.workflow import artifact, jobs, sources, stamps
 
 MIN_FREE_BYTES = 1 << 29
-"""A stage does not begin on a disk with less than this free."""
+"""Free disk space below which no stage is started."""
 LONGEST_S = 7 * 24 * 3600
-"""A stage that takes longer hangs."""
+"""Time limit of a stage: one that takes longer hangs."""
 GRACE_S = 30
-"""Time that a stage gets to save itself after SIGTERM."""
+"""Time that a stage has to save a checkpoint after SIGTERM."""
 FINAL_CODES = (2, 76)
-"""Bad input and divergence: they end the same way again as long as the key is the same."""
+"""Bad input and divergence: deterministic failures as long as the key is the same."""
 LOGS_KEPT = 9
-"""Logs of one job that are kept, the latest ones."""
+"""Number of latest logs kept per job."""
 EXPLAINED = {
     75: "stopped after saving; run the same again to go on",
     76: "training diverged; its diagnosis stands above",
@@ -53,30 +53,30 @@ EXPLAINED = {
 
 @dataclass(frozen=True)
 class Engine:
-    """How the caller wants a job to be run."""
+    """How the caller runs a job."""
 
     processes: int = 1
-    """Per machine, for what several can do together."""
+    """Per machine, for distributed stages."""
     launcher: tuple[str, ...] = ()
-    """Starts a command on every machine."""
+    """Command that starts another one on every machine."""
     attempt: int = 1
 
 
 def run(home: str, job_id: str, engine: Engine = Engine()) -> int:
-    """Do the job if anything that decides its artifact has changed; return the exit code."""
+    """Run the job if the key of its artifact has changed; return the exit code."""
     while (code := _run(home, job_id, engine)) is None:
-        _say(job_id, "what decides it changed meanwhile: looking at it again")
+        _say(job_id, "its key changed meanwhile: checking it again")
     return code
 
 
 def _run(home: str, job_id: str, engine: Engine) -> int | None:
-    """Do it once; None where its key changed while it was done, so that it has no stamp."""
-    job = jobs.planned(jobs.Home.parse(home), job_id)
+    """Run it once; None if its key changed while it ran, so that it has no stamp."""
+    job = jobs.read_job(jobs.Home.parse(home), job_id)
     out, stamp = Path(job["out"]), Path(job["stamp"])
     resume = Path("build", job["home"], "resume", job_id)
     redo = jobs.redo_mark(job["home"], job_id)
     waiting = f"[{job_id}] is being made by another build; waiting for it"
-    with artifact.held(jobs.lock_file(job["home"], job_id), waiting):
+    with artifact.locked(jobs.lock_file(job["home"], job_id), waiting):
         artifact.clean(out, _record(job), _failure(job))
         key = _key(job)
         made = artifact.read_manifest(out)
@@ -93,7 +93,7 @@ def _run(home: str, job_id: str, engine: Engine) -> int | None:
         _failure(job).unlink(missing_ok=True)
         redo.unlink(missing_ok=True)
         stamps.put(stamp, job["keys"])
-        if _key_now(home, job_id) != key:  # looked at after the stamp: a planner looks at stamps after keys
+        if _key_now(home, job_id) != key:  # after the stamp: a planner reads stamps after keys
             stamp.unlink(missing_ok=True)
             return None
         shutil.rmtree(resume, ignore_errors=True)
@@ -101,9 +101,9 @@ def _run(home: str, job_id: str, engine: Engine) -> int | None:
 
 
 def _key_now(home: str, job_id: str) -> str | None:
-    """Return the key of a job as its plan and inputs stand now; None where they are broken."""
+    """Return the key of a job by its current plan and inputs; None if they are invalid."""
     try:
-        return _key(jobs.planned(jobs.Home.parse(home), job_id))
+        return _key(jobs.read_job(jobs.Home.parse(home), job_id))
     except (InputError, FileNotFoundError):
         return None
 
@@ -117,7 +117,7 @@ def _failure(job: dict[str, Any]) -> Path:
 
 
 def _failed_before(job: dict[str, Any], key: str) -> int:
-    """Return the exit code with which the job failed last, if it would fail in the same way again; else 0."""
+    """Return the exit code of the job's last failure if it is deterministic and the key the same, else 0."""
     try:
         last = json.loads(_failure(job).read_text())
     except (FileNotFoundError, ValueError, RecursionError):
@@ -126,7 +126,7 @@ def _failed_before(job: dict[str, Any], key: str) -> int:
 
 
 def _key(job: dict[str, Any]) -> str:
-    """Hash all that decides the artifact: stage, code, table, recordings, and the content of every input."""
+    """Hash what determines the artifact: stage, code, table, recordings, and the content of every input."""
     contents = {}
     for entry in job["inputs"]:
         manifest = artifact.opened(Path(entry["path"]), entry["name"])
@@ -139,7 +139,7 @@ def _key(job: dict[str, Any]) -> str:
 
 
 def _other_key(resume: Path, key: str) -> bool:
-    """Return whether checkpoints, if any, belong to another key; they must never be gone on from."""
+    """Return whether checkpoints, if any, belong to another key; those must never be resumed."""
     try:
         return (resume / "key").read_text() != key
     except FileNotFoundError:
@@ -147,7 +147,7 @@ def _other_key(resume: Path, key: str) -> bool:
 
 
 def _do(job: dict[str, Any], key: str, resume: Path, engine: Engine) -> int:
-    """Run the stage program and, if its artifact stands, record how it went."""
+    """Run the stage program with its arguments and log; return its exit code."""
     if not sources.CODE.joinpath("stages", *job["stage"].split("."), "__main__.py").is_file():
         what = f"there is no stage program {job['stage']!r}"
         raise InputError("RUN-002", what, "stages/", "this build is incomplete")
@@ -165,7 +165,7 @@ def _do(job: dict[str, Any], key: str, resume: Path, engine: Engine) -> int:
 
 
 def _publish(job: dict[str, Any], key: str, command: list[str], log: TextIO) -> int:
-    """Run the stage program to its end and write the record of its artifact."""
+    """Run the stage program and, if it succeeds, write the record of its artifact."""
     _say(job["id"], f"begins ({job['place']})", log)
     out, start = Path(job["out"]), time.time()
     code, usage = _spawn(job, command, log)
@@ -197,17 +197,17 @@ def _write_json(path: Path, value: dict[str, Any]) -> None:
 
 
 def _python(job: dict[str, Any], engine: Engine) -> list[str]:
-    """Return the command that runs a module: Python, or torchrun where several processes work together."""
+    """Return the command that runs a module: Python, or torchrun for several processes."""
     across = any(name in os.environ for name in ("PET_NNODES", "PET_RDZV_ENDPOINT"))
     if not job["distributed"] or not (engine.processes > 1 or across):
         return [sys.executable, "-m"]
-    meeting = [] if across else ["--standalone"]
-    torchrun = ["torch.distributed.run", *meeting, f"--nproc-per-node={engine.processes}", "-m"]
+    rendezvous = [] if across else ["--standalone"]
+    torchrun = ["torch.distributed.run", *rendezvous, f"--nproc-per-node={engine.processes}", "-m"]
     return [*engine.launcher, sys.executable, "-m", *torchrun]
 
 
 def _log(job: dict[str, Any]) -> Path:
-    """Return the next log file of a job; all but the latest `LOGS_KEPT` are removed."""
+    """Return the path of the job's next log and remove all but the latest `LOGS_KEPT`."""
     folder = Path("build", job["home"], "logs")
     folder.mkdir(parents=True, exist_ok=True)
     logs = folder.glob(f"{job['id']}.*.log")
@@ -219,7 +219,7 @@ def _log(job: dict[str, Any]) -> Path:
 
 
 def _report_damage(job: dict[str, Any], log: TextIO) -> None:
-    """Report which inputs are not what was written, for which alone a stage may have failed."""
+    """Report inputs that fail their checksum: a stage may have failed because of them."""
     for folder in (Path(entry["path"]) for entry in job["inputs"]):
         if changed := artifact.damaged(folder):
             what, remedy = "has been damaged, changed or deleted", f"rm -r {folder}, and run the same again"
@@ -229,7 +229,7 @@ def _report_damage(job: dict[str, Any], log: TextIO) -> None:
 
 
 def _spawn(job: dict[str, Any], command: list[str], log: TextIO) -> tuple[int, struct_rusage]:
-    """Run `command` with its output forwarded line by line, and logged; return exit code and usage."""
+    """Run `command`, forwarding and logging its output by line; return exit code and resource usage."""
     child = subprocess.Popen(
         command,
         env=_environment(job["threads"]),
@@ -242,11 +242,11 @@ def _spawn(job: dict[str, Any], command: list[str], log: TextIO) -> tuple[int, s
     def stop(number: int, frame: FrameType | None) -> None:
         child.terminate()
         killer = threading.Timer(GRACE_S, child.kill)
-        killer.daemon = True  # a stage that ends in time is not waited for any longer
+        killer.daemon = True  # does not delay the exit of a stage that ends in time
         killer.start()
 
     old = {signal.SIGTERM: signal.signal(signal.SIGTERM, stop)}
-    # The child has its own SIGINT; what it saves is waited for.
+    # The child gets SIGINT itself; wait for it to save.
     old[signal.SIGINT] = signal.signal(signal.SIGINT, signal.SIG_IGN)
     reader = threading.Thread(target=_forward, args=(job["id"], child.stdout, log), daemon=True)
     reader.start()
@@ -266,13 +266,13 @@ def _spawn(job: dict[str, Any], command: list[str], log: TextIO) -> tuple[int, s
 
 
 def _bind_to_parent() -> None:
-    """In the child: die with the runner, leave no core dump."""
+    """In the child: die with the runner, write no core dump."""
     processes.die_with_parent()
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 def _environment(threads: int) -> dict[str, str]:
-    """Return a stage's environment: fixed hashing, threads as declared, no spinning, bounded decoders."""
+    """Return a stage's environment: fixed hash seed, declared threads, no busy waiting, bounded decoders."""
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
     return {
         **os.environ,
@@ -298,16 +298,16 @@ def _say(job_id: str, text: str, log: TextIO | None = None) -> None:
 
 
 def _quality(out: Path) -> str:
-    """Return what the artifact says about itself, for the last line."""
+    """Return the artifact's own quality verdict for the last line of the log."""
     try:
         report = json.loads((out / "qa.json").read_text())
     except (FileNotFoundError, ValueError):
         return ""
-    worries = []
+    warnings = []
     for check in (check for check in report["checks"] if check["status"] != "ok"):
         value = "unknown" if check["value"] is None else f"{check['value']:.3g}"
-        worries.append(f"{check['name']} {value} {check['unit']}".strip())
-    return f", quality {report['status']}" + (f": {'; '.join(worries)}" if worries else "")
+        warnings.append(f"{check['name']} {value} {check['unit']}".strip())
+    return f", quality {report['status']}" + (f": {'; '.join(warnings)}" if warnings else "")
 
 
 def _commit() -> str | None:

@@ -1,7 +1,7 @@
-"""What the code of a stage is, read from its syntax trees without importing anything.
+"""Content hash of a stage's code, from its syntax trees without importing anything.
 
-`digest` changes when the meaning of a program or of a local module it imports can have changed, not with
-comments, docstrings or layout; `config_of` imports the settings of a stage. Standard library only.
+`digest` changes if the code of a program or of a local module it imports changes, not with comments,
+docstrings or layout; `config_of` imports the settings of a stage. Standard library only.
 """
 
 import ast
@@ -18,15 +18,15 @@ from pipeline.workflow import artifact
 
 @dataclass(frozen=True)
 class Source:
-    """One Python file, as far as the planner cares."""
+    """Digest and imports of one Python file."""
 
     digest: str
     imports: tuple[str, ...]
-    """Local modules that it may import, dotted."""
+    """Dotted names of local modules that it may import."""
 
 
 CODE = Path(__file__).parents[2]
-"""What `pipeline` and `stages` stand in: the checkout, or where the package was installed."""
+"""Parent folder of `pipeline` and `stages`: the checkout, or the installed package."""
 PLUMBING = (
     "core.errors",
     "core.config",
@@ -37,34 +37,34 @@ PLUMBING = (
     "workflow.cli",
     "workflow.dag",
 )
-"""Files of `pipeline/` whose change cannot change what a stage computes."""
-READER = 4
-"""Raise it when more is read of a file, so that what was read before is read again."""
+"""Modules of `pipeline` that cannot affect what a stage computes."""
+CACHE_VERSION = 4
+"""Raise it to invalidate cached entries when parsing changes."""
 
 
 @dataclass
 class Cache:
-    """What was read before, by path, for as long as size and times of a file and its entry stay the same."""
+    """Values read from files, by path, valid as long as size and times of the file are unchanged."""
 
     known: dict[str, Any] = field(default_factory=dict)
     fresh: dict[str, Any] = field(default_factory=dict)
     digests: dict[str, str] = field(default_factory=dict)
-    """Of stages, as far as this process computed them."""
-    marks: str = ""
-    """Hash of name, size and times of all code, taken before any is read."""
+    """By stage, as computed by this process."""
+    fingerprint: str = ""
+    """Hash of names, sizes and times of all code, taken before any is read."""
 
     def get(self, path: Path, read: Any) -> Any:
-        """Return `read(path)`, a value of plain JSON types, or what it was last time."""
-        mark_now = [READER, *mark(path)]
+        """Return `read(path)`, a value of plain JSON types, from the cache if the file is unchanged."""
+        current = [CACHE_VERSION, *stat_fingerprint(path)]
         entry = self.fresh.get(str(path)) or self.known.get(str(path))
-        if entry is None or entry["mark"] != mark_now:
-            entry = {"mark": mark_now, "value": read(path)}
+        if entry is None or entry["mark"] != current:
+            entry = {"mark": current, "value": read(path)}
         self.fresh[str(path)] = entry
         return entry["value"]
 
 
-def fits(known: Any) -> bool:
-    """Return whether this is what a `Cache` kept."""
+def is_valid_cache(known: Any) -> bool:
+    """Return whether a value read from JSON has the structure of a `Cache`."""
     entries = known.values() if isinstance(known, dict) else [None]
     values = [
         entry["value"] if isinstance(entry, dict) and entry.keys() == {"mark", "value"} else None
@@ -93,14 +93,14 @@ def digest(stage: str, cache: Cache) -> str:
     return cache.digests[stage]
 
 
-def mark(path: Path) -> list[int]:
+def stat_fingerprint(path: Path) -> list[int]:
     """Return size and times of a file."""
     stat = path.stat()
     return [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns]
 
 
-def marks(folder: str, *, follow: bool = True) -> list[list[Any]]:
-    """Return path, size and times of all files below `folder`; in it, not below, links to folders count."""
+def folder_fingerprint(folder: str, *, follow: bool = True) -> list[list[Any]]:
+    """Return path, size and times of all files below `folder`; folder links are followed at the top only."""
     found: list[list[Any]] = []
     if not os.path.isdir(folder):
         return found
@@ -109,7 +109,7 @@ def marks(folder: str, *, follow: bool = True) -> list[list[Any]]:
             continue
         link = entry.is_symlink()
         if os.path.isdir(entry.path) if link and follow else entry.is_dir(follow_symlinks=False):
-            found += marks(entry.path, follow=False)
+            found += folder_fingerprint(entry.path, follow=False)
         else:
             stat = entry.stat(follow_symlinks=not link or os.path.isfile(entry.path))
             found.append([entry.path, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns])
@@ -127,21 +127,21 @@ def _path_of(module: str) -> Path | None:
     return next((p for p in (path.with_suffix(".py"), path / "__init__.py") if p.is_file()), None)
 
 
-def _assets(room: Path, cache: Cache) -> dict[str, str]:
-    """Return the digests of the room's files that are not Python and that the stage may read."""
+def _assets(folder: Path, cache: Cache) -> dict[str, str]:
+    """Return the digests of a stage folder's other files than Python, which it may read."""
     found = {}
-    for path in sorted((CODE / room).iterdir()) if (CODE / room).is_dir() else ():
+    for path in sorted((CODE / folder).iterdir()) if (CODE / folder).is_dir() else ():
         if path.name.startswith((".", "__pycache__", "node_modules")) or path.suffix == ".py":
             continue
         if path.is_dir():
-            found |= _assets(room / path.name, cache)
+            found |= _assets(folder / path.name, cache)
         else:
-            found[(room / path.name).as_posix()] = cache.get(path, artifact.digest_of_file)
+            found[(folder / path.name).as_posix()] = cache.get(path, artifact.digest_of_file)
     return found
 
 
 def recording_digest(path: Path, digest_of: Callable[[Path], str] = artifact.digest_of_file) -> str:
-    """Return the hash of a recording: of the file, or of all files of a folder but hidden ones."""
+    """Return the hash of a recording: of the file, or of all files of a folder except hidden ones."""
     if path.is_file():
         return digest_of(path)
     files = sorted(file for file in path.rglob("[!.]*") if file.is_file())
@@ -151,7 +151,7 @@ def recording_digest(path: Path, digest_of: Callable[[Path], str] = artifact.dig
 def _read(path: Path) -> dict[str, Any]:
     try:
         tree = ast.parse(path.read_bytes(), str(path))
-    except SyntaxError:  # breaks the stages that import it, when they run; not the plan of all the others
+    except SyntaxError:  # fails when a stage imports it, without breaking the plan of the others
         return asdict(Source(artifact.digest_of_file(path), ()))
     imports = {
         name for node in ast.walk(tree) for name in _imported(node) if name.startswith(("pipeline", "stages"))

@@ -1,8 +1,8 @@
-"""Stamps say which artifacts are up to date, by content, whatever the machine's clock does.
+"""Stamp files mark artifacts as up to date by content hash, independent of the machine's clock.
 
-A stamp holds a hash of its job's key files: where that differs, the planner removes it, and Make or Snakemake
-run the job. Their own question, which of two stamps is younger, is answered by a clock of the agent that
-never goes back: every stamp gets a later time than all before. Standard library only.
+A stamp holds a hash of its job's key files: if that differs, the planner removes it, and Make or Snakemake
+run the job. Both compare modification times of stamps, so these come from a monotonic clock per agent:
+every stamp gets a later time than all before. Standard library only.
 """
 
 import contextlib
@@ -16,26 +16,26 @@ from pipeline.workflow import artifact, dag
 from pipeline.workflow.jobs import Home, Job
 
 TICK_NS = 1_000_000
-"""Between two stamps at least; file systems resolve milliseconds."""
+"""Minimum time between two stamps; file systems resolve milliseconds."""
 
 
 def put(stamp: Path, keys: Sequence[str]) -> None:
-    """Stamp an artifact that is known to be up to date; `keys` are its job's key files."""
+    """Write the stamp of an up-to-date artifact; `keys` are its job's key files."""
     stamp.write_text(text(keys))
     clock = _clock(Home(stamp.parts[1]))
-    with artifact.held(clock):
+    with artifact.locked(clock):
         later_ns = max(time.time_ns(), clock.stat().st_mtime_ns + TICK_NS)
         os.utime(clock, ns=(later_ns, later_ns))
     os.utime(stamp, ns=(later_ns, later_ns))
 
 
 def text(keys: Sequence[str]) -> str:
-    """Return what the stamp of a job with these key files holds."""
+    """Return the content of the stamp of a job with these key files."""
     return artifact.digest_of([artifact.digest_of_file(Path(key)) for key in keys]) + "\n"
 
 
 def remove_outdated(jobs: Sequence[Job]) -> None:
-    """Remove the stamps of jobs whose key files have changed since."""
+    """Remove the stamps of jobs whose key files have changed."""
     digest_of = functools.cache(lambda key: artifact.digest_of_file(Path(key)))
     for job in jobs:
         with contextlib.suppress(FileNotFoundError):
@@ -45,7 +45,7 @@ def remove_outdated(jobs: Sequence[Job]) -> None:
 
 
 def remove_impossible(home: Home) -> None:
-    """Remove stamps from after the present, which were not put by `put`: they would hide every change."""
+    """Remove stamps with a time in the future, not written by `put`: they would hide every change."""
     now_ns = time.time_ns()
     with contextlib.suppress(FileNotFoundError):
         now_ns = max(now_ns, _clock(home).stat().st_mtime_ns)
@@ -65,5 +65,5 @@ def _all_stamps(home: Home) -> Iterator[str]:
 
 
 def _clock(home: Home) -> Path:
-    """Return the file whose age is the time of the last stamp; an agent's variants share it."""
+    """Return the file whose modification time is the last stamp's; an agent's variants share it."""
     return home.base.folder / "clock"

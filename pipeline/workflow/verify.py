@@ -1,10 +1,10 @@
-"""Hash everything that was built, and the recordings it was built from, and report what is not what it was.
+"""Verify the checksums of everything that was built, and of the recordings that it was built from.
 
     python -SE -m pipeline.workflow.verify HOME
 
-A build looks at the keys of artifacts, not at their bytes: what a failing disk or another program changed in
-a finished one is found here. Of recordings the planner looks at size and times; what differs all the same is
-forgotten, so that the next build starts from it. Exit code 2 where anything differs. Standard library only.
+A build compares the keys of artifacts, not their bytes: this finds what a failing disk or another program
+has changed. The planner compares size and times of recordings; its cache is dropped if a hash differs all
+the same, so that the next build uses the new content. Exit code 2 if anything differs. Standard library only.
 """
 
 import json
@@ -15,14 +15,14 @@ from pathlib import Path
 from pipeline.core import videos
 from pipeline.core.errors import InputError, exit_code
 from pipeline.workflow import artifact
-from pipeline.workflow.jobs import Home, listing
+from pipeline.workflow.jobs import Home, jobs_file
 from pipeline.workflow.sources import recording_digest
 
 
 def differences(home: Home) -> Iterator[InputError]:
-    """Yield an error per artifact and per recording of `home` that differs. Raises RUN-001 without a plan."""
+    """Yield an error per damaged artifact and changed recording of `home`. Raises RUN-001 without a plan."""
     try:
-        planned = json.loads(listing(home).read_text())
+        planned = json.loads(jobs_file(home).read_text())
     except FileNotFoundError:
         raise InputError("RUN-001", "is not planned yet", str(home), f"run `make {home}`") from None
     for folder in dict.fromkeys(Path(job["out"]) for job in planned):
@@ -36,8 +36,8 @@ def differences(home: Home) -> Iterator[InputError]:
         if video.sha256 is None or not recording.exists():
             continue
         if recording_digest(recording) != video.sha256:
-            for remembered in ("cache.json", "state.json"):
-                (home.base.plan / remembered).unlink(missing_ok=True)
+            for cached in ("cache.json", "state.json"):
+                (home.base.plan / cached).unlink(missing_ok=True)
             what = "has changed since it was planned"
             yield InputError("ART-005", what, str(recording), "build again, or put back what was there")
 

@@ -37,7 +37,7 @@ def main(arguments: list[str]) -> int:
     for verdict in itertools.chain(refused, stage.run(files, Config())):
         unusable += not verdict.usable
         print(f"{printable(verdict.text)}\n", flush=True)
-    for name in captures.not_understood(given.folder):
+    for name in captures.unknown_files(given.folder):
         named = printable(captures.named(given.folder / name))
         print(f"{named}  left alone: not a recording of a known format (CAP-003)\n")
     missing = captures.missing_roles([role for _, role in files])
@@ -50,7 +50,7 @@ def _files(folder: Path, recipe: Path) -> tuple[list[tuple[Path, Role]], list[Ca
     """Return recordings with roles, by names, sidecars and recipe, and those with a bad sidecar."""
     names = captures.find(folder)
     if not names:
-        captures.refuse_strangers(folder)
+        captures.refuse_unknown_files(folder)
         what = "there are no recordings; make builds from the built-in capture"
         raise InputError("CAP-042", what, str(folder), "copy recordings there (README: your own animal)")
     overrides = recipes.read(recipe)[0].get(recipes.VIDEOS_TABLE, {}) if recipe.is_file() else {}

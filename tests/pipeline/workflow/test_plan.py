@@ -376,7 +376,7 @@ def test_a_former_reconstruction_is_begun_from_but_not_by_variants(house):
         assert [
             job["id"] for job in json.loads(plan.read_text()) if "--former" in job["arguments"]
         ] == readers
-    assert captures.not_understood(house.folder / "captures/toy") == []
+    assert captures.unknown_files(house.folder / "captures/toy") == []
 
 
 def test_further_homes_are_inputs_of_the_behavior_model_alone(house):
@@ -424,7 +424,7 @@ def test_a_prompt_beside_a_recording_reaches_its_masks_alone(house):
     assert list(told) == ["masks.v003"], "b.r3d"
     assert "captures/toy/b.r3d.prompt.toml" in told["masks.v003"]["arguments"]
     assert any(key.endswith("keys/prompt.v003.json") for key in told["masks.v003"]["keys"])
-    assert captures.not_understood(house.folder / "captures/toy") == []
+    assert captures.unknown_files(house.folder / "captures/toy") == []
 
 
 @pytest.mark.parametrize("variable", ["AGENT", "VARIANT", "FORMAT", "PLACES"])
