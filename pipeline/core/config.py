@@ -1,7 +1,7 @@
 """Strict configuration: a table of plain values becomes a frozen dataclass, or an `InputError`.
 
-A stage's front declares `Config`; the recipe's table for that stage is checked against it:
-unknown keys and ill-typed values are refused with what is known. Standard library only.
+A stage declares `Config`; the recipe's table for that stage is checked against it: unknown keys and values
+of a wrong type are refused with a list of what is known. Standard library only.
 """
 
 import dataclasses
@@ -18,15 +18,15 @@ from typing import Any, ClassVar, Protocol, TypeVar
 from pipeline.core.errors import InputError
 
 LARGEST_INTEGER = (1 << 63) - 1
-"""TOML promises no more; larger ones are no float either."""
+"""64 bits, as TOML guarantees; larger ones may not fit a float either."""
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlong, _SHORT.maxstring, _SHORT.maxother = 4, 40, 100, 200
 _SHORT.maxtuple = _SHORT.maxlist = _SHORT.maxdict = 20
-"""Of a value in a message: files may hold numbers of thousands of digits, and tables as deep."""
+"""Limits of a value in a message: files may hold numbers of thousands of digits and deeply nested tables."""
 
 
 class Dataclass(Protocol):
-    """What `dataclasses` takes for one."""
+    """Protocol of dataclass instances."""
 
     __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
 
@@ -57,7 +57,7 @@ def read_table(path: Path) -> dict[str, Any]:
 def from_table(config: type[C], table: Mapping[str, Any], *, where: str, base: C | None = None) -> C:
     """Check `table` against the fields of the dataclass `config` and build it; nested tables likewise.
 
-    What the table leaves out is as in `base`, else the field's default. Raises `InputError` REC-001
+    Missing keys are taken from `base`, else from the field's default. Raises `InputError` REC-001
     (unknown key), REC-002 (wrong type, impossible or missing value).
     """
     fields = {field.name: field for field in dataclasses.fields(config)}
@@ -77,15 +77,15 @@ def from_table(config: type[C], table: Mapping[str, Any], *, where: str, base: C
 
 
 def default_of(field: dataclasses.Field) -> Any:
-    """Return a field's default, `MISSING` where it has none."""
-    made = field.default_factory
-    return field.default if made is dataclasses.MISSING else made()
+    """Return a field's default, `MISSING` if it has none."""
+    factory = field.default_factory
+    return field.default if factory is dataclasses.MISSING else factory()
 
 
 def refuse_unknown(
     table: Mapping[str, Any], known: typing.Collection[str], *, where: str, kind: str = "key"
 ) -> None:
-    """Raise REC-001 naming the known ones when `table` has a key outside `known`."""
+    """Raise REC-001, listing the known keys, if `table` has a key outside `known`."""
     for key in table:
         if key not in known:
             remedy = f"known: {', '.join(sorted(known)) or 'none'}"
@@ -93,23 +93,23 @@ def refuse_unknown(
 
 
 def refuse_impossible(value: Any, default: Any, *, where: str) -> None:
-    """Raise REC-002 for numbers that are not finite, negative unlike the default, or a rate or size of 0."""
+    """Raise REC-002 for non-finite numbers, unexpected negative ones, and a rate or size of 0."""
     if not isinstance(value, int | float) or not isinstance(default, int | float):
         return
-    nothing = where.endswith(("_hz", "_px")) and value == 0
-    counts = default > 0 or (default == 0 and isinstance(default, int))
-    if not math.isfinite(value) or (counts and value < 0) or (default > 0 and nothing):
+    zero_size = where.endswith(("_hz", "_px")) and value == 0
+    non_negative = default > 0 or (default == 0 and isinstance(default, int))
+    if not math.isfinite(value) or (non_negative and value < 0) or (default > 0 and zero_size):
         remedy = f"give a number as the default is, {default!r}"
         raise InputError("REC-002", f"{shown(value)} cannot be", where, remedy)
 
 
 def shown(value: Any) -> str:
-    """Return a value as a message holds it: cut where it is long or deep."""
+    """Return a value's `repr` for a message, truncated if long or deeply nested."""
     return _SHORT.repr(value)
 
 
 def _checked(hint: Any, value: Any, where: str, default: Any = None) -> Any:
-    """Return `value` as `hint` wants it (lists become tuples, integers floats) or raise REC-002."""
+    """Convert `value` to the type `hint` (lists to tuples, integers to floats) or raise REC-002."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
         raise InputError("REC-002", f"{shown(value)} is too large", where, f"{LARGEST_INTEGER} at most")

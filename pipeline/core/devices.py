@@ -12,14 +12,14 @@ Device = Literal["cpu", "cuda"]
 
 
 def choose(requested: Literal["auto", "cpu", "cuda"] | str) -> Device:
-    """Return the device to compute on; `auto` takes CUDA where torch can use it.
+    """Return the device to compute on; `auto` chooses CUDA if torch can use it.
 
-    Raises `InputError` DEP-002 where CUDA is requested and cannot be used.
+    Raises `InputError` DEP-002 if CUDA is requested but unavailable.
     """
     if requested == "cpu":
         return "cpu"
     if "torch" in sys.modules or _built_with_cuda():
-        import torch  # late: it costs seconds, and many stages need none
+        import torch  # imported late: it takes seconds, and many stages do not need it
 
         if torch.cuda.is_available():
             return "cuda"
@@ -30,7 +30,7 @@ def choose(requested: Literal["auto", "cpu", "cuda"] | str) -> Device:
 
 
 def _built_with_cuda() -> bool:
-    """Read from torch's version file, without importing torch, whether it was built for CUDA or ROCm."""
+    """Return whether torch was built for CUDA or ROCm, from its version file, without importing it."""
     found = importlib.util.find_spec("torch")
     if found is None or not found.submodule_search_locations:
         return False

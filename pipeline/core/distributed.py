@@ -1,8 +1,8 @@
-"""Several processes that fit one model, each on its own recordings: `torchrun`, or `make <agent>.<artifact>
-PROCESSES=4`.
+"""Data-parallel training: several processes fit one model, each on its own recordings.
 
-`join` enters the group; alone, everything here is what it is for one process. A shared loss divides by the
-number of all processes' elements (`total`), so that a step does not depend on who holds what.
+Start them with `torchrun` or `make <agent>.<artifact> PROCESSES=4`; `join` enters the process group. Without
+one, everything here works for a single process. A shared loss divides by the number of elements in all
+processes (`total`), so that a step does not depend on how data are distributed.
 """
 
 import os
@@ -16,23 +16,21 @@ from torch.nn.parallel import DistributedDataParallel
 from pipeline.core import processes
 
 NamedLoss = Callable[[int, torch.Generator], Mapping[str, Float[Tensor, ""]]]
-"""of a step and its generator: weighted terms by name"""
+"""maps a step and its random generator to weighted terms by name"""
 
 
 def join(device: str) -> None:
-    """Enter the group of processes that torchrun started; without torchrun, stay alone. Each takes one GPU,
-    if there are any.
-    """
+    """Join the process group that torchrun started, if any, each process with its own GPU if there is one."""
     if not distributed.is_torchelastic_launched():
         return
     processes.die_with_parent()
     if device == "cuda":
-        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))  # torchrun's number of this process here
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))  # local rank on this machine, set by torchrun
     distributed.init_process_group("nccl" if device == "cuda" else "gloo")
 
 
 def leave() -> bool:
-    """Leave the group; return whether this process is the one that writes what was found."""
+    """Leave the process group; return whether this process has rank 0, which writes results."""
     leads = rank() == 0
     if distributed.is_initialized():
         distributed.destroy_process_group()
@@ -40,12 +38,12 @@ def leave() -> bool:
 
 
 def size() -> int:
-    """Return how many processes there are."""
+    """Return the number of processes."""
     return distributed.get_world_size() if distributed.is_initialized() else 1
 
 
 def rank() -> int:
-    """Return which of them this is; 0 leads: it alone writes files."""
+    """Return the rank of this process; only rank 0 writes files."""
     return distributed.get_rank() if distributed.is_initialized() else 0
 
 
@@ -53,29 +51,29 @@ def total(values: Shaped[Tensor, "*any"]) -> Shaped[Tensor, "*any"]:
     """Return the sum over all processes, without gradients."""
     if size() == 1:
         return values.detach()
-    there = values.detach().to("cuda" if distributed.get_backend() == "nccl" else "cpu", copy=True)
-    distributed.all_reduce(there)
-    return there.to(values.device)
+    summed = values.detach().to("cuda" if distributed.get_backend() == "nccl" else "cpu", copy=True)
+    distributed.all_reduce(summed)
+    return summed.to(values.device)
 
 
 def mean(values: Shaped[Tensor, "*any"]) -> Shaped[Tensor, "*any"]:
-    """Return the mean over all processes, without gradients: what a shared loss divides by."""
+    """Return the mean over all processes, without gradients: the divisor of a shared loss."""
     return total(values) / size()
 
 
 def share(batch: int) -> int:
-    """Return how many of a batch's examples are this process's: each has as many, one at least."""
+    """Return the number of a batch's examples per process, at least one."""
     return max(batch // size(), 1)
 
 
 def wait() -> None:
-    """Go on when all have come here."""
+    """Block until all processes get here (barrier)."""
     if size() > 1:
         distributed.barrier()
 
 
 class Shared(nn.Module):
-    """A loss over modules whose gradients are averaged over all processes as they are computed."""
+    """A loss over modules, wrapped as a module so that DDP averages its gradients over all processes."""
 
     def __init__(self, modules: Mapping[str, nn.Module], loss: NamedLoss):
         super().__init__()
@@ -87,7 +85,7 @@ class Shared(nn.Module):
 
 
 def shared(modules: Mapping[str, nn.Module], loss: NamedLoss) -> NamedLoss:
-    """Return a loss whose gradients are the mean of all processes'; all begin with the leader's weights."""
+    """Return a loss whose gradients are averaged over all processes; all start with the weights of rank 0."""
     return DistributedDataParallel(
         Shared(modules, loss), forward_sync_buffers=False, find_unused_parameters=True
     )

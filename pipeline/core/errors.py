@@ -1,7 +1,6 @@
-"""The one error that a user can cause and therefore can repair.
+"""The error type for mistakes that a user can fix.
 
-Everything else that goes wrong is a broken promise of ours: an `assert` or a plain traceback. Standard
-library only.
+Any other failure is a bug of ours and shows as an `assert` or a plain traceback. Standard library only.
 """
 
 import contextlib
@@ -12,18 +11,18 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""No space, a quota, or a limit of the shell (`ulimit -f`)."""
-_OF_RUST = re.compile(r"\(os error (\d+)\)")
-"""How safetensors' messages name the system's error."""
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""No space left, quota exceeded, or the shell's file size limit (`ulimit -f`)."""
+_RUST_ERRNO = re.compile(r"\(os error (\d+)\)")
+"""Error number in messages of safetensors, which is written in Rust."""
 QUOTED = 120
-"""Characters of a library's message that an error shows."""
+"""Maximum number of characters of a library's message in an error."""
 MAKE_AGAIN = "build it again with this version: make <agent>.<artifact>.redo"
-"""What to do about what another version wrote."""
+"""Remedy for files that another version wrote."""
 
 
 class InputError(Exception):
-    """Something handed to a program is wrong: say what, where, and one thing to do about it.
+    """A user's input is wrong: says what, where, and one thing to do about it.
 
     `code` is stable (`CAP-003`), so that it can be searched for and tested.
     """
@@ -39,23 +38,23 @@ class InputError(Exception):
 
 
 def printable(text: str) -> str:
-    """Return text whose control characters are spelled out: names of files may hold ESC, terminals obey."""
+    """Escape control characters: file names may contain ESC sequences, which terminals would execute."""
     return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
 
 
 @contextlib.contextmanager
 def coded_disk_errors(where: str) -> Iterator[None]:
-    """Turn an error that the user can cure into an `InputError`: SYS-001 (full), SYS-003 (forbidden)."""
+    """Turn a disk error that the user can fix into an `InputError`: SYS-001 (full), SYS-003 (no access)."""
     try:
         yield
     except InputError:
         raise
     except Exception as error:
-        cause = _of_the_system(error)
+        cause = _os_error(error)
         if cause is None:
             raise
         place = str(cause.filename or where)
-        if cause.errno in _FULL:
+        if cause.errno in _DISK_FULL:
             remedy = "free some space and run the same again"
             raise InputError("SYS-001", "the disk is full", place, remedy) from error
         if cause.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
@@ -78,26 +77,26 @@ def exit_code(program: Callable[[], int], where: str = "build") -> int:
 
 @contextlib.contextmanager
 def other_versions_refused(what: str, where: str) -> Iterator[None]:
-    """Turn what reading a file of another version raises into an `InputError` ART-007.
+    """Turn any exception from reading a file of another version into an `InputError` ART-007.
 
-    ``what`` is expected (`behavior model`), at ``where``: by hand any artifact may be given.
+    ``what`` is the expected kind of file (`behavior model`), ``where`` its path.
     """
     try:
         yield
     except (InputError, PermissionError):
         raise
-    except Exception as error:  # a parser's own errors have no common base
+    except Exception as error:  # exceptions of parsers have no common base class
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:QUOTED]}"
         found = f"is no {what} as this version writes it ({reason})"
         raise InputError("ART-007", found, where, MAKE_AGAIN) from error
 
 
-def _of_the_system(error: Exception) -> OSError | None:
-    """Return the system's error, which torch puts behind one of its own and safetensors into a text."""
+def _os_error(error: Exception) -> OSError | None:
+    """Return the `OSError` behind an exception: torch wraps it, safetensors quotes it in its message."""
     if isinstance(error, OSError):
         return error
-    behind = error.__context__
-    if isinstance(error, RuntimeError) and isinstance(behind, OSError) and behind.errno in _FULL:
-        return behind
-    number = _OF_RUST.search(str(error))
+    cause = error.__context__
+    if isinstance(error, RuntimeError) and isinstance(cause, OSError) and cause.errno in _DISK_FULL:
+        return cause
+    number = _RUST_ERRNO.search(str(error))
     return OSError(int(number[1]), os.strerror(int(number[1]))) if number else None

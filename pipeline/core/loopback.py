@@ -1,6 +1,6 @@
-"""Who may talk to a server of this machine: its own page, asked for by its own address.
+"""Access control of local servers: only their own page, requested by its own address.
 
-A server on the loopback interface is out of reach of other machines, but not of other sites in the same
+A server on the loopback interface is unreachable from other machines, but not from other sites in the same
 browser: they can send forms and open sockets (refused by `Origin`), or point a name of their own at
 127.0.0.1 and read answers (DNS rebinding, refused by `Host`). Standard library only.
 """
@@ -8,11 +8,11 @@ browser: they can send forms and open sockets (refused by `Origin`), or point a 
 from collections.abc import Sequence
 
 HOST = "127.0.0.1"
-"""What local servers listen on."""
+"""Address that local servers listen on."""
 
 
 def is_own(port: int, hosts: Sequence[str], origins: Sequence[str]) -> bool:
-    """Return whether a request is one of a server's own page, or of a program on this machine.
+    """Return whether a request comes from the server's own page, or from a program on this machine.
 
     `hosts` and `origins` are all values of the headers `Host` and `Origin`; a program sends no `Origin`.
     """

@@ -1,4 +1,4 @@
-"""Child processes that cannot outlive what they work for. Standard library only."""
+"""Child processes that cannot outlive their parent. Standard library only."""
 
 import ctypes
 import multiprocessing
@@ -12,29 +12,28 @@ _PR_SET_PDEATHSIG = 1
 
 
 def die_with_parent() -> None:
-    """In a child: ask the kernel for SIGKILL when the parent dies, however it dies (on Linux)."""
+    """In a child: ask the kernel (Linux) for SIGKILL when the parent dies for any reason."""
     libc = ctypes.CDLL(None)
     if hasattr(libc, "prctl"):
         libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def unordered(function: Callable[..., T], jobs: Sequence[tuple], workers: int) -> Iterator[tuple[int, T]]:
-    """Call `function` with the arguments of every job, several at once; yield each job's number and result
-    when it is done.
+    """Call `function` with each job's arguments in parallel; yield (index, result) of each.
 
-    The workers are fresh interpreters: threads and locks are not inherited. Ctrl-C reaches every process of a
-    terminal; they leave it to this one, from their first instruction on, and are ended when it stops asking.
+    Workers are spawned, so that threads and locks are not inherited. They block SIGINT, which a terminal sends
+    to all processes, from the start; this process kills them when it is interrupted.
     """
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=die_with_parent)
     try:
-        # Inherited; what comes meanwhile comes afterwards.
+        # Workers inherit the mask; a signal that arrives meanwhile is delivered afterwards.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            number = {pool.submit(function, *job): index for index, job in enumerate(jobs)}
+            index_of = {pool.submit(function, *job): index for index, job in enumerate(jobs)}
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        for future in as_completed(number):
-            yield number[future], future.result()
+        for future in as_completed(index_of):
+            yield index_of[future], future.result()
     except BaseException:
         for worker in multiprocessing.active_children():
             worker.kill()

@@ -1,4 +1,4 @@
-"""Progress for people: a bar on a terminal, a line every 10 s anywhere else, on standard error."""
+"""Progress on standard error: a bar on a terminal, a line every 10 s elsewhere."""
 
 import sys
 import time
@@ -15,12 +15,12 @@ BAR_WIDTH = 28
 
 
 def log(message: str) -> None:
-    """Say one thing once; begin with what is meant and give the numbers."""
+    """Print one message to standard error."""
     print(printable(message), file=sys.stderr, flush=True)
 
 
 def track(iterable: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
-    """Yield from `iterable` and report how far it is; `total` is needed where it has no length."""
+    """Yield from `iterable` and report progress; give `total` if it has no length."""
     if total is None and isinstance(iterable, Sized):
         total = len(iterable)
     on_terminal = sys.stderr.isatty()

@@ -1,6 +1,4 @@
-"""Several things at once in one process: for work that is mostly spent in libraries, which let others run
-meanwhile.
-"""
+"""Thread pools for work in libraries that release the GIL."""
 
 import contextlib
 from collections import deque
@@ -15,8 +13,8 @@ B = TypeVar("B")
 
 
 @contextlib.contextmanager
-def alone() -> Iterator[None]:
-    """Let torch work with one thread: small steps take longer with two, and sums depend on their number."""
+def single_threaded() -> Iterator[None]:
+    """Limit torch to one thread: small steps are slower with two, and sums depend on their number."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -26,20 +24,20 @@ def alone() -> Iterator[None]:
 
 
 def ordered(function: Callable[[A], B], items: Iterable[A], workers: int) -> Iterator[B]:
-    """Yield what `function` makes of each item, in their order; at most `workers` are worked on or wait to be
-    taken.
+    """Map `function` over `items` in parallel, in order; at most `workers` results are pending.
 
-    Each is made by one thread, so that sums come out the same however many workers there are. What one raises
-    is raised here; those under way are finished first.
+    Each result is computed by one thread, so sums do not depend on the number of workers. An exception is
+    raised here after running calls have finished.
     """
-    with alone(), ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        under_way: deque[Future[B]] = deque()
+    pool = ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,))
+    with single_threaded(), pool:
+        pending: deque[Future[B]] = deque()
         try:
             for item in items:
-                if len(under_way) == workers:
-                    yield under_way.popleft().result()
-                under_way.append(pool.submit(function, item))
-            while under_way:
-                yield under_way.popleft().result()
+                if len(pending) == workers:
+                    yield pending.popleft().result()
+                pending.append(pool.submit(function, item))
+            while pending:
+                yield pending.popleft().result()
         finally:
             pool.shutdown(cancel_futures=True)

@@ -1,8 +1,8 @@
-"""The one training loop: seeded steps, checkpoints, resume, guards.
+"""The training loop: seeded steps, checkpoints, resuming, recovery from non-finite losses.
 
-`fit` calls a loss, steps an optimiser and keeps enough on disk to go on after any kill. Randomness is a
-pure function of (seed, step), so that on a CPU an interrupted run ends with the same bits as an
-uninterrupted one. SIGTERM saves and exits with 75; a loss that stays broken exits with 76 and a diagnosis.
+`fit` minimises a loss with an optimiser and can resume from checkpoints after any kill. Randomness is a pure
+function of (seed, step), so that on a CPU an interrupted run is bit-identical to an uninterrupted one.
+SIGTERM saves and exits with 75; a loss that stays non-finite exits with 76 and a diagnosis.
 """
 
 import contextlib
@@ -25,23 +25,21 @@ from torch import Tensor
 from pipeline.core import distributed, progress
 from pipeline.core.distributed import NamedLoss
 
-KEEP = 3
-BROKEN_IN_A_ROW = 3
+CHECKPOINTS_KEPT = 3
+MAX_BROKEN_STEPS = 3
 EXIT_SAVED = 75
 EXIT_DIVERGED = 76
 Loss = Callable[[int, torch.Generator], Float[Tensor, ""] | Mapping[str, Float[Tensor, ""]]]
-"""of a step and its generator; weighted terms by name, or their sum"""
+"""maps a step and its random generator to weighted terms by name, or to their sum"""
 
 
 @dataclass(frozen=True)
 class FitRecord:
-    """The loss terms of every step, as weighted in the sum; NaN where a broken step was skipped or the loss
-    had no such term.
-    """
+    """Weighted loss terms of every step; NaN for skipped steps and for terms that the loss did not return."""
 
     terms: dict[str, Float[np.ndarray, "step"]]
     rolled_back: int
-    """how often the loop fell back to a checkpoint with half the rate"""
+    """number of times that the loop rolled back to a checkpoint and halved the learning rate"""
 
     def total(self) -> Float[np.ndarray, "step"]:
         """Return the sum of all terms per step."""
@@ -68,13 +66,13 @@ def fit(
     """Minimise ``loss(step, generator)`` for ``steps`` steps, from the newest checkpoint in ``resume`` if
     there is one.
 
-    ``modules`` is all state that must survive (an average of the weights is one of them). The loss returns a
-    scalar or named, weighted, scalar terms. ``schedule`` maps progress 0..1 to a factor on each group's rate.
-    Steps whose loss or gradient is not finite are skipped; three in a row fall back to the last checkpoint at
-    half the rate, and the second such fall ends the run (exit 76, ``diagnosis.json`` in ``resume``).
-    ``asked_to_stop`` says instead of signals whether to save and exit: several fits in threads share one
-    `termination`. With ``shared``, all processes of `pipeline.core.distributed` minimise the mean of their
-    losses; the first keeps checkpoints.
+    ``modules`` hold all state to checkpoint (including averaged weights). The loss returns a scalar or named,
+    weighted, scalar terms. ``schedule`` maps progress 0..1 to a factor on each group's learning rate.
+    Steps whose loss or gradient is not finite are skipped; three in a row roll back to the last checkpoint at
+    half the rate, and a second rollback ends the run (exit 76, ``diagnosis.json`` in ``resume``).
+    ``asked_to_stop`` replaces the signal handlers: several fits in threads share one `termination`.
+    With ``shared``, all processes of `pipeline.core.distributed` minimise the mean of their losses; rank 0
+    keeps checkpoints.
     """
     shared = shared and distributed.size() > 1
     loop = _Loop(dict(modules), optimizer, resume, shared)
@@ -87,7 +85,7 @@ def fit(
                 continue
             if after_step:
                 after_step(loop.step - 1)
-            stop = loop.anywhere(asked_to_stop())
+            stop = loop.in_any_process(asked_to_stop())
             if resume and (loop.step % save_every == 0 or stop):
                 loop.save()
             if stop:
@@ -99,15 +97,13 @@ def fit(
 
 
 def generator_for(seed: int, step: int, rank: int = 0) -> torch.Generator:
-    """Return the generator of one step, a pure function of (seed, step) and of the process, where there are
-    several.
-    """
+    """Return the random generator of one step, a pure function of (seed, step, rank)."""
     seeds = np.random.SeedSequence([seed, step, rank] if rank else [seed, step])
     return torch.Generator().manual_seed(int(seeds.generate_state(1, np.uint64)[0] >> np.uint64(1)))
 
 
 class _Loop:
-    """The state of a run: modules, optimiser, step, losses so far; knows how to save and restore itself."""
+    """State of a run (modules, optimiser, step, losses so far), which can be saved and restored."""
 
     def __init__(
         self,
@@ -124,7 +120,7 @@ class _Loop:
         self.start = self._state() if folder is None else None
 
     def until(self, steps: int) -> Iterator[int]:
-        """Yield the step to do next until all are done; a fall back yields earlier ones again."""
+        """Yield the next step until all are done; a rollback yields earlier ones again."""
         while self.step < steps:
             yield self.step
 
@@ -136,7 +132,7 @@ class _Loop:
         schedule: Callable[[float], float] | None,
         clip_norm: float | None,
     ) -> bool:
-        """Do one step. Return False when it was broken and the loop fell back to an earlier one."""
+        """Do one step. Return False if it was not finite and the loop rolled back to a checkpoint."""
         factor = self.rate * (schedule(self.step / max(steps, 1)) if schedule else 1.0)
         for group, base in zip(self.optimizer.param_groups, self.base_rates, strict=True):
             group["lr"] = base * factor
@@ -155,8 +151,8 @@ class _Loop:
             self.broken = 0
         else:
             self.broken += 1
-            if self.broken >= BROKEN_IN_A_ROW:
-                self._fall_back(values, float(norm))
+            if self.broken >= MAX_BROKEN_STEPS:
+                self._roll_back(values, float(norm))
                 return False
         for name in self.terms | values:
             self.terms.setdefault(name, [math.nan] * self.step).append(
@@ -166,16 +162,16 @@ class _Loop:
         return True
 
     def _values_of(self, terms: Mapping[str, Tensor]) -> dict[str, float]:
-        """Return the terms as numbers; the mean of all processes'."""
+        """Return the terms as numbers, averaged over all processes."""
         values = torch.stack([value.detach().float() for value in terms.values()])
         values = distributed.total(values) / distributed.size() if self.shared else values
         return dict(zip(terms, values.tolist(), strict=True))
 
-    def anywhere(self, here: bool) -> bool:
-        """Return whether something is so in any of the processes."""
+    def in_any_process(self, here: bool) -> bool:
+        """Return whether ``here`` is true in any process."""
         return bool(distributed.total(torch.tensor(float(here)))) if self.shared else here
 
-    def _fall_back(self, values: Mapping[str, float], norm: float) -> None:
+    def _roll_back(self, values: Mapping[str, float], norm: float) -> None:
         diagnosis = {
             "step": self.step,
             "gradient_norm": repr(norm),
@@ -216,9 +212,7 @@ class _Loop:
         self.optimizer.load_state_dict(state["optimizer"])
 
     def save(self) -> None:
-        """Write a checkpoint by temp file, fsync and rename; keep the newest three. Of several processes, the
-        first does.
-        """
+        """Write a checkpoint by temporary file, fsync and rename; keep the newest three (rank 0 only)."""
         if self.rank or self.folder is None:
             return
         temp = self.folder / f".step.tmp.{os.getpid()}"
@@ -231,19 +225,17 @@ class _Loop:
         except BaseException:
             temp.unlink(missing_ok=True)
             raise
-        for old in _checkpoints(self.folder)[KEEP:]:
+        for old in _checkpoints(self.folder)[CHECKPOINTS_KEPT:]:
             old.unlink()
 
     def restore(self) -> None:
-        """Load the newest checkpoint that can be read; start over when there is none. Of several processes,
-        the first goes first.
-        """
+        """Load the newest readable checkpoint, rank 0 first; start over if there is none."""
         if self.folder is None:
             return
         if self.rank == 0:
             self.folder.mkdir(parents=True, exist_ok=True)
-            for dead in self.folder.glob(".step.tmp.*"):
-                dead.unlink()
+            for leftover in self.folder.glob(".step.tmp.*"):
+                leftover.unlink()
             self._restore(self.folder)
         if self.shared:
             distributed.wait()
@@ -254,7 +246,7 @@ class _Loop:
         for path in _checkpoints(folder):
             try:
                 state = torch.load(path, weights_only=True, map_location="cpu")
-            except Exception as error:  # any damage: the file before it is as good
+            except Exception as error:  # whatever the damage: try the checkpoint before
                 progress.log(f"{path.name} cannot be read ({type(error).__name__}); trying the one before")
                 continue
             self._load(state)
@@ -279,16 +271,14 @@ def _named(loss: Loss) -> NamedLoss:
 
 @contextlib.contextmanager
 def termination() -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns whether SIGTERM or SIGINT has come; the handlers live as long as the
-    block.
-    """
-    came = []
+    """Yield a function that returns whether SIGTERM or SIGINT was received within the block."""
+    received = []
     previous = {
-        number: signal.signal(number, lambda number, _: came.append(number))
+        number: signal.signal(number, lambda number, _: received.append(number))
         for number in (signal.SIGTERM, signal.SIGINT)
     }
     try:
-        yield lambda: bool(came)
+        yield lambda: bool(received)
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

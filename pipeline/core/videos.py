@@ -1,4 +1,4 @@
-"""The recordings of one agent: who they are, what role they play, on which side of the split they stand.
+"""The recordings of one agent with their role and split.
 
 `plan` writes them to `build/<agent>/plan/videos.json`; stages read them with `read`. Standard library only.
 """
@@ -16,7 +16,7 @@ Split = Literal["train", "test", "none"]
 ROLES: tuple[Role, ...] = get_args(Role)
 SPLITS: tuple[Split, ...] = get_args(Split)
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".3gp", ".webm")
-"""names of video files end like this, in lower case"""
+"""suffixes of video files, lower case"""
 
 
 @dataclass(frozen=True)
@@ -24,14 +24,14 @@ class Video:
     """One recording."""
 
     id: str
-    """`v000`, `v001`, ...; never given to another file."""
+    """`v000`, `v001`, ...; never reused for another file."""
     file: str
-    """Name inside the capture folder; appears nowhere else, whatever characters it holds."""
+    """Name in the capture folder, with any characters; not used in other paths."""
     role: Role
     split: Split
-    """Sessions: `train` or `test`; every other role `none`."""
+    """`train` or `test` for sessions, `none` for other roles."""
     sha256: str | None
-    """Of the recording; None for the built-in capture, whose manifest holds it."""
+    """Hash of the recording; None for the built-in capture, which has a manifest."""
     synchronized_with: str | None = None
     """Id of the session whose clock this one shares (held-out phone)."""
     offset_s: float = 0.0
@@ -39,13 +39,13 @@ class Video:
     mapped: bool = False
     """A turnaround or session without depth: its cameras and depth come from the map of the walk-through."""
     animal: str | None = None
-    """Whose turnaround it is, in a home of several animals."""
+    """Name of the animal of a turnaround, in a home of several."""
 
 
 def role_of_animal(
     video: Video | None, otherwise: Literal["turnaround", "session"]
 ) -> Literal["turnaround", "session"]:
-    """Return which of the two a recording of the animal is; ``otherwise`` where nothing is known of it."""
+    """Return whether a recording is the turnaround or a session; ``otherwise`` if it is unknown (None)."""
     if video is None:
         return otherwise
     return "turnaround" if video.role == "turnaround" else "session"

@@ -29,7 +29,7 @@ def plan_metrics(data: BehaviorData, on_cpu: Ats, seed: int, *, measure: bool) -
     for name, steps in STEPS.items():
         sampling = replace(on_cpu.sampling, goal_steps=steps, sequence_steps=steps)
         method, seconds = replace(on_cpu, sampling=sampling), []
-        with threads.alone():
+        with threads.single_threaded():
             for _ in range(REPEATS):
                 begin = time.perf_counter()
                 method.sample(context, 1, np.random.default_rng(seed))

@@ -68,7 +68,7 @@ def cosine(progress: float) -> float:
     return LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * progress))
 
 
-@threads.alone()
+@threads.single_threaded()
 def optimise(problem: Problem, plan: OptimizationPlan) -> dict[str, FitRecord]:
     """Run all phases; the modules of the problem change in place. Returns the losses of each phase.
 
