@@ -1,7 +1,7 @@
-"""Guarded access to the members of a recording: a ZIP that may be hostile, or a folder.
+"""Safe access to the members of a recording: an untrusted ZIP archive, or a folder.
 
-Nothing is ever extracted to disk: members are checked when the container opens and read one at a time, at
-most ``max_bytes`` each.
+Nothing is extracted to disk: members are checked when the container is opened and read one at a time, at most
+``max_bytes`` each.
 """
 
 import codecs
@@ -25,53 +25,53 @@ from pipeline.recordings.recording import broken_metadata, damaged, refuse_other
 
 MAX_MEMBER_BYTES = 64 << 20
 UNKNOWN = 65535
-"""what 16-bit depth pictures hold, beside 0, where nothing was measured"""
+"""value of 16-bit depth pictures, besides 0, for unknown depth"""
 MAX_MEMBERS = 1_000_000
-"""members that are listed at all, in 0.6 GB of memory: 90 minutes at 60 Hz with three files a frame"""
-MEMBERS_PER_FRAME, MEMBERS_BESIDE = 4, 1000
-"""members that a recording may hold per declared frame (colour, depth, confidence, one more), and beside"""
+"""maximum number of members, 0.6 GB when listed: 90 minutes at 60 Hz with three files per frame"""
+MEMBERS_PER_FRAME, EXTRA_MEMBERS = 4, 1000
+"""maximum members per declared frame (colour, depth, confidence, one more), and in addition"""
 GIB = 1 << 30
 MAX_TOTAL_BYTES = 256 * GIB
 MAX_RATIO = 200
-"""unpacked over packed size beyond which a member is no picture but a bomb"""
+"""compression ratio beyond which a member counts as a ZIP bomb"""
 SMALL_BYTES = 1 << 16
-"""members up to this size are never called bombs"""
+"""members up to this size never count as ZIP bombs"""
 MAX_DIGITS = 18
-"""of a frame number in a file name: what 64 bits hold"""
+"""maximum digits of a frame number in a file name: it fits 64 bits"""
 DIRECTORY_ENTRY_BYTES = 47
-"""least size of a member's entry in a ZIP's directory"""
+"""minimum size of an entry in a ZIP's central directory"""
 _END_OF_DIRECTORY, _END_OF_DIRECTORY_64 = b"PK\x05\x06", b"PK\x06\x06"
 _SIZE_AT, _COUNT_AT, _SIZES_64_AT = 12, 10, 32
-"""offsets in the end of the directory: its size, the number of its entries; both in the 64-bit record"""
+"""offsets in the end of central directory record: directory size, number of entries; both in ZIP64's"""
 _TAIL_BYTES = (1 << 16) + 22 + 20 + 56
-"""longest end of a ZIP: comment, end of directory, its 64-bit locator and record"""
+"""maximum length of a ZIP's end: comment, end of central directory, ZIP64 locator and record"""
 _UNREADABLE = (
     zipfile.BadZipFile, EOFError, zlib.error, lzma.LZMAError, struct.error, ValueError, NotImplementedError,
     RuntimeError, OverflowError, OSError,
 )  # fmt: skip
-"""what zipfile raises for archives that are damaged, encrypted, of unknown methods, or lie"""
+"""what zipfile raises for archives that are damaged, encrypted, inconsistent or of unknown compression"""
 
 
 class Container(ABC):
     """Named members of a recording."""
 
     where: str
-    """shown in messages"""
+    """path for messages"""
     names: frozenset[str]
 
     @abstractmethod
     def read(self, name: str, max_bytes: int = MAX_MEMBER_BYTES) -> bytes:
-        """Read one member. Raises InputError when it is damaged or longer than ``max_bytes``."""
+        """Read one member. Raises InputError if it is damaged or longer than ``max_bytes``."""
 
     def place(self, name: str) -> str:
         """Return a member's name for messages."""
         return f"{self.where}/{name}"
 
     def text(self, name: str) -> str:
-        """Read a text, UTF-8 or as Windows saves it, with a mark; what is neither is replaced."""
+        """Read a text in UTF-8, or UTF-16 with a byte order mark; invalid bytes are replaced."""
         data = self.read(name)
-        wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-        return data.decode("utf-16" if wide else "utf-8-sig", errors="replace")
+        utf_16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        return data.decode("utf-16" if utf_16 else "utf-8-sig", errors="replace")
 
     def table(self, name: str) -> dict[str, Any]:
         """Read a JSON table. Raises CAP-004."""
@@ -104,7 +104,7 @@ class Container(ABC):
         return np.where(raw == UNKNOWN, 0, raw).astype(np.float32) / np.float32(per_meter)
 
     def numbered(self, folder: str, *suffixes: str) -> dict[int, str]:
-        """Return the members of a folder that are named by frame number, by it; of these suffixes, if any."""
+        """Return a folder's members named by frame number, by number; only with these suffixes, if any."""
         found = {}
         for name in sorted(name for name in self.names if name.startswith(f"{folder}/")):
             number, suffix = frame_number(Path(name).stem), Path(name).suffix.lower()
@@ -114,7 +114,7 @@ class Container(ABC):
 
 
 class FolderContainer(Container):
-    """A folder's files, addressed by their relative paths; links are not followed, hidden files not seen."""
+    """A folder's files by relative path, without hidden files and symbolic links."""
 
     def __init__(self, folder: Path) -> None:
         self.where = str(folder)
@@ -123,7 +123,7 @@ class FolderContainer(Container):
         self.names = frozenset(path.relative_to(folder).as_posix() for path in files)
 
     def path(self, name: str) -> Path:
-        """Return where a regular file lies. Raises CAP-001 for links, pipes and names that are not there."""
+        """Return the path of a regular file. Raises CAP-001 for links, pipes and missing names."""
         if name not in self.names:
             raise damaged(self.place(name), "there is no such regular file")
         return self._folder / name
@@ -138,7 +138,7 @@ class FolderContainer(Container):
 
 
 class ZipContainer(Container):
-    """A ZIP's members, after its directory has been checked for anything a recording never holds."""
+    """A ZIP's members, after a check of its central directory for unsafe ones."""
 
     def __init__(self, path: Path) -> None:
         self.where = str(path)
@@ -162,19 +162,19 @@ class ZipContainer(Container):
 
 
 def refuse_surplus_members(container: Container, frames: int) -> None:
-    """Raise CAP-002 where a container holds more members than its metadata's count of frames accounts for."""
-    most = MEMBERS_PER_FRAME * frames + MEMBERS_BESIDE
+    """Raise CAP-002 if a container has too many members for the number of frames in its metadata."""
+    most = MEMBERS_PER_FRAME * frames + EXTRA_MEMBERS
     if len(container.names) > most:
         raise _unsafe(container.where, f"{len(container.names)} members for {frames} frames, at most {most}")
 
 
 def frame_number(stem: str) -> int | None:
-    """Return the number that a file name is, None for any other name."""
+    """Return the frame number in a file name's stem; None if it is not a number."""
     return int(stem) if stem.isascii() and stem.isdigit() and len(stem) <= MAX_DIGITS else None
 
 
 def _declared_members(path: Path) -> int:
-    """Read how many members a ZIP's end declares, before its directory is read into memory."""
+    """Return the number of members that a ZIP declares, before its directory is read into memory."""
     with open(path, "rb") as file:
         file.seek(max(path.stat().st_size - _TAIL_BYTES, 0))
         tail = file.read()
@@ -200,7 +200,7 @@ def _unsafe(where: str, why: str) -> InputError:
 
 
 def _refuse_unsafe(members: list[zipfile.ZipInfo], where: str) -> None:
-    """Refuse archives with too many, too large, too dense, encrypted, linked, doubled or escaping members."""
+    """Raise CAP-002 for too many, too large, encrypted, linked, duplicate or escaping members, ZIP bombs."""
     if len(members) > MAX_MEMBERS:
         raise _unsafe(where, f"{len(members)} members, at most {MAX_MEMBERS} are read")
     if sum(info.file_size for info in members) > MAX_TOTAL_BYTES:
@@ -214,7 +214,7 @@ def _refuse_unsafe(members: list[zipfile.ZipInfo], where: str) -> None:
 
 
 def _fault_of(info: zipfile.ZipInfo) -> str | None:
-    """Name what is wrong with a member, if anything."""
+    """Return what is unsafe about a member, if anything."""
     name = info.orig_filename
     parts = name.split("/")
     if "\\" in name or "\0" in name or ":" in name or name.startswith("/") or ".." in parts:

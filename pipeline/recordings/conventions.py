@@ -1,7 +1,7 @@
-"""Check on the depth itself what a recording's device poses mean, and whether they mean anything.
+"""Verify a recording's device poses and their convention against its depth.
 
-The depth of a few frames is moved by the poses into others and compared with what was measured there. The
-documented convention stays unless it is clearly refuted and another one clearly fits.
+The depth of a few frames is warped by the poses into other frames and compared with the depth there. The
+documented convention is kept unless it is clearly refuted and another one clearly fits.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ from pipeline.geometry.subsampling import evenly
 TOLERANCE_M = 0.015
 TOLERANCE_SHARE = 0.01
 UNUSABLE_FACTOR = 4.0
-"""of the tolerance, which grows with depth, beyond which poses are no mere drift"""
+"""residual, in tolerances, beyond which poses are wrong and not merely drifting"""
 MIN_OVERLAP = 0.25
 MIN_TURN_RAD = np.radians(3.0)
 MIN_SHIFT_M = 0.05
@@ -26,15 +26,15 @@ POSE_PAIRS = 6
 """pairs of frames on which device poses are checked against depth"""
 GAP_S = (0.33, 1.5)
 GAP_FRAMES = 2.5
-"""pairs may lie this many frames apart where frames are rare"""
+"""maximum gap of a pair at low frame rates, in frames"""
 NEAREST_M = 0.05
 """points nearer to the second camera are not compared"""
 MIN_COMPARED = 50
-"""points that a pair must share to be judged"""
+"""minimum number of common points of a pair"""
 UNIT_TOLERANCE = 0.05
-"""quaternions as lengths: what rounding to a few digits leaves"""
+"""tolerance of a quaternion's norm, for values rounded to a few digits"""
 STRIDE_PX, POINTS_A_SIDE = 3, 80
-"""every third pixel of the first picture is enough, and so are 80 along its longer side"""
+"""points are sampled every third pixel of the first picture, at most 80 along its longer side"""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Convention:
     direction: Literal["camera_to_world", "world_to_camera"] = "camera_to_world"
     axes: Literal["opengl", "opencv"] = "opengl"
     quarter_turns: int = 0
-    """clockwise turns from the stored picture to the one that the poses refer to"""
+    """clockwise turns from the stored picture to the camera of the poses"""
     quaternion: Literal["xyzw", "wxyz"] = "xyzw"
 
 
@@ -83,7 +83,7 @@ class PoseCheck:
     """median over pairs of the median depth difference; NaN when nothing could be compared"""
     overlap: float
     tolerance_m: float
-    """residual that measured depth of this distance allows"""
+    """allowed residual, which grows with depth"""
     reason: str
 
 
@@ -108,8 +108,8 @@ def check_poses(
     documented: Convention = OPENGL,
     among: Sequence[Convention] = CONVENTIONS,
 ) -> PoseCheck:
-    """Decide which convention ``among`` these the poses follow; ``depth_view`` reads a frame's depth."""
-    broken = "the recording has no device poses" if pose is None else _fault_of(pose)
+    """Find the convention, ``among`` the given ones, that poses follow; ``depth_view`` reads a depth map."""
+    broken = "the recording has no device poses" if pose is None else _invalid_reason(pose)
     if pose is None or broken:
         return PoseCheck("unusable", documented, 0, np.nan, np.nan, TOLERANCE_M, broken)
     chosen = _moving_pairs(odometry_from_pose(pose, documented), timestamp_s, pairs)
@@ -137,8 +137,8 @@ class _Score:
         return self.residual_m / max(self.overlap, 1e-3)
 
 
-def _fault_of(pose: Float[np.ndarray, "frame 7"]) -> str:
-    """Name what makes poses meaningless without looking at depth; nothing where they may mean something."""
+def _invalid_reason(pose: Float[np.ndarray, "frame 7"]) -> str:
+    """Return why poses are invalid regardless of depth; empty if they may be valid."""
     if not np.isfinite(pose).all():
         return "device poses are not finite"
     if np.any(np.abs(np.linalg.norm(pose[:, :4], axis=1) - 1) > UNIT_TOLERANCE):
@@ -151,7 +151,7 @@ def _fault_of(pose: Float[np.ndarray, "frame 7"]) -> str:
 def _moving_pairs(
     odometry_from_camera: Float[np.ndarray, "frame 4 4"], timestamp_s: Float[np.ndarray, "frame"], pairs: int
 ) -> np.ndarray:
-    """Pick up to ``pairs`` (first, second) frames with time and motion between, spread over the recording."""
+    """Pick up to ``pairs`` frame pairs with time and motion between them, spread over the recording."""
     second = np.searchsorted(timestamp_s, timestamp_s + GAP_S[0])
     first = np.flatnonzero(second < len(timestamp_s))
     second = second[first]
@@ -188,7 +188,7 @@ def _score(
 def compare(
     first: DepthPicture, second: DepthPicture, second_from_first: Float[np.ndarray, "4 4"]
 ) -> tuple[float, float, float]:
-    """Return (median depth difference, share of points that can be compared, tolerance), metres."""
+    """Return (median depth difference in metres, share of compared points, tolerance in metres)."""
     stride = max(STRIDE_PX, max(first.depth.shape) // POINTS_A_SIDE)
     every = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     points_first = cameras.back_project(first.depth, first.intrinsics)[every][first.depth[every] > 0]
@@ -209,7 +209,7 @@ def compare(
 
 
 def _judge(scores: dict[Convention, _Score], documented: Convention, pairs: int) -> PoseCheck:
-    """Keep the documented convention unless it is refuted and another one is clearly right."""
+    """Keep the documented convention unless it is refuted and another one clearly fits."""
     score, best = scores[documented], min(scores, key=lambda convention: scores[convention].cost)
     verdict: Verdict = "documented"
     chosen = documented

@@ -1,7 +1,7 @@
-"""A depth camera that stands beside the colour camera, as in Kinects and most RGB-D cameras.
+"""A depth camera beside the colour camera, as in Kinects and most RGB-D cameras.
 
-`reproject` brings its depth to the colour camera's optical frame, on a grid of about its own size; what the
-colour camera cannot see behind something nearer is left out by a z-buffer.
+`reproject` registers its depth to the colour camera at about its own resolution, with a z-buffer for
+occlusion.
 """
 
 from dataclasses import dataclass
@@ -12,12 +12,12 @@ from jaxtyping import Float
 from pipeline.geometry import cameras, rigid
 
 NEAREST_M = 0.05
-"""depth in the colour camera below this lies at or behind its lens, metres"""
+"""minimum depth in the colour camera, metres"""
 
 
 @dataclass(frozen=True)
 class DepthCamera:
-    """Where a depth camera stands and how it sees; both cameras have OpenCV axes."""
+    """Intrinsics and extrinsics of a depth camera; both cameras have OpenCV axes."""
 
     intrinsics: Float[np.ndarray, "3 3"]
     """pixels of the depth picture as stored"""
@@ -33,7 +33,7 @@ class DepthCamera:
 
 
 def grid_size(depth_size: tuple[int, int], color_size: tuple[int, int]) -> tuple[int, int]:
-    """Return the (height, width) of reprojected depth: the colour's shape, the depth's longer side."""
+    """Return the (height, width) of reprojected depth: the colour's aspect ratio, the depth's longer side."""
     share = max(depth_size) / max(color_size)
     return round(color_size[0] * share), round(color_size[1] * share)
 

@@ -1,6 +1,6 @@
-"""From a recording to upright frames at a steady rate.
+"""From a recording to upright frames at a fixed rate.
 
-`understand` costs a second and reads a dozen depth pictures; `frames` then reads one picture at a time.
+`understand` takes a second and reads a dozen depth pictures; `frames` then reads one picture at a time.
 """
 
 import dataclasses
@@ -27,18 +27,18 @@ from pipeline.recordings.upright import (
 
 JPEG = b"\xff\xd8"
 MAX_DEPTH_SIDE_PX = 640
-"""larger depth was enlarged by the app; it is sampled down again"""
+"""larger depth was upsampled by the app; it is downsampled again"""
 MIN_TRACKED = 0.8
-"""share of frames with a device pose below which device poses are not used at all"""
+"""minimum share of frames with a device pose for poses to be used at all"""
 MEASURED, RELATIVE = "measured", "relative"
 UPRIGHT_VIEWS = 12
-"""frames whose depth is used to find the up direction where no sensor measured it"""
+"""number of frames whose depth is used to find the up direction if no sensor measured it"""
 UNIT_VIEWS = 5
-"""frames on which the unit of the depth is checked"""
+"""number of frames for checking the unit of depth"""
 NEAREST_TYPICAL_M, FARTHEST_TYPICAL = 0.1, 2.0
-"""typical depth is not below the one, metres, nor above the other, in units of the farthest that is used"""
+"""limits of the median depth: metres, and multiples of the maximum depth that is used"""
 MAX_STRETCHED = 0.03
-"""difference in shape of pictures and depth, as a share, beyond which they cannot show the same"""
+"""maximum relative difference in aspect ratio between pictures and depth"""
 SHARPNESS_WIDTH_PX = 240
 DARK = 0.15
 """mean brightness (0..1) below which a picture loses quality"""
@@ -46,12 +46,12 @@ DARK = 0.15
 
 @dataclass(frozen=True)
 class ExtractionPlan:
-    """What was understood of a recording; ``chosen`` indexes its frames, everything else is upright."""
+    """How to extract a recording; ``chosen`` indexes its frames, everything else is upright."""
 
     chosen: Int[np.ndarray, "frame"]
     timestamp_s: Float[np.ndarray, "frame"]
     stored_size: tuple[int, int]
-    """(height, width) of the colour pictures before the turn"""
+    """(height, width) of the colour pictures before rotation"""
     intrinsics: Float[np.ndarray, "frame 3 3"]
     """colour pixels"""
     depth_intrinsics: Float[np.ndarray, "frame 3 3"]
@@ -70,13 +70,13 @@ class ExtractedFrame:
 
     color: UInt8[np.ndarray, "height width 3"]
     jpeg: bytes
-    """the phone's own bytes where the picture is kept as it is"""
+    """the phone's original bytes if the picture is unchanged"""
     depth: Float[np.ndarray, "depth_height depth_width"]
     """metres, 0 = unknown"""
     confidence: UInt8[np.ndarray, "depth_height depth_width"]
     """0 low, 1 medium, 2 high"""
     sharpness: float
-    """standard deviation of the Laplacian of the picture at a common width"""
+    """standard deviation of the Laplacian at a common width"""
     brightness: float
     """mean, 0..1"""
     depth_valid: float
@@ -86,7 +86,7 @@ class ExtractedFrame:
 def understand(
     recording: Recording, *, rate_hz: float, max_depth_m: float, max_side_px: int
 ) -> ExtractionPlan:
-    """Choose frames, check the poses on the depth, find the upright turn and the size of the pictures.
+    """Choose frames, check the poses against depth, find the rotation to upright and the picture size.
 
     Raises CAP-006 for a recording without depth, CAP-004 and CAP-008 for impossible intrinsics and depth.
     """
@@ -140,7 +140,7 @@ def _upright(
     chosen: Int[np.ndarray, "frame"],
     view: Callable[[int], conventions.DepthPicture],
 ) -> tuple[Float[np.ndarray, "frame 4 4"] | None, int]:
-    """Return the upright cameras of the chosen frames, if poses are of use, and the turns to upright."""
+    """Return the upright cameras of the chosen frames (None without usable poses) and the quarter turns."""
 
     def room() -> list[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]]:
         shown = chosen[evenly(len(chosen), UPRIGHT_VIEWS, rounded=True)]
@@ -161,7 +161,7 @@ def _upright(
 def _refuse_other_pictures(
     intrinsics: Float[np.ndarray, "frame 3 3"], color_size: tuple[int, int], where: str
 ) -> None:
-    """Raise CAP-004 for a centre outside of the picture: intrinsics of another resolution or turn."""
+    """Raise CAP-004 for a principal point outside the picture: intrinsics of another size or rotation."""
     (height, width), (x, y) = color_size, np.median(intrinsics[:, :2, 2], axis=0)
     if not (0 < x < width and 0 < y < height):
         why = f"the intrinsics' centre, {x:.0f} {y:.0f}, lies outside of pictures of {width} x {height}"
@@ -169,7 +169,7 @@ def _refuse_other_pictures(
 
 
 def _refuse_other_shape(color_size: tuple[int, int], depth_size: tuple[int, int], where: str) -> None:
-    """Raise CAP-008 for depth of another shape than the pictures, all as stored: one shows more."""
+    """Raise CAP-008 for depth of another aspect ratio than the pictures, both as stored."""
     (height, width), (depth_height, depth_width) = color_size, depth_size
     stretched_px = abs(depth_height - depth_width * height / width)
     rounding_px = 0.5 * (1 + height / width)
@@ -180,7 +180,7 @@ def _refuse_other_shape(color_size: tuple[int, int], depth_size: tuple[int, int]
 
 
 def _refuse_other_unit(recording: Recording, max_depth_m: float) -> None:
-    """Raise CAP-008 for depth too far or near for any sensor's use, as if written in another unit."""
+    """Raise CAP-008 for implausibly far or near depth, as if stored in another unit."""
     shown = recording.index[evenly(len(recording.index), UNIT_VIEWS)]
     depth = np.concatenate([recording.read_depth(int(number)).ravel() for number in shown])
     depth = depth[np.isfinite(depth) & (depth > 0)]
@@ -192,7 +192,7 @@ def _refuse_other_unit(recording: Recording, max_depth_m: float) -> None:
 
 
 def _tracked(recording: Recording) -> tuple[Int[np.ndarray, "used"], Float[np.ndarray, "used 7"] | None, str]:
-    """Return the frames to use, their poses, and what was lost: of many lost ones no pose is used."""
+    """Return the frames to use, their poses, and remarks; without poses if too many are lost."""
     everything = np.arange(len(recording.index))
     if recording.pose is None:
         return everything, None, ""
@@ -203,7 +203,7 @@ def _tracked(recording: Recording) -> tuple[Int[np.ndarray, "used"], Float[np.nd
 
 
 def _y_up_from(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
-    """Return the smallest turn of the poses' world that brings ``up`` to +y."""
+    """Return the smallest rotation of the poses' world that maps ``up`` to +y."""
     axis, angle = np.cross(up, (0.0, 1.0, 0.0)), np.arccos(np.clip(up[1] / np.linalg.norm(up), -1, 1))
     axis = axis / np.linalg.norm(axis) if np.linalg.norm(axis) > 1e-9 else np.array([1.0, 0.0, 0.0])
     return rigid.make(rigid.rotation_from_vector(axis * angle), np.zeros(3))
@@ -212,7 +212,7 @@ def _y_up_from(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
 def picture(
     recording: Recording, row: int, size: tuple[int, int] | None = None
 ) -> UInt8[np.ndarray, "height width 3"] | None:
-    """Read one frame's picture, not turned, reduced to a (height, width); None where it is damaged."""
+    """Read one frame's picture as stored, reduced to a (height, width); None if it is damaged."""
     stored = recording.read_color(int(recording.index[row]))
     if stored is None:
         return None
@@ -224,7 +224,7 @@ def picture(
 def frames(
     recording: Recording, plan: ExtractionPlan, *, max_depth_m: float, jpeg_quality: int
 ) -> Iterator[ExtractedFrame | None]:
-    """Yield the plan's frames in order, upright; None where the file is damaged."""
+    """Yield the plan's frames in order, upright; None for damaged ones."""
     for number in recording.index[plan.chosen]:
         stored = recording.read_color(int(number))
         if stored is None:
@@ -248,7 +248,7 @@ def frames(
 
 
 def stored_depth(recording: Recording, number: int, max_depth_m: float) -> Float[np.ndarray, "height width"]:
-    """Read one frame's known depth as stored (not turned), metres, at most at a sensor's size."""
+    """Read one frame's depth in metres, as stored (not rotated), at most `MAX_DEPTH_SIDE_PX` large."""
     depth = known_depth(recording.read_depth(number), max_depth_m)
     if recording.depth_camera is not None:
         assert recording.intrinsics is not None, recording.where
@@ -259,7 +259,7 @@ def stored_depth(recording: Recording, number: int, max_depth_m: float) -> Float
 
 
 def _sampled(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Return a picture at another (height, width), by its nearest pixels."""
+    """Resize a picture to a (height, width) by nearest neighbour."""
     same = image.shape == size
     return image if same else cv2.resize(image, size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
 
@@ -273,7 +273,7 @@ def _decoded(stored: Picture, size: tuple[int, int], where: str) -> UInt8[np.nda
 
 
 def _confidence(recording: Recording, number: int, depth: np.ndarray) -> UInt8[np.ndarray, "height width"]:
-    """Return the confidence of depth: 2 where no frame has any, 0 where this one alone lacks it."""
+    """Return the confidence of depth: 2 if the recording has none, 0 if only this frame lacks it."""
     if recording.read_confidence is None:
         return np.where(depth > 0, 2, 0).astype(np.uint8)
     confidence = recording.read_confidence(number)
@@ -283,7 +283,7 @@ def _confidence(recording: Recording, number: int, depth: np.ndarray) -> UInt8[n
 
 
 def reduced_size(size: tuple[int, int], max_side_px: int) -> tuple[int, int]:
-    """Divide a (height, width) by the least whole number that brings its longer side to ``max_side_px``."""
+    """Divide a (height, width) by the smallest integer such that its longer side fits ``max_side_px``."""
     factor = -(-max(size) // max_side_px)
     return (round(size[0] / factor), round(size[1] / factor))
 
@@ -291,7 +291,7 @@ def reduced_size(size: tuple[int, int], max_side_px: int) -> tuple[int, int]:
 def known_depth(
     depth: Float[np.ndarray, "height width"], max_depth_m: float
 ) -> Float[np.ndarray, "height width"]:
-    """Return depth in metres with 0 where it is not finite, not positive or beyond the sensor's range."""
+    """Return depth in metres, 0 where it is not finite, not positive or out of the sensor's range."""
     return np.where(np.isfinite(depth) & (depth > 0) & (depth < max_depth_m), depth, np.float32(0))
 
 
@@ -308,13 +308,13 @@ def quality_of(
     brightness: Float[np.ndarray, "frame"],
     depth_valid: Float[np.ndarray, "frame"],
 ) -> Float[np.ndarray, "frame"]:
-    """Return 0..1 per frame: how sharp it is for its recording, whether it is lit, how much depth it has."""
+    """Return a quality 0..1 per frame from relative sharpness, brightness and share of known depth."""
     sharp = np.minimum(sharpness / max(float(np.median(sharpness)), 1e-6), 1)
     return sharp * np.minimum(brightness / DARK, 1) * depth_valid
 
 
 def summary(recording: Recording, plan: ExtractionPlan) -> str:
-    """Summarise in one line what was understood of a recording."""
+    """Summarise an extraction plan in one line."""
     seconds = recording.timestamp_s[-1] - recording.timestamp_s[0]
     height, width = recording.color_size
     turned = f"turned {90 * plan.quarter_turns} deg clockwise" if plan.quarter_turns else "upright as stored"
@@ -327,7 +327,7 @@ def summary(recording: Recording, plan: ExtractionPlan) -> str:
 
 
 def choose_frames(timestamp_s: Float[np.ndarray, "frame"], rate_hz: float) -> Int[np.ndarray, "chosen"]:
-    """Pick, for every tick of a clock at ``rate_hz``, the frame nearest to it within half a tick, if any.
+    """Pick the frame nearest to every tick of a clock at ``rate_hz``, within half a tick, if any.
 
     Ticks start at the first frame; ``timestamp_s`` must increase.
     """

@@ -1,7 +1,7 @@
-"""The formats that are understood: how each is recognised and which file of this room reads it.
+"""The known formats: how each is recognised and which module reads it.
 
-A new format is one file with `open_recording` and one line here. Standard library only until a recording
-is opened: the planner looks at the disk with `format_of`.
+A new format is a module with `open_recording` and a line here. Standard library only until a recording is
+opened, since the planner uses `format_of`.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ UNDERSTOOD = (
 )
 
 MAX_SCALE_SOURCES = 3
-"""sessions that are read for scale; each costs half a minute"""
+"""maximum number of sessions read for scale; each takes half a minute"""
 
 
 @dataclass(frozen=True)
 class Format:
-    """One kind of recording."""
+    """One format of recordings."""
 
     name: str
     fits: Callable[[Path], bool]
-    """whether a path is one, by names alone"""
+    """whether a path has this format, judged by names only"""
     reader: str
-    """module of this package that opens it"""
+    """module of this package that reads it"""
     has_depth: bool = True
 
 
@@ -70,12 +70,12 @@ FORMATS: tuple[Format, ...] = (
 
 
 def format_of(path: Path) -> Format | None:
-    """Return the format that a path's names fit, or None."""
+    """Return the format of a path, judged by names, or None."""
     return next((each for each in FORMATS if each.fits(path)), None)
 
 
 def open_recording(path: Path) -> Recording:
-    """Open a recording of any format, reading no pictures; raises CAP-003, and what its reader raises."""
+    """Open a recording of any format without reading pictures. Raises CAP-003, and errors of its reader."""
     if not path.exists():
         raise InputError("CAP-003", "there is no such recording", str(path), f"give one of: {UNDERSTOOD}")
     found = format_of(path)
@@ -85,7 +85,7 @@ def open_recording(path: Path) -> Recording:
 
 
 def _reader(name: str) -> Callable[[Path], Recording]:
-    """Import what opens a format, as late as it is needed: the planner does without."""
+    """Import a format's reader, only when needed: the planner does not need it."""
     from pipeline.recordings import (
         nerfcapture,
         plain_video,
@@ -101,7 +101,7 @@ def _reader(name: str) -> Callable[[Path], Recording]:
 
 
 def scale_sources(folder: Path, video: Video, videos: Iterable[Video]) -> list[Video]:
-    """Return the training sessions in ``folder`` whose depth gives a walk-through without depth its scale."""
+    """Return the training sessions in ``folder`` whose depth scales a walk-through without depth."""
     if video.role != "walkthrough" or has_depth(folder / video.file):
         return []
     sessions = (other for other in videos if other.role == "session" and other.split == "train")
@@ -109,6 +109,6 @@ def scale_sources(folder: Path, video: Video, videos: Iterable[Video]) -> list[V
 
 
 def has_depth(path: Path) -> bool:
-    """Return, by its names alone, whether a recording has depth."""
+    """Return whether a recording has depth, judged by names only."""
     found = format_of(path)
     return found is not None and found.has_depth

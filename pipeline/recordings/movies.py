@@ -1,7 +1,7 @@
-"""Video files by frame number: any codec that PyAV reads, damaged places left out, nothing held in memory.
+"""Random access to frames of video files with any codec that PyAV decodes, skipping damaged ones.
 
-Frames are identified by their presentation time, read from the packets without decoding: a frame that a
-damaged place swallows shifts no other.
+Frames are identified by presentation timestamp (PTS), read from the packets without decoding, so that a frame
+lost to damage does not shift the others.
 """
 
 import contextlib
@@ -23,19 +23,20 @@ _GUARDS = {
     "protocol_whitelist": "file",
     "max_pixels": str(MAX_PIXELS),
 }
-"""a list of other files (ffconcat, HLS) is no video, pictures larger than any phone's are not decoded"""
+"""refuses playlists of other files (ffconcat, HLS) and pictures larger than any phone's"""
 SKIP_FRAMES = 90
-"""further ahead than this, decoding begins anew at the nearest key frame"""
+"""frames to decode ahead sequentially; beyond, the decoder seeks to the nearest key frame"""
 CAPTURE_RATE = "com.android.capture.fps"
-"""tag of Android: pictures taken per second, however many are shown per second"""
-CLEARLY_SLOWED = 3.0
-"""dim light halves the rate of an ordinary video; from this factor on it is slow motion, or time lapse"""
+"""Android's metadata tag of the capture frame rate, which may differ from the playback rate"""
+MIN_SLOWDOWN = 3.0
+"""ratio of capture to playback rate from which a video is slow motion (or its inverse, time lapse); dim light
+halves the rate of an ordinary video"""
 MAX_ASPECT = 2.0
-"""of a pixel's sides; a camera's are less unequal, more is a broken header"""
+"""maximum pixel aspect ratio; a larger one is a broken header"""
 
 
 class Movie:
-    """A video whose frames are read by number, cheapest in order; stretched to square pixels on request."""
+    """A video whose frames are read by number, fastest in order; optionally resampled to square pixels."""
 
     def __init__(self, path: Path, *, square_pixels: bool = False) -> None:
         self.where = str(path)
@@ -47,7 +48,7 @@ class Movie:
                 raise no_frames(self.where, "the video is empty")
             self._pts = np.array(times)
             shown_s = (self._pts - self._pts[0]) * float(stream.time_base)
-            self.timestamp_s = shown_s / _slowed(shown_s, container.metadata.get(CAPTURE_RATE, ""))
+            self.timestamp_s = shown_s / _slowdown(shown_s, container.metadata.get(CAPTURE_RATE, ""))
             aspect = float(stream.sample_aspect_ratio or 1) if square_pixels else 1.0
         self._decoder: Iterator[av.VideoFrame] | None = None
         self._position = 0
@@ -60,7 +61,7 @@ class Movie:
         return len(self._pts)
 
     def read(self, number: int) -> UInt8[np.ndarray, "height width 3"] | None:
-        """Return one frame as RGB, as stored (not turned); None where the file is damaged there."""
+        """Return one frame as RGB, as stored (not rotated); None if it is damaged."""
         if self._decoder is None or number < self._position or number > self._position + SKIP_FRAMES:
             self._decoder = self._decoded_from(number)
         wanted = int(self._pts[number])
@@ -68,7 +69,7 @@ class Movie:
         for frame in self._decoder:
             if frame.pts is None or frame.pts < wanted:
                 continue
-            if frame.pts > wanted:  # the wanted one is lost; this one may be asked for next
+            if frame.pts > wanted:  # the wanted frame is lost; keep this one for the next call
                 self._decoder = itertools.chain([frame], self._decoder)
                 return None
             height, width = self.size
@@ -83,21 +84,21 @@ class Movie:
         return frame
 
     def _decoded_from(self, number: int) -> Iterator[av.VideoFrame]:
-        """Yield decoded frames from one at or before a number on.
+        """Yield decoded frames, starting at or before frame ``number``.
 
-        Pictures shown before a key frame may be stored behind it and need the key frame before (open groups
-        of pictures, usual in HEVC): decoding begins earlier until nothing before the number is missing.
+        In an open GOP (usual in HEVC) frames shown before a key frame are stored after it and refer to the
+        previous key frame: seek further back until frame ``number`` is not skipped.
         """
         start = number
         while True:
-            decoder = self._sought(start)
+            decoder = self._decoded_from_key_frame(start)
             first = next(decoder, None)
             if not start or (first is not None and (first.pts or 0) <= self._pts[number]):
                 return itertools.chain(() if first is None else (first,), decoder)
             start = max(2 * start - number - 1, 0)
 
-    def _sought(self, number: int) -> Iterator[av.VideoFrame]:
-        """Yield decoded frames from the key frame that is found for a number, stepping over damage."""
+    def _decoded_from_key_frame(self, number: int) -> Iterator[av.VideoFrame]:
+        """Yield decoded frames from the key frame at or before ``number``, skipping damaged packets."""
         with self._opened() as container:
             stream = container.streams.video[0]
             if number:
@@ -132,17 +133,17 @@ class Movie:
             yield container
 
 
-def _slowed(shown_s: Float[np.ndarray, "frame"], capture_rate: str) -> float:
-    """Return how many times slower than life a video is shown, by its tag; 1 where it has none."""
+def _slowdown(shown_s: Float[np.ndarray, "frame"], capture_rate: str) -> float:
+    """Return a video's slow-motion factor by its metadata tag; 1 without a tag."""
     try:
-        slowed = float(capture_rate) * float(np.median(np.diff(shown_s)))
+        slowdown = float(capture_rate) * float(np.median(np.diff(shown_s)))
     except ValueError:
         return 1.0
-    return slowed if CLEARLY_SLOWED <= max(slowed, 1 / max(slowed, 1e-9)) < np.inf else 1.0
+    return slowdown if MIN_SLOWDOWN <= max(slowdown, 1 / max(slowdown, 1e-9)) < np.inf else 1.0
 
 
 def _packet_times(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[int]:
-    """Yield the times of all frames but those that an edit list hides: never shown, decoded for others."""
+    """Yield the PTS of all frames except those hidden by an edit list, which only serve as references."""
     packets = container.demux(stream)
     while True:
         try:

@@ -23,15 +23,15 @@ from pipeline.recordings.recording import (
 
 COEFFICIENTS = ("fl_x", "fl_y", "cx", "cy")
 MIN_REACH_M = 4.0
-"""depth beyond what 16 bits reach comes back as near: what reaches less is refused, metres"""
+"""minimum range of 16-bit depth, metres: beyond its range depth wraps around"""
 LARGEST_UNIT = 65535
-"""of 16 bits"""
+"""maximum value of 16-bit depth"""
 ASSUMED_HZ = 10.0
-"""of streams whose frames carry no times"""
+"""frame rate of streams without timestamps"""
 
 
 def open_recording(path: Path) -> Recording:
-    """Open a streamed folder. Raises CAP-010 for the phone's own zip and streams whose far depth is lost."""
+    """Open a streamed folder. Raises CAP-010 for the phone's own zip and streams whose depth wraps around."""
     container: Container = FolderContainer(path) if path.is_dir() else ZipContainer(path)
     table = _table(container)
     scale = _meters_per_unit(table, container)
@@ -60,7 +60,7 @@ def open_recording(path: Path) -> Recording:
 
 
 def _meters_per_unit(table: dict[str, Any], container: Container) -> float:
-    """Return the unit of the depth pictures, metres. Raises CAP-004 and CAP-010 where there is none."""
+    """Return the unit of the depth pictures, metres. Raises CAP-004 and CAP-010 if there is none."""
     if isinstance(container, ZipContainer) or "depth_integer_scale" in table:
         what = "a zip of transforms, as NeRFCapture saves it, holds no metric depth"
         remedy = "stream from the app with its nerfcapture_dataset.py and give the folder that it writes"
@@ -87,7 +87,7 @@ def _table(container: Container) -> dict[str, Any]:
 
 
 def _frames(table: dict[str, Any], container: Container) -> list[dict[str, Any]]:
-    """Return the frames in the order of their numbers: the app appends them from parallel tasks."""
+    """Return the frames sorted by number: the app appends them from parallel tasks."""
     found = []
     try:
         for frame in table["frames"]:
@@ -104,7 +104,7 @@ def _frames(table: dict[str, Any], container: Container) -> list[dict[str, Any]]
 
 
 def _member(name: str, container: Container) -> str:
-    """Return the member that a frame names; the author's script leaves out the ending of colour pictures."""
+    """Return the member that a frame names; the app's script omits the suffix of colour pictures."""
     name = name.removeprefix("./")
     return next((each for each in (name, f"{name}.png", f"{name}.jpg") if each in container.names), name)
 

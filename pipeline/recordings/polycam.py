@@ -1,8 +1,8 @@
 """Polycam raw data (LiDAR or room mode, developer mode): sparse keyframes with poses, for the walk-through.
 
-Optimised pictures and cameras (`corrected_*`) are used where both exist; their black borders carry no
-depth. The app's own mesh, `raw.glb`, stands turned to its axes; the inverse of `alignmentTransform`
-(column-major) brings it back to the cameras.
+Optimised pictures and cameras (`corrected_*`) are used where both exist; depth is dropped in
+their black borders. The app's own mesh, `raw.glb`, is rotated to its own axes; the inverse of
+`alignmentTransform` (column-major) maps it back to the cameras' world.
 """
 
 import io
@@ -31,9 +31,9 @@ from pipeline.recordings.recording import (
 )
 
 TRUSTED_M = 5.0
-"""depth beyond this is unknown, metres"""
+"""maximum trusted depth, metres"""
 MAX_MESH_BYTES = 512 << 20
-GLB_JSON_LENGTH_AT, GLB_JSON_AT = 12, 20  # where a binary glTF's JSON chunk has its length and begins
+GLB_JSON_LENGTH_AT, GLB_JSON_AT = 12, 20  # byte offsets of length and content of a GLB's JSON chunk
 COEFFICIENTS = ("fx", "fy", "cx", "cy")
 MATRIX = tuple(f"t_{row}{column}" for row in range(3) for column in range(4))
 
@@ -106,7 +106,7 @@ def _depth(
 
 
 def _mesh(container: FolderContainer) -> Mesh:
-    """Read the app's mesh in the cameras' world. Raises CAP-001 and CAP-004."""
+    """Read the app's mesh into the cameras' world. Raises CAP-001 and CAP-004."""
     table = container.table("mesh_info.json")
     try:
         aligned_from_world = np.array(table["alignmentTransform"], float).reshape(4, 4).T
@@ -119,7 +119,7 @@ def _mesh(container: FolderContainer) -> Mesh:
         listed = json.loads(data[GLB_JSON_AT:][: struct.unpack_from("<I", data, GLB_JSON_LENGTH_AT)[0]])
         assert sum(each["count"] for each in listed["accessors"]) <= len(data), "more values than bytes"
         loaded = trimesh.load(io.BytesIO(data), file_type="glb", force="mesh")
-    except Exception as error:  # whatever the reader meets in a file that was cut
+    except Exception as error:  # readers raise anything for a truncated file
         raise damaged(container.place("raw.glb"), repr(error)) from error
     if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
         raise damaged(container.place("raw.glb"), "it holds no surface")
@@ -130,7 +130,7 @@ def _mesh(container: FolderContainer) -> Mesh:
 def _confidence(
     container: FolderContainer, name: str | None, size: tuple[int, int]
 ) -> UInt8[np.ndarray, "height width"] | None:
-    """Read 0 as low, 255 as high and whatever lies between as medium."""
+    """Read confidence as 0 low, 1 medium, 2 high; stored values are 0 low, 255 high, and others medium."""
     if name is None:
         return None
     raw = container.gray(name)

@@ -1,6 +1,6 @@
-"""Record3D, both ways the app exports: an ``.r3d`` archive, or a folder of EXR and JPEG files.
+"""Record3D's two exports: an ``.r3d`` archive, or a folder of EXR and JPEG files.
 
-Files are paired with the metadata's rows by number, so that missing ones shift nothing.
+Files are matched with rows of the metadata by number, so that missing ones do not shift the others.
 """
 
 import math
@@ -36,25 +36,25 @@ from pipeline.recordings.recording import (
 )
 
 DEPTH_SIZES = {49_152: (256, 192), 307_200: (640, 480), 691_200: (960, 720)}
-"""floats per picture -> (height, width) of a portrait recording, where the metadata lack it"""
+"""floats per picture -> (height, width) of a portrait recording, if the metadata lack it"""
 FACE_ID_FLOATS = (307_200, 691_200)
 FACE_ID, LIDAR = 0, 1
-"""the app's numbers of the cameras at the front and at the back"""
+"""the app's numbers of the front and back cameras"""
 MAX_SIDE_PX = 16384
-"""a picture with a longer side is none that a phone takes"""
+"""maximum longer side of a phone's picture"""
 MIN_TIMED = 0.5
-"""share of frames whose times increase below which the times are not used"""
+"""minimum share of frames with increasing timestamps for them to be used"""
 LZFSE_HEADER_BYTES = {b"bvxn": 12, b"bvx1": 772}
-"""of a block of LZVN, and of LZFSE with unpacked tables"""
+"""header size by magic number: LZVN blocks, and LZFSE v1 blocks (uncompressed tables)"""
 LZFSE_FIELD_BITS = 20
-"""of a field in the packed header of LZFSE's version 2"""
+"""bits per field in the packed header of LZFSE v2 blocks"""
 LZFSE_END = b"bvx$"
-"""marks the end of an LZFSE stream"""
+"""end of stream marker of LZFSE"""
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where one kind of export keeps its members; ``%d`` is the frame number."""
+    """Paths of an export's members; ``%d`` is the frame number."""
 
     metadata: str
     color: str
@@ -69,7 +69,7 @@ _FOLDER = _Layout("metadata.json", "rgb/%d.jpg", "depth/%d.exr", "confidence/%d.
 def open_recording(path: Path) -> Recording:
     """Open a ``.r3d`` file, or a folder that is or holds Record3D's ``EXR_RGBD``.
 
-    Raises InputError CAP-001..008 for what cannot be a usable recording.
+    Raises InputError CAP-001..008 for unusable recordings.
     """
     if path.is_dir():
         inner = path / "EXR_RGBD"
@@ -114,9 +114,9 @@ def _open(container: Container, layout: _Layout) -> Recording:
 
 
 class _Metadata:
-    """The recording's JSON, checked as it is read, rows by frame number; every complaint is CAP-004.
+    """The recording's JSON, validated when read, with rows by frame number. Errors are CAP-004.
 
-    What single rows lack is replaced, or left out, and counted in ``remarks``.
+    Values missing in single rows are replaced or dropped, and counted in ``remarks``.
     """
 
     def __init__(self, container: Container, name: str) -> None:
@@ -125,17 +125,17 @@ class _Metadata:
         self.color_size = (self._pixels("h"), self._pixels("w"))
 
     def declared_frames(self) -> int:
-        """Return how many frames the recording has by its metadata, the most where tables disagree."""
+        """Return the number of frames by the metadata, the maximum if tables disagree."""
         tables = (self._table.get(key) for key in ("poses", "frameTimestamps", "perFrameIntrinsicCoeffs"))
         return max((len(table) for table in tables if isinstance(table, list)), default=0)
 
     def depth_size(self) -> tuple[int, int] | None:
-        """Return (height, width) of the depth pictures where the app wrote it."""
+        """Return (height, width) of the depth pictures, if the app wrote it."""
         written = "dh" in self._table and "dw" in self._table
         return (self._pixels("dh"), self._pixels("dw")) if written else None
 
     def timestamp_s(self, index: Int[np.ndarray, "frame"]) -> Float[np.ndarray, "frame"]:
-        """Return seconds since the first frame, NaN where they do not increase; old apps wrote the rate."""
+        """Return seconds since the first frame, NaN where not increasing; old apps wrote only the rate."""
         if not self._table.get("frameTimestamps"):
             return (index - index[0]) / self._numbers("fps", (), positive=True)
         timestamp_s = self._rows("frameTimestamps", (), index)
@@ -146,18 +146,18 @@ class _Metadata:
         return np.where(good, timestamp_s - timestamp_s[good][0], np.nan)
 
     def intrinsics(self, index: Int[np.ndarray, "frame"]) -> Float[np.ndarray, "frame 3 3"]:
-        """Return K in colour pixels, per frame where the app wrote it, else the first frame's."""
+        """Return K in colour pixels, per frame if the app wrote it, else the first frame's."""
         coefficients = self._rows("perFrameIntrinsicCoeffs", (4,), index)
         missing = ~(np.all(np.isfinite(coefficients), axis=1) & np.all(coefficients[:, :2] > 0, axis=1))
         if missing.any():
-            first = self._numbers("K", (9,)).reshape(3, 3).T  # stored by columns
+            first = self._numbers("K", (9,)).reshape(3, 3).T  # stored column-major
             coefficients[missing] = first[[0, 1, 0, 1], [0, 1, 2, 2]]
             if self._table.get("perFrameIntrinsicCoeffs"):
                 self._remark(missing, "have no intrinsics of their own: the first frame's are used")
         return intrinsics_from_coefficients(coefficients, self._where)
 
     def camera_type(self) -> int | None:
-        """Return the app's number of the camera, where it wrote one."""
+        """Return the app's number of the camera, if it wrote one."""
         if "cameraType" not in self._table:
             return None
         camera_type = int(self._numbers("cameraType", ()))
@@ -166,7 +166,7 @@ class _Metadata:
         return camera_type
 
     def pose(self, index: Int[np.ndarray, "frame"]) -> Float[np.ndarray, "frame 7"] | None:
-        """Return the device poses as stored, NaN where they are missing or no numbers; None without any."""
+        """Return the device poses as stored, NaN where missing or not numeric; None without any."""
         if not self._table.get("poses"):
             return None
         pose = self._rows("poses", (7,), index)
@@ -174,12 +174,12 @@ class _Metadata:
         return pose
 
     def up(self) -> tuple[float, float, float] | None:
-        """Return what points up in the poses' world: nothing where old apps took the first camera for it."""
+        """Return the up direction in the poses' world; None for old apps, whose world is the first camera."""
         first = self._rows("poses", (7,), np.zeros(1, int))
         return None if np.isnan(first).all() or np.allclose(first, (0, 0, 0, 1, 0, 0, 0), atol=1e-6) else Y_UP
 
     def _rows(self, key: str, shape: tuple[int, ...], index: Int[np.ndarray, "frame"]) -> np.ndarray:
-        """Read a table's rows of the given shape by frame number; NaN where there is none or no number."""
+        """Read rows of the given shape by frame number; NaN where missing or not numeric."""
         rows = np.full((len(index), *shape), np.nan)
         if self._table.get(key):
             stored = self._numbers(key, (None, *shape), finite=False)
@@ -199,7 +199,7 @@ class _Metadata:
     def _numbers(
         self, key: str, shape: tuple[int | None, ...], *, positive: bool = False, finite: bool = True
     ) -> np.ndarray:
-        """Read an array of numbers whose axes have the given lengths (None: any)."""
+        """Read an array of numbers with the given shape (None: any length)."""
         if key not in self._table:
             raise self._broken(f"{key!r} is missing")
         try:
@@ -217,13 +217,13 @@ class _Metadata:
 
 
 def _numbers(names: frozenset[str], pattern: str) -> set[int]:
-    """Return the frame numbers of the members that follow a pattern such as ``rgbd/%d.jpg``."""
+    """Return the frame numbers of members that match a pattern such as ``rgbd/%d.jpg``."""
     numbers = (frame_number(Path(name).stem) for name in names)
     return {number for number in numbers if number is not None and pattern % number in names}
 
 
 def _depth_size(container: Container, layout: _Layout, metadata: _Metadata, first: int) -> tuple[int, int]:
-    """Return (height, width) of the depth: as written, else from the first picture."""
+    """Return (height, width) of depth: from the metadata, else from the first picture."""
     size = metadata.depth_size()
     if size is not None:
         return size
@@ -238,7 +238,7 @@ def _depth_size(container: Container, layout: _Layout, metadata: _Metadata, firs
 
 
 def _refuse_face_id(depth_size: tuple[int, int], camera_type: int | None, where: str) -> None:
-    """Refuse the front camera: depth of another size, another camera type, and no device poses at all."""
+    """Raise CAP-005 for the front camera, known by depth size or camera type: it has no device poses."""
     if camera_type == FACE_ID or math.prod(depth_size) in FACE_ID_FLOATS:
         remedy = "record with the LiDAR camera at the back of the phone"
         raise InputError("CAP-005", "recorded with the Face-ID camera: it has no device poses", where, remedy)
@@ -256,7 +256,7 @@ def _read_depth(container: Container, name: str, size: tuple[int, int]) -> Float
 def _confidence_reader(
     container: Container, layout: _Layout, index: np.ndarray, size: tuple[int, int]
 ) -> Callable[[int], np.ndarray | None] | None:
-    """Return a reader of confidence pictures where frames have one."""
+    """Return a reader of confidence pictures, if frames have them."""
     known = _numbers(container.names, layout.confidence)
     if isinstance(container, FolderContainer) or known.isdisjoint(index):
         return None
@@ -278,7 +278,7 @@ def _decompress_exactly(container: Container, name: str, expected: int) -> bytes
 
 
 def _decompress(container: Container, name: str, max_bytes: int) -> bytes:
-    """Unpack LZFSE after its block headers promised at most ``max_bytes``."""
+    """Decompress LZFSE after checking that its block headers declare at most ``max_bytes``."""
     where = container.place(name)
     packed = container.read(name, max_bytes + max_bytes // 8 + 4096)
     try:
@@ -290,11 +290,11 @@ def _decompress(container: Container, name: str, max_bytes: int) -> bytes:
 
 
 class BrokenBlockError(ValueError):
-    """The stream is cut or is no LZFSE."""
+    """The stream is truncated or not LZFSE."""
 
 
 def unpacked_bytes(data: bytes) -> int:
-    """Add up the sizes that the blocks' headers declare. Raises BrokenBlockError."""
+    """Sum the uncompressed sizes in the block headers. Raises BrokenBlockError."""
     at, total = 0, 0
     while data[at : at + 4] != LZFSE_END:
         raw, length = _block(data, at)
@@ -305,7 +305,7 @@ def unpacked_bytes(data: bytes) -> int:
 
 
 def _block(data: bytes, at: int) -> tuple[int, int]:
-    """Return (unpacked bytes, stored bytes with the header) of the block at an offset."""
+    """Return (uncompressed bytes, stored bytes with header) of the block at an offset."""
     try:
         match data[at : at + 4]:
             case b"bvx-":

@@ -1,7 +1,7 @@
-"""What every format becomes: a `Recording` whose frames are known and whose pictures are read on demand.
+"""The common interface of all formats: a `Recording` whose pictures are read on demand.
 
-Readers give poses and pictures as stored, with the convention that the format documents; checking and
-turning them is the next files' work.
+Readers return poses and pictures as stored, with the convention that the format documents; `extraction`
+checks and rotates them.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from pipeline.recordings.depth_camera import DepthCamera
 
 Y_UP = (0.0, 1.0, 0.0)
 ORTHONORMAL = 0.02
-"""largest entry by which a rotation, times itself transposed, may differ from the identity"""
+"""maximum deviation of R R^T from the identity, per entry"""
 Picture = bytes | UInt8[np.ndarray, "height width 3"]
 """an encoded JPEG or PNG, or decoded RGB"""
 
@@ -29,75 +29,75 @@ class Recording:
 
     where: str
     kind: str
-    """format, as people call it"""
+    """name of the format"""
     index: Int[np.ndarray, "frame"]
-    """the app's number of each frame, in time order"""
+    """the app's frame numbers, in time order"""
     timestamp_s: Float[np.ndarray, "frame"]
-    """increasing, on the recording's own clock, which starts at 0"""
+    """increasing, from 0 on the recording's own clock"""
     intrinsics: Float[np.ndarray, "frame 3 3"] | None
-    """colour pixels; None where they are unknown (plain video)"""
+    """colour pixels; None if unknown (plain video)"""
     pose: Float[np.ndarray, "frame 7"] | None
-    """four quaternion and three translation (metres) numbers as documented, NaN where lost; None without"""
+    """quaternion and translation (metres) in the documented convention, NaN where lost; None without"""
     color_size: tuple[int, int]
     """(height, width) in pixels"""
     depth_size: tuple[int, int] | None
-    """(height, width) in pixels; None where there is no depth"""
+    """(height, width) in pixels; None without depth"""
     read_color: Callable[[int], Picture | None]
-    """picture of the app's frame number; None where the file is damaged there"""
+    """picture of a frame number; None if it is damaged"""
     read_depth: Callable[[int], Float[np.ndarray, "height width"]]
-    """metres as stored, of the app's frame number"""
+    """depth of a frame number, metres, as stored"""
     read_confidence: Callable[[int], UInt8[np.ndarray, "height width"] | None] | None = None
-    """0 low, 1 medium, 2 high, and None for a frame that lacks it; None where the recording has none"""
+    """0 low, 1 medium, 2 high, or None for a frame without; None if the recording has none"""
     convention: Convention = OPENCV
-    """what the format documents about its poses"""
+    """documented convention of the poses"""
     up: tuple[float, float, float] | None = None
-    """direction that points up in the poses' world; None where the format does not document it"""
+    """up direction in the poses' world; None if the format does not document it"""
     quarter_turns: int = 0
-    """clockwise, stored to upright, from the video rotation tag, used where `up` is None"""
+    """clockwise, stored to upright, from the video's rotation tag; used if `up` is None"""
     read_mesh: Callable[[], Mesh] | None = None
-    """the app's own surface of the room, metres, in the poses' world; None where it has none"""
+    """the app's own mesh of the room, metres, in the poses' world; None without"""
     depth_camera: DepthCamera | None = None
-    """the depth camera where it is another one than the colour camera; None where depth is aligned"""
+    """the depth camera; None if depth is registered to the colour camera"""
     remarks: tuple[str, ...] = ()
-    """what had to be assumed or left out, one sentence each"""
+    """assumptions and omissions, one sentence each"""
 
 
 def damaged(where: str, why: str) -> InputError:
-    """Make the error for something that cannot be read to its end."""
+    """Return the error for a damaged or truncated file."""
     what = f"the recording is damaged or was not copied completely ({why})"
     return InputError("CAP-001", what, where, "export it from the phone again")
 
 
 def broken_metadata(where: str, why: str) -> InputError:
-    """Make the error for numbers beside the pictures that cannot be used, as after a change of format."""
+    """Return the error for invalid metadata, as after a change of the format."""
     remedy = "export it from the phone again; if a newer app wrote it, report the app's version"
     return InputError("CAP-004", f"the recording's metadata cannot be used: {why}", where, remedy)
 
 
 def no_depth(where: str, why: str) -> InputError:
-    """Make the error for recordings without depth."""
+    """Return the error for recordings without depth."""
     remedy = "record with a LiDAR phone, or add a depth picture per frame: see the README's table of formats"
     return InputError("CAP-006", f"no depth: {why}", where, remedy)
 
 
 def no_frames(where: str, why: str) -> InputError:
-    """Make the error for recordings of which no frame is whole."""
+    """Return the error for recordings without a complete frame."""
     return InputError("CAP-007", f"no usable frames: {why}", where, "export it from the phone again")
 
 
 def wrong_depth(where: str, why: str) -> InputError:
-    """Make the error for a depth picture of another size or kind than it must be."""
+    """Return the error for a depth picture of a wrong size or type."""
     return InputError("CAP-008", f"a depth picture is wrong: {why}", where, "export it from the phone again")
 
 
 def refuse_other_size(shape: tuple[int, ...], size: tuple[int, int] | None, where: str) -> None:
-    """Raise CAP-008 for a depth picture of another (height, width) than ``size``, where one is expected."""
+    """Raise CAP-008 for a depth picture whose (height, width) is not ``size``, if given."""
     if size is not None and shape != size:
         raise wrong_depth(where, f"{shape[1]} x {shape[0]} instead of {size[1]} x {size[0]}")
 
 
 def pose_from_matrix(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "frame 7"]:
-    """Turn matrices into stored poses (quaternion xyzw, translation); NaN where one is no rigid motion."""
+    """Convert matrices to poses (quaternion xyzw, translation); NaN where one is not a rigid motion."""
     pose = np.full((len(world_from_camera), 7), np.nan)
     rotation = world_from_camera[:, :3, :3]
     with np.errstate(all="ignore"):
@@ -116,7 +116,7 @@ def pose_from_matrix(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float
 def intrinsics_from_coefficients(
     coefficients: Float[np.ndarray, "frame 4"], where: str
 ) -> Float[np.ndarray, "frame 3 3"]:
-    """Turn (fx, fy, cx, cy) per frame into matrices; raises CAP-004 for impossible values."""
+    """Convert (fx, fy, cx, cy) per frame to matrices. Raises CAP-004 for impossible values."""
     if not np.isfinite(coefficients).all() or np.any(coefficients[:, :2] <= 0):
         raise broken_metadata(where, "the focal length must be positive")
     intrinsics = np.tile(np.eye(3), (len(coefficients), 1, 1))

@@ -24,13 +24,13 @@ from pipeline.recordings.recording import (
 RATE_HZ = 30.0
 KINECT_SIZE = (480, 640)
 KINECT_DEPTH, KINECT_COLOR = (585.0, 585.0, 320.0, 240.0), (525.5, 525.5, 320.0, 240.0)
-"""fx, fy, cx, cy of the set's Kinects at 640 x 480, pixels: the depth camera's as documented, the colour
-camera's as matches between its pictures and depth edges show it
+"""fx, fy, cx, cy of the data set's Kinects at 640 x 480, pixels: the depth camera's as documented, the colour
+camera's as estimated from matches between its pictures and depth edges
 """
 KINECT_DEPTH_FROM_COLOR = np.array([[1, 0, 0, 0.025], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-"""the colour camera stands 2.5 cm to the right of the depth camera"""
+"""the colour camera is 2.5 cm to the right of the depth camera"""
 SAME_LENS_PX = 0.5
-"""largest difference at which a lens beside the pictures, as often, is the set's depth camera's"""
+"""tolerance for given intrinsics to count as those of the data set's depth camera, as often"""
 NAME = re.compile(r"frame-([0-9]{1,18})\.(color\.(?:png|jpg|jpeg)|depth\.png|pose\.txt)\Z")
 
 
@@ -77,7 +77,7 @@ def open_recording(path: Path) -> Recording:
 def _poses(
     container: FolderContainer, index: np.ndarray, names: dict[int, str], camera: DepthCamera | None
 ) -> Float[np.ndarray, "frame 7"] | None:
-    """Return the colour camera's poses (the set's are its depth camera's), NaN where lost."""
+    """Return the colour camera's poses (the data set has the depth camera's), NaN where lost."""
     if not names:
         return None
     matrices = np.full((len(index), 4, 4), np.nan)

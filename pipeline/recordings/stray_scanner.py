@@ -1,6 +1,6 @@
 """Stray Scanner: a folder with `rgb.mp4`, `odometry.csv` and per frame depth and confidence, in landscape.
 
-Times are the odometry's (the video's are counted, not real); focal lengths per frame where they were written.
+Timestamps are the odometry's (the video's are synthetic); focal lengths are per frame if available.
 """
 
 import csv
@@ -28,14 +28,14 @@ from pipeline.recordings.recording import (
 )
 
 INTRINSICS_SIZE = (1440, 1920)
-"""(height, width) to which the app's intrinsics refer, whatever the video's size"""
+"""(height, width) that the app's intrinsics refer to, whatever the video's size"""
 POSE = ("qx", "qy", "qz", "qw", "x", "y", "z")
 MAX_FRAMES = 1 << 31
-"""frame numbers are below this"""
+"""upper bound of frame numbers"""
 COEFFICIENTS = ("fx", "fy", "cx", "cy")
 READ = {"timestamp", "frame", *POSE, *COEFFICIENTS}
 OLDEST = ("x", "y", "z", "qx", "qy", "qz", "qw")
-"""columns of the oldest app, which wrote no header"""
+"""columns of the oldest app version, which wrote no header"""
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ class OdometryTable:
     pose: Float[np.ndarray, "row 7"]
     """quaternion xyzw, translation; OpenCV axes, camera to world"""
     coefficients: Float[np.ndarray, "row 4"] | None
-    """fx, fy, cx, cy where the app wrote them"""
+    """fx, fy, cx, cy, if the app wrote them"""
 
 
 def open_recording(path: Path) -> Recording:
-    """Open a Stray Scanner folder. Raises InputError CAP-001..009 for what cannot be used."""
+    """Open a Stray Scanner folder. Raises InputError CAP-001..009 for unusable recordings."""
     container = FolderContainer(path)
     movie = Movie(container.path("rgb.mp4"))
     rows = read_odometry(container.text("odometry.csv"), container.place("odometry.csv"))
@@ -134,7 +134,7 @@ def _intrinsics(
 def _depth(
     container: FolderContainer, name: str, size: tuple[int, int] | None
 ) -> Float[np.ndarray, "height width"]:
-    """Read uint16 millimetres, PNG or as the older app wrote them, `.npy`. Raises CAP-008."""
+    """Read uint16 millimetres from PNG, or `.npy` of older apps, as metres. Raises CAP-008."""
     if not name.endswith(".npy"):
         return container.meters(name, size)
     try:
@@ -148,7 +148,7 @@ def _depth(
 
 
 def _refuse_constant_rows(container: FolderContainer, names: list[str]) -> None:
-    """Refuse depth of app versions whose encoder repeated one value along each row."""
+    """Raise CAP-009 for depth of app versions whose encoder repeated one value along each row."""
     pictures = [_depth(container, name, None) for name in names]
     if all(np.ptp(picture, axis=1).max() == 0 and np.ptp(picture) > 0 for picture in pictures):
         what = "every row of the depth pictures holds one value: a fault of this version of Stray Scanner"

@@ -12,11 +12,11 @@ from pipeline.recordings.recording import broken_metadata, intrinsics_from_coeff
 INTRINSICS = ("intrinsics.txt", "camera-intrinsics.txt", "camera_matrix.csv")
 """3 x 3 or 4 x 4 matrix, or the four numbers fx fy cx cy, in colour pixels"""
 DEPTH_INTRINSICS, DEPTH_FROM_COLOR = "depth_intrinsics.txt", "depth_from_color.txt"
-"""the same of a depth camera of its own, in depth pixels; and where it stands: a 4 x 4 matrix, metres"""
+"""intrinsics of a separate depth camera, in depth pixels, and its extrinsics: a 4 x 4 matrix, metres"""
 
 
 def lines(container: Container, name: str) -> list[str]:
-    """Return a member's lines without comments and blanks."""
+    """Return a member's lines without comments and blank lines."""
     found = map(str.strip, container.text(name).splitlines())
     return [line for line in found if line and not line.startswith("#")]
 
@@ -24,9 +24,9 @@ def lines(container: Container, name: str) -> list[str]:
 def table(
     container: Container, name: str, columns: int, rows: int | None = None
 ) -> Float[np.ndarray, "row column"]:
-    """Read numbers in columns separated by blanks or commas; raises CAP-004 when they are no such table.
+    """Read numbers in columns separated by blanks or commas; raises CAP-004 for anything else.
 
-    What old Windows programs write for none (``-1.#IND``) is NaN.
+    ``-1.#IND``, as old Windows programs write it, is NaN.
     """
     cells = [line.replace(",", " ").split() for line in lines(container, name)]
     try:
@@ -59,7 +59,7 @@ def coefficients(
 
 
 def read_coefficients(container: Container, name: str) -> Float[np.ndarray, "4"]:
-    """Read (fx, fy, cx, cy) from a file of these four numbers or of a matrix. Raises CAP-004."""
+    """Read (fx, fy, cx, cy) from a file with these four numbers or a matrix. Raises CAP-004."""
     try:
         numbers = np.array([float(cell) for cell in container.text(name).replace(",", " ").split()])
     except ValueError as error:
@@ -80,8 +80,8 @@ def depth_camera(
 ) -> tuple[DepthCamera | None, tuple[str, ...]]:
     """Return the depth camera of `depth_intrinsics.txt` and `depth_from_color.txt`, if any, and a remark.
 
-    ``sizes`` are (height, width) of colour and of depth as stored. The former file alone means cameras at one
-    place, the latter alone the colour camera's lens. Raises CAP-004 for a matrix that is no rigid motion.
+    ``sizes`` are (height, width) of colour and of depth as stored. Without the latter file the cameras have
+    the same pose, without the former the same lens. Raises CAP-004 for a matrix that is not a rigid motion.
     """
     color_size, depth_size = sizes
     if not {DEPTH_INTRINSICS, DEPTH_FROM_COLOR} & container.names:
@@ -101,7 +101,7 @@ def depth_camera(
 
 
 def depth_camera_remark(camera: DepthCamera, color_intrinsics: Float[np.ndarray, "3 3"]) -> str:
-    """Say what the two cameras are, for capture-check and the log."""
+    """Describe the two cameras, for capture-check and the log."""
     depth_fx, color_fx, apart_mm = camera.intrinsics[0, 0], color_intrinsics[0, 0], 1000 * camera.baseline_m
     apart = f"{apart_mm:.0f} mm from the colour camera (fx {color_fx:g})"
     return f"depth camera fx {depth_fx:g}, {apart}: depth is reprojected"

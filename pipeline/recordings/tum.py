@@ -1,7 +1,7 @@
-"""TUM RGB-D folders: `rgb.txt`, `depth.txt` and, where there is one, `groundtruth.txt`, associated by time.
+"""TUM RGB-D folders: `rgb.txt`, `depth.txt` and, if present, `groundtruth.txt`, associated by timestamps.
 
-`depth_scale.txt` holds the units of depth per metre, else poses distinguish the set's 5000 from millimetres.
-Intrinsics from `intrinsics.txt` or the set's default.
+`depth_scale.txt` holds the depth units per metre; without it, poses decide between the data set's 5000 and
+millimetres. Intrinsics from `intrinsics.txt` or the data set's default.
 """
 
 from collections.abc import Callable
@@ -23,17 +23,17 @@ from pipeline.recordings.recording import (
 )
 
 DEFAULT_SIZE = (480, 640)
-"""height and width of such pictures"""
+"""(height, width) that the default intrinsics refer to"""
 QUOTED = 40
-"""characters of a line that an error shows"""
+"""maximum characters of a line in an error"""
 PER_METER, MILLIMETERS = 5000.0, 1000.0
-"""units per metre of the set, and of most other cameras"""
-CLEARLY = 0.5
-"""share of the disagreement between depth and poses that is left where another unit is the right one"""
+"""depth units per metre of the data set, and of most other cameras"""
+MAX_RESIDUAL_RATIO = 0.5
+"""millimetres are chosen if their residual is below this share of the other unit's"""
 NEAREST_S = 0.02
-"""largest difference in time between a colour picture, its depth and its pose, seconds"""
+"""maximum time difference between a colour picture, its depth and its pose, seconds"""
 DEFAULT = (525.0, 525.0, 319.5, 239.5)
-"""fx, fy, cx, cy that the set recommends for 640 x 480, pixels"""
+"""fx, fy, cx, cy that the data set recommends for 640 x 480, pixels"""
 
 
 def open_recording(path: Path) -> Recording:
@@ -84,7 +84,7 @@ def open_recording(path: Path) -> Recording:
 def nearest(
     times: Float[np.ndarray, "frame"], others: Float[np.ndarray, "other"], within_s: float
 ) -> Int[np.ndarray, "frame"]:
-    """Return for each time the index of the nearest of `others` (increasing), -1 where none is near."""
+    """Return the index of the nearest of `others` (increasing) to each time, -1 beyond ``within_s``."""
     right = np.clip(np.searchsorted(others, times), 1, max(len(others) - 1, 1))
     left = np.clip(right - 1, 0, len(others) - 1)
     right = np.clip(right, 0, len(others) - 1)
@@ -111,7 +111,7 @@ def _listed(container: FolderContainer, name: str) -> list[tuple[float, str]]:
 def _poses(
     container: FolderContainer, times: Float[np.ndarray, "frame"]
 ) -> Float[np.ndarray, "frame 7"] | None:
-    """Return the pose nearest in time to each frame, NaN where there is none within 20 ms."""
+    """Return the pose nearest in time to each frame, NaN if there is none within 20 ms."""
     if "groundtruth.txt" not in container.names:
         return None
     table = text_files.table(container, "groundtruth.txt", 8)
@@ -131,7 +131,7 @@ def _units_per_meter(
     timestamp_s: Float[np.ndarray, "frame"],
     view: Callable[[int, float], DepthPicture],
 ) -> tuple[float, tuple[str, ...]]:
-    """Return the units of `depth_scale.txt`, else millimetres where poses fit them, else the set's."""
+    """Return the units of `depth_scale.txt`, else millimetres if the poses fit them, else the data set's."""
     name = "depth_scale.txt"
     if name in container.names:
         per_meter = float(text_files.table(container, name, 1, rows=1)[0, 0])
@@ -144,11 +144,11 @@ def _units_per_meter(
         return assumed
     tracked = pose[known], timestamp_s[known]
 
-    def off(per_meter: float) -> float:
+    def residual(per_meter: float) -> float:
         check = check_poses(*tracked, lambda i: view(known[i], per_meter), documented=OPENCV, among=(OPENCV,))
         return check.residual_m / check.tolerance_m
 
-    if off(MILLIMETERS) < min(1.0, CLEARLY * off(PER_METER)):
+    if residual(MILLIMETERS) < min(1.0, MAX_RESIDUAL_RATIO * residual(PER_METER)):
         fit = f"{MILLIMETERS:g} units per metre fit the poses, the set's {PER_METER:g} do not"
         return MILLIMETERS, (f"no {name}: {fit}",)
     return assumed

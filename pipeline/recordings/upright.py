@@ -1,4 +1,4 @@
-"""Quarter turns that make a recording upright: from gravity, else from how it was held and the room."""
+"""Quarter turns that make a recording upright: from gravity, else from camera poses and the room."""
 
 from collections.abc import Sequence
 
@@ -10,17 +10,17 @@ from pipeline.geometry.ground import floor_direction
 from pipeline.mapping import depth_scans
 
 ROLL = 4.0
-"""what a mean squared sine of roll counts against a share of level surface"""
+"""weight of the mean squared sine of camera roll, relative to the share of level surface"""
 MARGIN = 0.15
-"""by which the best of the four directions must be ahead of the others"""
+"""minimum lead of the best of four directions over the second best"""
 NEAR_GUESS_DEG = 35.0
-"""up is looked for within this angle of where the phone's upright pose puts it: phones are held tilted"""
+"""search angle for up around the mean up direction of the cameras: phones are held tilted"""
 LEVEL_COSINE = 0.95
 """surfaces within 18 degrees of level are floor (facing up) or ceiling"""
 SIDE_PX = 200
-"""longer side that depth is thinned to: directions over fewer pixels than that are noise"""
+"""longer side to which depth is subsampled for normals, which are too noisy at full resolution"""
 MIN_POINTS = 100
-"""points with a surface direction that the room must show"""
+"""minimum number of points with a normal"""
 
 
 def quarter_turns_from_gravity(
@@ -29,9 +29,9 @@ def quarter_turns_from_gravity(
     up_odometry: tuple[float, float, float] | Float[np.ndarray, "3"] = (0.0, 1.0, 0.0),
     margin: float = 0.1,
 ) -> int:
-    """Return the clockwise quarter turns (0..3) after which up in the world points up in the pictures.
+    """Return the clockwise quarter turns (0..3) after which world up points up in the pictures, on average.
 
-    On average, and 0 unless another turn is better by ``margin`` (mean cosine): a phone may look down.
+    It is 0 unless another turn is better by ``margin`` (mean cosine): a phone may look down.
     """
     up_in_picture = [
         -(cameras.turn_camera(odometry_from_camera, turns)[:, :3, 1] @ np.asarray(up_odometry)).mean()
@@ -45,11 +45,11 @@ def up_from_room(
     odometry_from_camera: Float[np.ndarray, "frame 4 4"],
     views: Sequence[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]],
 ) -> Float[np.ndarray, "3"] | None:
-    """Return the direction that points up where no sensor measured it, or None where the room is ambiguous.
+    """Return the up direction if no sensor measured it, or None if it is ambiguous.
 
-    Each of the four sides of the pictures may be up, sharpened by the room's planes (Manhattan): more level
-    surface is seen from above (floor, seats) than from below, and one side of the pictures stays level
-    while they turn. ``views`` are (depth in metres, intrinsics) of frames spread evenly.
+    Each of the four sides of the pictures is a hypothesis, refined by the room's planes (Manhattan world).
+    The score rewards level surface seen from above (floor, seats) rather than below, and cameras without
+    roll. ``views`` are (depth in metres, intrinsics) of frames spread evenly.
     """
     seen = np.linspace(0, len(odometry_from_camera) - 1, len(views)).round().astype(int)
     normals = [
@@ -75,7 +75,7 @@ def up_from_room(
 def _normals(
     depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "point 3"]:
-    """Return some of the directions that surfaces face, in camera axes."""
+    """Return a subsample of surface normals, in camera axes."""
     step = max(1, max(depth.shape) // SIDE_PX)
     thinned = depth[step // 2 :: step, step // 2 :: step]
     normal = depth_scans.image_normals(
@@ -88,7 +88,7 @@ def quarter_turns_from_room(
     odometry_from_camera: Float[np.ndarray, "frame 4 4"],
     views: Sequence[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]],
 ) -> int:
-    """Return the clockwise quarter turns (0..3) to upright where no sensor measured up, 0 where ambiguous."""
+    """Return the clockwise quarter turns (0..3) to upright if no sensor measured up, 0 if ambiguous."""
     up = up_from_room(odometry_from_camera, views)
     return 0 if up is None else quarter_turns_from_gravity(odometry_from_camera, up_odometry=up)
 
@@ -96,9 +96,9 @@ def quarter_turns_from_room(
 def quarter_turns_from_surfaces(
     views: Sequence[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]],
 ) -> int:
-    """Return the clockwise quarter turns (0..3) to upright where not even poses are known.
+    """Return the clockwise quarter turns (0..3) to upright without poses.
 
-    Floors and tables are seen from above: surfaces face up more than to any other side of the pictures.
+    Floors and tables are seen from above, so that surface normals point up on average.
     """
     lean = [found.mean(0) for found in (_normals(*view) for view in views) if len(found) >= MIN_POINTS]
     return quarter_turns_from_gravity(np.eye(4)[None], up_odometry=np.mean(lean, axis=0)) if lean else 0

@@ -76,7 +76,7 @@ def test_more_members_than_declared_frames_are_refused(tmp_path):
     made = walk(6)
     made.write(tmp_path / "a.r3d")
     with zipfile.ZipFile(tmp_path / "a.r3d", "a") as archive:
-        for number in range(containers.MEMBERS_PER_FRAME * 6 + containers.MEMBERS_BESIDE):
+        for number in range(containers.MEMBERS_PER_FRAME * 6 + containers.EXTRA_MEMBERS):
             archive.writestr(f"more/{number}", b"")
     with pytest.raises(InputError, match="CAP-002"):
         open_recording(tmp_path / "a.r3d")
