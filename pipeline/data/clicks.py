@@ -1,4 +1,4 @@
-"""Clicked correspondences between frames of recordings and the walk-through: stored, lifted, fitted.
+"""Clicked correspondences between frames of recordings and the walk-through: stored, back-projected, fitted.
 
 The paper's protocol: about seven clicked pairs, both pixels back-projected by their depth, Procrustes. Frames
 are named by recording and recorded number, pixels by shares of the upright picture, so that clicks outlive
@@ -22,15 +22,15 @@ from pipeline.geometry import align, cameras, rigid
 WANTED = 7
 """pairs per frame, as in the paper"""
 MIN = 4
-"""pairs per frame below which nothing is fitted"""
+"""minimum pairs per frame for a fit"""
 MAX_BYTES = 8 << 20
 MAX_FRAMES = 1 << 31
-"""numbers of recorded frames are below this"""
+"""upper bound of recorded frame numbers"""
 
 
 @dataclass(frozen=True)
 class ClickedPixel:
-    """A place in one picture."""
+    """A pixel of one picture."""
 
     recording: str
     """file name of the recording"""
@@ -42,7 +42,7 @@ class ClickedPixel:
 
 @dataclass(frozen=True)
 class ClickedPair:
-    """The same thing seen in a recording's frame and in the walk-through."""
+    """The same point in a recording's frame and in the walk-through."""
 
     seen: ClickedPixel
     reference: ClickedPixel
@@ -50,7 +50,7 @@ class ClickedPair:
 
 @dataclass(frozen=True)
 class ClickedClip:
-    """A recording's frames and their recorded numbers."""
+    """A recording's frames and their source numbers."""
 
     clip: Clip
     source_index: Int[np.ndarray, "frame"]
@@ -60,24 +60,24 @@ class ClickedClip:
         """Open a finished ``frames/<id>`` artifact."""
         return cls(Clip.open(folder), read_source_index(folder))
 
-    def frame_of(self, spot: ClickedPixel) -> int | None:
-        """Return the extracted frame that a spot is in; None where that recorded frame was not extracted."""
-        found = np.flatnonzero(self.source_index == spot.source_index)
+    def frame_of(self, click: ClickedPixel) -> int | None:
+        """Return the extracted frame of a clicked pixel; None if its recorded frame was not extracted."""
+        found = np.flatnonzero(self.source_index == click.source_index)
         return int(found[0]) if len(found) else None
 
-    def lift(self, spot: ClickedPixel) -> Float[np.ndarray, "3"] | None:
-        """Back-project a spot by the median depth around it: camera axes, metres; None without depth."""
-        frame = self.frame_of(spot)
+    def lift(self, click: ClickedPixel) -> Float[np.ndarray, "3"] | None:
+        """Back-project a click by the median depth around it: camera axes, metres; None without depth."""
+        frame = self.frame_of(click)
         if frame is None:
             return None
         depth = self.clip.depth(frame)
         height, width = depth.shape
-        x, y = spot.pixel
+        x, y = click.pixel
         column, row = min(int(x * width), width - 1), min(int(y * height), height - 1)
         around = depth[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
         if not (around > 0).any():
             return None
-        pixel = np.array(spot.pixel) * self.clip.color_size[::-1]
+        pixel = np.array(click.pixel) * self.clip.color_size[::-1]
         return cameras.unproject(pixel, self.clip.intrinsics[frame]) * float(np.median(around[around > 0]))
 
 
@@ -87,11 +87,11 @@ class ClickFit:
 
     world_from_camera: Float[np.ndarray, "4 4"]
     residual_m: Float[np.ndarray, "pair"]
-    """distance left per pair; NaN where a depth is missing"""
+    """distance per pair after the fit; NaN where depth is missing"""
 
     @property
     def typical_m(self) -> float:
-        """Root mean square of what is left, metres."""
+        """Root mean square residual, metres."""
         return float(np.sqrt(np.nanmean(self.residual_m**2)))
 
 
@@ -101,7 +101,7 @@ def fit(
     reference: ClickedClip,
     world_from_reference: Float[np.ndarray, "frame 4 4"],
 ) -> ClickFit | None:
-    """Fit the camera of the frame that all ``pairs`` are in; None with fewer than four that have depth."""
+    """Fit the camera of the frame of all ``pairs``; None with fewer than four that have depth."""
     camera, world = np.full((len(pairs), 3), np.nan), np.full((len(pairs), 3), np.nan)
     for row, pair in enumerate(pairs):
         mine, theirs = seen.lift(pair.seen), reference.lift(pair.reference)
@@ -135,14 +135,14 @@ def read(path: Path) -> list[ClickedPair]:
 
 
 def parse(table: Any) -> list[ClickedPair]:
-    """Check what came from a file or a page; raises ValueError."""
+    """Validate clicks from a file or a page; raises ValueError."""
     if not isinstance(table, Mapping) or not isinstance(table.get("pairs"), list):
         raise ValueError("it holds no list of pairs")
     return [ClickedPair(_spot(pair, "seen"), _spot(pair, "reference")) for pair in table["pairs"]]
 
 
 def text(pairs: Sequence[ClickedPair]) -> str:
-    """Return the file's text."""
+    """Return the file's content."""
     rows = [json.dumps(asdict(pair), sort_keys=True) for pair in pairs]
     return '{"pairs": [\n' + ",\n".join(rows) + "\n]}\n"
 

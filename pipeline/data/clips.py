@@ -50,9 +50,9 @@ CLIP_KEYS = (
 """what `Clip` holds of `frames.npz`"""
 
 MIN_CONFIDENCE = 1
-"""depth of less confidence is not used: 0 is what a phone itself calls low"""
+"""minimum confidence of usable depth: 0 is what phones report as low"""
 STEP_SHARE = 0.25
-"""range of depth over 3 x 3 pixels, as a share of the depth, from which on a pixel lies at a step"""
+"""relative depth range over 3 x 3 pixels from which a pixel is at a depth discontinuity"""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Clip:
 
     @property
     def mapped(self) -> bool:
-        """Return whether its cameras lie in the map's world, and its depth is no measurement of its own."""
+        """Return whether cameras and depth come from the map instead of its own measurements."""
         return self.scale == MAPPED
 
     @classmethod
@@ -132,7 +132,7 @@ class Pictures:
         return len(self.timestamp_s)
 
     def file(self, frame: int) -> Path:
-        """Return where one frame's picture lies."""
+        """Return the path of one frame's picture."""
         return self.folder / "color" / f"{frame:06d}.jpg"
 
     def color(self, frame: int) -> UInt8[np.ndarray, "height width 3"]:
@@ -142,11 +142,11 @@ class Pictures:
 
 @dataclass(frozen=True)
 class Masks:
-    """The agent's masks of one recording, at colour resolution: 255 agent, 0 not, 128 unknown."""
+    """The agent's masks of one recording, at colour resolution: 255 agent, 0 background, 128 unknown."""
 
     folder: Path
     visible: np.ndarray
-    """[frame] bool: the agent was found"""
+    """[frame] bool: whether the agent was found"""
     confidence: Float[np.ndarray, "frame"]
 
     @classmethod

@@ -9,9 +9,9 @@ from pipeline.data import npz
 from pipeline.data.schema import FileSchema
 
 STRIDE_PX = 8
-"""side of a cell of descriptors, colour pixels"""
+"""stride of the descriptor grid, colour pixels"""
 CHANNELS = 16
-"""of a descriptor after projection to the shared basis"""
+"""channels of a descriptor after projection to the shared basis"""
 BASIS = FileSchema.of(
     "feature_basis/basis.npz",
     "mean [channel] f4",

@@ -9,7 +9,7 @@ from pipeline.data import npz
 from pipeline.data.schema import FileSchema
 
 STRIDE_PX = 4
-"""side of a cell of flow, colour pixels"""
+"""stride of the flow grid, colour pixels"""
 GAPS = (1, 2, 4, 8)
 """frames between the two pictures of a pair"""
 FLOW = FileSchema.of(
@@ -35,7 +35,7 @@ def open_confidence(
 
 
 def writer(folder: Path, gap: int, frames: int, size: tuple[int, int], *, backward: bool = False) -> npz.Rows:
-    """Begin the file of one gap, to which ``frames`` rows of ``size`` (height, width) in cells are added."""
+    """Start the file of one gap for ``frames`` rows of (height, width) ``size`` in cells."""
     path, shape = path_of(folder, gap, backward=backward), (frames, *size)
     return npz.Rows(path, flow=((*shape, 2), np.float16), confidence=(shape, np.uint8))
 

@@ -1,4 +1,4 @@
-"""Standard files of 3D Gaussians: binary PLY of 62 floats (248 bytes) a row, as viewers of 3DGS read them."""
+"""Standard files of 3D Gaussians: binary PLY of 62 floats (248 bytes) a row, as read by 3DGS viewers."""
 
 from pathlib import Path
 

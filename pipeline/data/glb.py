@@ -1,4 +1,4 @@
-"""Make binary glTF 2.0: still surfaces and skinned, animated ones.
+"""Write and read binary glTF 2.0: static meshes and skinned, animated ones.
 
 A skinned file holds one root node that carries `world_from_agent`, every bone as a sibling joint under it
 (bone b carries `agent_from_bone`), and beside the root the mesh, which follows its joints alone. Same
@@ -25,7 +25,7 @@ _ROOT_NODE, _MESH_NODE, _FIRST_JOINT = 0, 1, 2
 
 @dataclass(frozen=True)
 class Skin:
-    """Four or eight influences a vertex; `agent_from_bone_rest` are the bones in the pose of the surface."""
+    """Four or eight influences per vertex; `agent_from_bone_rest` is the bind pose."""
 
     joints: UInt8[np.ndarray, "vertex influence"]
     weights: Float32[np.ndarray, "vertex influence"]
@@ -35,7 +35,7 @@ class Skin:
 
 @dataclass(frozen=True)
 class Action:
-    """One named animation: keys in seconds, root in the world, bones in the agent frame."""
+    """One named animation: keyframes in seconds, root in the world, bones in the agent frame."""
 
     name: str
     time_s: Float[np.ndarray, " frame"]
@@ -44,7 +44,7 @@ class Action:
 
 
 def static(mesh: Mesh, name: str) -> bytes:
-    """Return a file of a still surface with vertex colour; metres, +y up."""
+    """Return a file of a static mesh with vertex colours; metres, +y up."""
     document = _Document()
     document.add_mesh(mesh, name, None)
     document.file.nodes = [gltf.Node(name=name, mesh=0)]
@@ -53,7 +53,7 @@ def static(mesh: Mesh, name: str) -> bytes:
 
 
 def skinned(mesh: Mesh, skin: Skin, actions: Sequence[Action], name: str = "agent") -> bytes:
-    """Return a file of a skinned surface (agent frame, metres) with one animation per action."""
+    """Return a file of a skinned mesh (agent frame, metres) with one animation per action."""
     document = _Document()
     document.add_mesh(mesh, name, skin)
     joints = list(range(_FIRST_JOINT, _FIRST_JOINT + len(skin.bone_names)))
@@ -74,7 +74,7 @@ def skinned(mesh: Mesh, skin: Skin, actions: Sequence[Action], name: str = "agen
 
 
 class _Document:
-    """A growing glTF document and its one binary buffer."""
+    """A glTF document under construction and its binary buffer."""
 
     def __init__(self) -> None:
         self.file = gltf.GLTF2(asset=gltf.Asset(version="2.0", generator="agent-to-sim"), scene=0)
@@ -151,7 +151,7 @@ def _translation_quaternion(parent_from_node: Float[np.ndarray, "n 4 4"]) -> tup
 
 
 def _without_flips(quaternion: Float[np.ndarray, "frame 4"]) -> Float[np.ndarray, "frame 4"]:
-    """Choose signs so that neighbouring keys lie on one side: viewers interpolate the shorter arc."""
+    """Choose quaternion signs so that neighbouring keyframes interpolate along the shorter arc."""
     flips = np.where((quaternion[1:] * quaternion[:-1]).sum(-1) < 0, -1.0, 1.0)
     return quaternion * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
 
@@ -164,19 +164,19 @@ def _unit_normals(mesh: Mesh) -> Float32[np.ndarray, "vertex 3"]:
 
 
 def _linear_rgba(color: UInt8[np.ndarray, "vertex 3"]) -> Float32[np.ndarray, "vertex 4"]:
-    """Undo the sRGB curve: glTF's vertex colours are linear."""
+    """Convert sRGB to linear RGBA, as in glTF's vertex colours."""
     srgb = color.astype(np.float32) / 255
     linear = images.linear_from_srgb(srgb)
     return np.concatenate([linear, np.ones_like(linear[:, :1])], 1).astype(np.float32)
 
 
 def read_static(data: bytes) -> Mesh:
-    """Read back what `static` made."""
+    """Read a file that `static` wrote."""
     return _Opened(data).mesh()
 
 
 def read_skinned(data: bytes) -> tuple[Mesh, Skin, list[Action]]:
-    """Read back what `skinned` made: colours to a level of 255, everything else to float32."""
+    """Read a file that `skinned` wrote: colours to 8 bits, everything else to float32."""
     document = _Opened(data)
     attributes = document.file.meshes[0].primitives[0].attributes
     table = document.file.skins[0]
@@ -194,13 +194,13 @@ def read_skinned(data: bytes) -> tuple[Mesh, Skin, list[Action]]:
 
 
 def _given(value: T | None) -> T:
-    """Return what pygltflib declares optional and `_Document` always writes."""
+    """Narrow a value that pygltflib declares optional and `_Document` always writes."""
     assert value is not None, "not a file of this module"
     return value
 
 
 class _Opened:
-    """A glTF document that is read."""
+    """A glTF document opened for reading."""
 
     def __init__(self, data: bytes) -> None:
         self.file = _given(gltf.GLTF2.load_from_bytes(data))
@@ -223,7 +223,7 @@ class _Opened:
         return Mesh(self.values(primitive.attributes.POSITION).copy(), faces, color)
 
     def action(self, animation: gltf.Animation, bones: int) -> Action:
-        """Channels stand in the order in which `_Document.animation` writes them."""
+        """Read an animation, whose channels are in the order of `_Document.animation`."""
         outputs = [self.values(sampler.output) for sampler in animation.samplers]
         places, turns = np.stack(outputs[::2], 1), np.roll(np.stack(outputs[1::2], 1), 1, axis=-1)
         rotation = rigid.rotation_from_quaternion(turns.astype(np.float64))

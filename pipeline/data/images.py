@@ -18,23 +18,23 @@ from jaxtyping import Float, Shaped, UInt8
 from pipeline.core.errors import InputError
 
 MAX_PIXELS = 32 << 20
-"""of a colour picture, and of all channels of a depth picture: 8K video, larger than a phone's picture"""
+"""limit for a colour picture, and for all channels of a depth picture: 8K video, more than any phone's"""
 SRGB_SLOPE, SRGB_OFFSET, SRGB_GAMMA, SRGB_KNEE = 12.92, 0.055, 2.4, 0.0031308
 """The transfer curve of sRGB (IEC 61966-2-1); the knee in linear intensity."""
 MAX_DEPTH_M = 1000.0
-"""depth beyond this is no measurement, metres"""
+"""maximum plausible depth, metres"""
 MAX_EXR_HEADER_BYTES = 1 << 16
 PNG_CHUNK_BYTES = 12
-"""Length, kind and checksum around what a chunk holds."""
+"""Length, type and checksum around a chunk's data."""
 STARTS_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-"""JPEG markers, of any coding, that the size of the picture follows."""
+"""JPEG start of frame markers, which precede the size of the picture."""
 EXPORT_AGAIN = "export the recording again"
 _EXR_DEEP, _EXR_MULTIPART, _EXR_CHANNEL_BYTES, _EXR_ZIP_ROWS = 0x800, 0x1000, 16, 16
 """flags of OpenEXR's version field, bytes after a channel's name, rows of a ZIP block"""
 
 
 def decode_color(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Decode an image file's bytes to RGB. Raises InputError CAP-020 when they are not a readable image."""
+    """Decode an image file's bytes to RGB. Raises InputError CAP-020 if they are not a readable image."""
     image = decoded(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise InputError("CAP-020", "the picture cannot be decoded", where, EXPORT_AGAIN)
@@ -52,7 +52,7 @@ def encode_jpeg(color: UInt8[np.ndarray, "height width 3"], quality: int = 92) -
 
 
 def write_color(path: Path, color: UInt8[np.ndarray, "height width 3"], quality: int = 92) -> None:
-    """Write RGB; the ending chooses JPEG, PNG or WebP, ``quality`` counts for JPEG and WebP."""
+    """Write RGB as JPEG, PNG or WebP, by suffix; ``quality`` applies to JPEG and WebP."""
     flags = {".jpg": [cv2.IMWRITE_JPEG_QUALITY, quality], ".webp": [cv2.IMWRITE_WEBP_QUALITY, quality]}
     kind = Path(path).suffix
     encoded, data = cv2.imencode(kind, np.ascontiguousarray(color[..., ::-1]), flags.get(kind, []))
@@ -98,13 +98,13 @@ def write_depth(path: Path, depth: Float[np.ndarray, "height width"]) -> None:
     with OpenEXR.File(header, {"Z": np.ascontiguousarray(depth, np.float16)}) as file:
         with contextlib.suppress(RuntimeError):
             file.write(str(path))
-    if not _is_complete(Path(path)):  # OpenEXR does not notice a disk that is full when it closes the file
-        Path(path).write_bytes(bytes(max(depth.nbytes, MAX_EXR_HEADER_BYTES)))  # raises the disk's own reason
+    if not _is_complete(Path(path)):  # OpenEXR ignores a full disk when it closes the file
+        Path(path).write_bytes(bytes(max(depth.nbytes, MAX_EXR_HEADER_BYTES)))  # raises the actual disk error
         raise OSError(errno.ENOSPC, "there is room again by now", str(path))
 
 
 def _is_complete(path: Path) -> bool:
-    """Return whether a ZIP-compressed scan-line EXR reaches to the end of its last block."""
+    """Return whether a ZIP-compressed scan-line EXR is complete up to its last block."""
     with open(path, "rb") as file:
         try:
             attributes, table = _exr_attributes(file.read(MAX_EXR_HEADER_BYTES))
@@ -119,9 +119,9 @@ def _is_complete(path: Path) -> bool:
 
 
 def decoded(data: bytes, flags: int) -> Shaped[np.ndarray, "height width *channel"] | None:
-    """Decode with OpenCV; None for what it cannot read, PNG with a wrong checksum among them.
+    """Decode with OpenCV; None for unreadable files, including PNG with a wrong checksum.
 
-    PNG and JPEG whose header asks for too many pixels are not tried.
+    PNG and JPEG whose header declares too many pixels are not decoded.
     """
     try:
         if _declared_pixels(data) > MAX_PIXELS:
@@ -132,10 +132,10 @@ def decoded(data: bytes, flags: int) -> Shaped[np.ndarray, "height width *channe
 
 
 def _declared_pixels(data: bytes) -> int:
-    """Return the pixels that a PNG or JPEG asks for; 0 for other kinds, too many for a broken PNG."""
+    """Return the number of pixels that a PNG or JPEG declares; 0 for others, too many for a broken PNG."""
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         at, kind = 8, b""
-        while kind != b"IEND":  # OpenCV allocates what a chunk declares before it looks for its bytes
+        while kind != b"IEND":  # OpenCV allocates the declared size of a chunk before reading it
             length, kind = struct.unpack_from(">I4s", data, at)
             at += PNG_CHUNK_BYTES + length
             if zlib.crc32(data[at - length - 8 : at - 4]) != struct.unpack_from(">I", data, at - 4)[0]:
@@ -153,7 +153,7 @@ def _declared_pixels(data: bytes) -> int:
 
 
 def _check_exr_size(path: Path) -> None:
-    """Refuse sizes and channels that no depth picture has by the header, before pixels are decoded."""
+    """Check size and channels in the header before pixels are decoded."""
     try:
         with open(path, "rb") as file:
             head = file.read(MAX_EXR_HEADER_BYTES)
@@ -168,7 +168,7 @@ def _check_exr_size(path: Path) -> None:
 
 
 def _exr_attributes(head: bytes) -> tuple[dict[str, bytes], int]:
-    """Return a flat EXR's attributes by name, and where its header ends. Raises ValueError for others."""
+    """Return a flat EXR's attributes by name, and its header's length. Raises ValueError for others."""
     version = struct.unpack_from("<I", head, 4)[0] if head[:4] == b"\x76\x2f\x31\x01" else 0
     if version & 0xFF != 2 or version & (_EXR_DEEP | _EXR_MULTIPART):
         raise ValueError("no single flat picture")
@@ -185,7 +185,7 @@ def _exr_attributes(head: bytes) -> tuple[dict[str, bytes], int]:
 
 
 def _exr_channels(listed: bytes) -> int:
-    """Count the channels of a channel list: names, each with 16 bytes behind it, to an empty one."""
+    """Count the channels of a channel list: names followed by 16 bytes each, up to an empty one."""
     count, at = 0, 0
     while listed[at : at + 1] not in (b"\0", b""):
         at = listed.index(b"\0", at) + 1 + _EXR_CHANNEL_BYTES

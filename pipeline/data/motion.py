@@ -1,4 +1,4 @@
-"""The time-varying structure D: where camera, agent and bones are in every frame.
+"""The time-varying structure D: poses of camera, agent and bones in every frame.
 
 `Motion` is one video's result as files hold it (`save`, `load`), `MotionTable` all videos' while it is being
 optimised: initial poses and small learned se(3) corrections on their right side.
@@ -27,14 +27,14 @@ MOTION = FileSchema.of(
 )
 TRACKS = FileSchema.of("reconstruction/tracks.npz", "vertex_index [point] i8", "rest_agent [point 3] f4")
 DOUBTFUL = 0.1
-"""frames of less confidence than this are no evidence of anything"""
+"""frames with lower confidence are not used"""
 INTERPOLATED = 0.05
-"""confidence, at most, of frames in long gaps between views of the agent: its pose there is interpolated"""
+"""maximum confidence of frames whose agent pose is interpolated over a long gap"""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """One video: poses, the agent's NaN where it is not known; confidence is low where it is interpolated."""
+    """Poses of one video; the agent's are NaN where unknown, and of low confidence where interpolated."""
 
     timestamp_s: Float[np.ndarray, "frame"]
     world_from_camera: Float[np.ndarray, "frame 4 4"]
@@ -45,13 +45,13 @@ class Motion:
 
     @property
     def agent_known(self) -> Bool[np.ndarray, "frame"]:
-        """Where the agent's pose was observed nearby in time."""
+        """Frames whose agent pose was observed nearby in time."""
         return np.isfinite(self.world_from_agent).all((1, 2)) & (self.confidence >= DOUBTFUL)
 
     def at(
         self, query_s: float
     ) -> tuple[Float[np.ndarray, "4 4"] | None, Float[np.ndarray, "bone 4 4"] | None]:
-        """Return the agent's root and bones at one time, interpolated; None where they are not known."""
+        """Return the agent's root and bones interpolated at one time; None if unknown."""
         after = int(np.clip(np.searchsorted(self.timestamp_s, query_s), 1, len(self.timestamp_s) - 1))
         pair = slice(after - 1, after + 1)
         if not np.isfinite(self.world_from_agent[pair]).all():
@@ -78,14 +78,14 @@ def load(path: Path) -> Motion:
 def gaps_s(
     timestamp_s: Float[np.ndarray, "frame"], good: Bool[np.ndarray, "frame"]
 ) -> Float[np.ndarray, "frame"]:
-    """Return how far apart in time the good frames around each are: 0 for good ones, infinite at the ends."""
+    """Return the gap between the good frames around each frame: 0 for good ones, infinite at the ends."""
     when = np.concatenate([[-np.inf], timestamp_s[good], [np.inf]])
     after = np.searchsorted(when, timestamp_s)
     return np.where(good, 0.0, when[after] - when[after - 1])
 
 
 class MotionTable(nn.Module):
-    """Poses of all frames of all videos, one after the other, with learned corrections.
+    """Concatenated poses of all frames of all videos, with learned corrections.
 
     A pose is ``initial @ exp(correction)``. Cameras are corrected at knots, linearly between them:
     registration leaves slow drift, not jitter. Videos whose camera is held (templates) keep the initial
@@ -134,7 +134,7 @@ class MotionTable(nn.Module):
     def start(
         self, initial_from_leaning: Float[Tensor, "frame 4 4"], bone: Float[Tensor, "frame bone 6"]
     ) -> None:
-        """Let the agent's initial roots lean, and its bones start with these corrections."""
+        """Set a lean of the agent's initial roots and initial corrections of its bones."""
         self.initial_agent.copy_(self.initial_agent @ initial_from_leaning)
         self.bone.copy_(bone)
 

@@ -1,4 +1,4 @@
-"""NPZ files: written with fixed timestamps so that equal arrays give equal bytes, read without pickle.
+"""NPZ files: written deterministically (fixed timestamps), read without pickle.
 
 `save` writes, `Rows` writes what does not fit into memory, `load` reads everything after checking each
 header, `open_lazily` maps big uncompressed members, `Column` keeps what only this process needs out of
@@ -24,7 +24,7 @@ from jaxtyping import Shaped
 from pipeline.core.errors import InputError
 
 MAX_BYTES = 64 << 30
-"""an array larger than this is refused: more than any machine here holds"""
+"""maximum size of an array: more than the memory of our machines"""
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 _LOCAL_LENGTHS, _LOCAL_HEADER = 26, 30
 """offset of the lengths of name and extra field in a ZIP's local header, and its size without them, bytes"""
@@ -33,7 +33,7 @@ _BROKEN = (
     NotImplementedError, OverflowError, MemoryError, TypeError, SyntaxError,
     tokenize.TokenError, struct.error,
 )  # fmt: skip
-"""what zipfile and numpy raise for archives that are damaged, encrypted, of unknown methods, or lie"""
+"""what zipfile and numpy raise for damaged, encrypted, inconsistent or unsupported archives"""
 
 
 def save(path: Path, *, compress: bool = False, **arrays: np.ndarray) -> None:
@@ -50,10 +50,10 @@ def save(path: Path, *, compress: bool = False, **arrays: np.ndarray) -> None:
 
 
 class Rows:
-    """Arrays written row by row in a ``with`` block; the file is the one that `save` would write."""
+    """Arrays written row by row in a ``with`` block, to the same bytes as by `save`."""
 
     def __init__(self, path: Path, **arrays: tuple[tuple[int, ...], type]) -> None:
-        """Begin a file of arrays of these shapes, the number of rows to come first, and dtypes."""
+        """Start a file of arrays with these shapes (number of rows first) and dtypes."""
         self._path = path
         self._kinds = {name: (shape, np.dtype(kind)) for name, (shape, kind) in arrays.items()}
         self._parts = {name: tempfile.TemporaryFile(dir=path.parent) for name in arrays}
@@ -89,14 +89,14 @@ class Rows:
 
 
 class Column:
-    """Rows of one array in an unnamed file that vanishes with it, mapped: read as they are looked at."""
+    """Rows of one array in an unlinked temporary file, memory-mapped for reading."""
 
     def __init__(self, folder: Path | None) -> None:
-        """``folder`` is where the file lies; None: where temporary files do."""
+        """Create the file in ``folder``; None: in the default folder for temporary files."""
         self._file, self._rows, self._like = tempfile.TemporaryFile(dir=folder), 0, np.zeros(0)
 
     def append(self, rows: Shaped[np.ndarray, "row ..."]) -> "Column":
-        """Add rows at the end."""
+        """Append rows."""
         self._file.write(np.ascontiguousarray(rows).data)
         self._rows, self._like = self._rows + len(rows), rows[:0].copy()
         return self
@@ -128,7 +128,7 @@ def load(
 
 
 def open_lazily(path: Path, name: str) -> Shaped[np.ndarray, "..."]:
-    """Map one uncompressed member read-only, so that only what is indexed is read from disk.
+    """Memory-map one uncompressed member read-only, so that only what is indexed is read.
 
     Raises InputError ART-010 for damaged files and missing names.
     """
@@ -148,7 +148,7 @@ def open_lazily(path: Path, name: str) -> Shaped[np.ndarray, "..."]:
 
 @contextlib.contextmanager
 def _readable(path: Path) -> Iterator[zipfile.ZipFile]:
-    """Open an archive; whatever a damaged one makes its readers raise becomes ART-010."""
+    """Open an archive; errors from reading a damaged one become ART-010."""
     try:
         with zipfile.ZipFile(path) as archive:
             yield archive

@@ -1,4 +1,4 @@
-"""The plotting kit that the quality pages of all stages share.
+"""Plots and contact sheets for the quality pages of all stages.
 
 Charts: `panels` makes axes, `floor_plan`, `loss_curves`, `histograms` and `time_series` draw on them,
 `pixels` returns the picture; no display, no global state. Pictures: `sample` chooses frames, `resized`,
@@ -18,12 +18,12 @@ BLUE, ORANGE, GREEN, RED, GREY = "#3b6ea5", "#dd8452", "#55a868", "#c44e52", "#b
 """What was recorded of the animal; what was generated; the observer; what is wrong or sampled;
 surroundings."""
 BACKGROUND = 245
-"""Grey value (of 255) where a picture shows nothing."""
+"""Grey value (of 255) of the background."""
 DOTS_PER_INCH = 80
 SMOOTHED_OVER = 50
-"""A curve is smoothed over this fraction (one fiftieth) of its length."""
+"""Smoothing window of a curve: one fiftieth of its length."""
 DEPTH_RANGE_M = 4.0
-"""Depth at which the colour scale ends: the width of a room."""
+"""End of the depth colour scale: the width of a room."""
 LABEL_PX = 20
 """Height of a line of text below a picture."""
 
@@ -44,7 +44,7 @@ def pixels(figure: Figure) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def running_mean(values: Num[np.ndarray, "step"]) -> Float[np.ndarray, "mean"]:
-    """Return means over windows of a fiftieth of the curve, at complete windows only."""
+    """Return the moving average over a fiftieth of the curve, complete windows only."""
     width = max(len(values) // SMOOTHED_OVER, 1)
     return np.convolve(values, np.ones(width) / width, "valid")
 
@@ -55,7 +55,7 @@ def loss_curves(
     width_in: float = 9.0,
     log: bool = True,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw smoothed losses, one panel per name; all curves of a label share a colour."""
+    """Draw smoothed losses, one panel per name and one colour per label."""
     figure, axes = panels(1, max(len(curves), 1), width_in=width_in, height_in=3.0)
     for axis, (title, labelled_curves) in zip(axes[0], curves.items(), strict=False):
         for number, (label, values) in enumerate(labelled_curves.items()):
@@ -73,7 +73,7 @@ def loss_curves(
 def histograms(
     values: Mapping[str, Num[np.ndarray, "..."]], *, log: bool = False, good_below: float | None = None
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw one histogram per axis label; a logarithmic axis leaves out what is not positive.
+    """Draw one histogram per axis label; a logarithmic axis omits values that are not positive.
 
     Bins below ``good_below`` are green, the others orange.
     """
@@ -149,7 +149,7 @@ def labelled(image: UInt8[np.ndarray, "height width 3"], text: str) -> UInt8[np.
 
 
 def grid(images: Sequence[UInt8[np.ndarray, "_ _ 3"]], columns: int) -> UInt8[np.ndarray, "height width 3"]:
-    """Lay pictures out on a grid, row by row; smaller ones are padded to the largest."""
+    """Arrange pictures in a grid, row by row; smaller ones are padded to the largest."""
     height, width = np.max([image.shape[:2] for image in images], axis=0)
     sheet = np.full((-(-len(images) // columns), columns, height, width, 3), BACKGROUND, np.uint8)
     for place, image in enumerate(images):
@@ -162,7 +162,7 @@ def outlined(
     mask: Bool[np.ndarray, "height width"],
     color: tuple[int, int, int],
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Return a picture with a line of one pixel around a mask."""
+    """Return a picture with a one pixel outline around a mask."""
     inside = mask.astype(np.uint8)
     drawn = image.copy()
     drawn[cv2.dilate(inside, np.ones((3, 3), np.uint8)) > inside] = color

@@ -39,7 +39,7 @@ def write_ply(path: Path, mesh: Mesh, **properties: Float[np.ndarray, "vertex"])
 
 
 def read_ply(path: Path) -> Mesh:
-    """Read a binary triangle mesh. Raises InputError ART-020 when it is not one or is damaged."""
+    """Read a binary triangle mesh. Raises InputError ART-020 for damaged and other files."""
     try:
         return _parse(Path(path).read_bytes())
     except (ValueError, IndexError, KeyError, TypeError, OverflowError) as error:

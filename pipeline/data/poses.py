@@ -34,16 +34,16 @@ class RegisteredPoses:
 
     @classmethod
     def open(cls, folder: Path) -> "RegisteredPoses | None":
-        """Read a recording's `poses.npz`; None where it was refused. Raises InputError ART-010."""
+        """Read a recording's `poses.npz`; None if its registration was refused. Raises InputError ART-010."""
         path = folder / "poses.npz"
         return cls(**POSES.load(path)) if path.exists() else None
 
     @classmethod
     def unknown(cls, timestamp_s: Float[np.ndarray, "frame"]) -> "RegisteredPoses":
-        """Return the poses of a recording that was refused: NaN, of no confidence."""
+        """Return the poses of a refused recording: NaN with confidence 0."""
         nowhere, nothing = np.full((len(timestamp_s), 4, 4), np.nan), np.zeros(len(timestamp_s))
         return cls(timestamp_s, nowhere, nowhere, nothing, nothing, nothing > 0)
 
     def write(self, folder: Path) -> None:
-        """Write `poses.npz` into an artifact in the making."""
+        """Write `poses.npz` into an unfinished artifact."""
         POSES.save(folder / "poses.npz", **vars(self))

@@ -17,12 +17,12 @@ from pipeline.data import images
 
 Status = Literal["ok", "warn", "fail"]
 MARKS = {"ok": "●", "warn": "▲", "fail": "■", "none": "○"}
-"""Signs of a status on pages, also for those who see no colours; "none" is without a check."""
+"""Symbols of a status, readable without colour; "none": no check."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One number and where it begins to worry."""
+    """One number with its thresholds."""
 
     name: str
     value: float | None
@@ -35,7 +35,7 @@ class Check:
 
     @property
     def status(self) -> Status:
-        """Judge the value; one that was not measured (None, NaN) warns."""
+        """Compare the value with its thresholds; one that was not measured (None, NaN) warns."""
         if self.value is None or not math.isfinite(self.value):
             return "warn"
         if _beyond(self.value, self.fail, self.better):
@@ -48,7 +48,7 @@ class Picture:
     """One picture for the report."""
 
     name: str
-    """File name without ending."""
+    """File name without suffix."""
     image: UInt8[ndarray, "height width 3"]
     caption: str
 
@@ -79,7 +79,7 @@ def write(
 
 
 def worst(statuses: Sequence[Status]) -> Status:
-    """Return the most serious of several judgements; none at all is ok."""
+    """Return the most severe of several statuses; ok if there are none."""
     return max(("ok", *statuses), key=("ok", "warn", "fail").index)
 
 

@@ -1,4 +1,4 @@
-"""What an NPZ file of an artifact holds: every array's key, axes and dtype, written and checked in one place.
+"""Schemas of the NPZ files of artifacts: key, axes and dtype of every array, checked on save and load.
 
 A module per artifact kind declares its files as `FileSchema` and offers typed readers and writers over it;
 `tests/test_data_layout.py` compares every schema with `data_layout.md`.
@@ -72,11 +72,11 @@ class FileSchema:
         return {key: array.astype(kinds[key], copy=False) for key, array in stored.items()}
 
     def _dtype(self, key: str) -> np.dtype | None:
-        """Return the dtype on disk; None for text, whose length is its own."""
+        """Return the dtype on disk; None for text, which has no fixed length."""
         return None if self.arrays[key].dtype == "U" else np.dtype(self.arrays[key].dtype)
 
     def _problem(self, stored: dict[str, np.ndarray], wanted: tuple[str, ...] | None = None) -> str | None:
-        """Name what contradicts the schema: missing keys, kinds, numbers of axes, lengths that disagree."""
+        """Return how arrays violate the schema: missing keys, wrong kinds, axes or lengths."""
         lengths: dict[str, int] = {}
         for key in self.arrays if wanted is None else wanted:
             schema = self.arrays[key]

@@ -38,12 +38,12 @@ class SceneCameras:
 
     timestamp_s: Float[np.ndarray, "frame"]
     world_from_camera: Float[np.ndarray, "frame 4 4"]
-    """of every frame; those that were not registered stand where odometry puts them"""
+    """of every frame; those not registered are placed by odometry"""
     intrinsics: Float[np.ndarray, "frame 3 3"]
     """colour pixels"""
     registered: Bool[np.ndarray, "frame"]
     keyframe: Bool[np.ndarray, "frame"]
-    """optimized together; the others were aligned to the surface from these"""
+    """jointly optimized frames; the others were aligned to the resulting surface"""
 
     @classmethod
     def open(cls, scene_template: Path) -> "SceneCameras":
@@ -61,7 +61,7 @@ class SceneCameras:
 
     @property
     def world_from_keyframe(self) -> Float[np.ndarray, "frame 4 4"]:
-        """`world_from_camera`, NaN where the frame was not registered or is no keyframe."""
+        """`world_from_camera`, NaN where the frame was not registered or is not a keyframe."""
         return np.where(self.keyframe[:, None, None], self.world_from_registered, np.nan)
 
 

@@ -1,4 +1,4 @@
-"""The scene on voxels of the world: `feature_volume.npz` of a reconstruction or a table of motion."""
+"""The scene as a voxel grid in the world: `feature_volume.npz` of a reconstruction or a table of motion."""
 
 from pipeline.data.schema import FileSchema
 
