@@ -21,7 +21,7 @@ def die_with_parent() -> None:
 def unordered(function: Callable[..., T], jobs: Sequence[tuple], workers: int) -> Iterator[tuple[int, T]]:
     """Call `function` with each job's arguments in parallel; yield (index, result) of each.
 
-    Workers are spawned, so that threads and locks are not inherited. They block SIGINT, which a terminal sends
+    Workers are spawned, so that threads and locks are not inherited. They block SIGINT, which a tty sends
     to all processes, from the start; this process kills them when it is interrupted.
     """
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=die_with_parent)

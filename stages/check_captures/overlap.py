@@ -1,4 +1,4 @@
-"""Whether a recording shows the walk-through's room: SIFT with depth, a rigid fit, agreement over time."""
+"""Check that a recording shows the walk-through's room: SIFT with depth, rigid fits, temporal consistency."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,28 +13,28 @@ from stages.check_captures.sampling import SampledFrame
 
 POINTS = 600
 WITHIN_M = 0.06
-MIN = 10
-"""points that must agree for a frame to be placed"""
+MIN_INLIERS = 10
+"""minimum inliers to localize a frame"""
 AGREE = (15.0, 0.6)
-"""degrees and metres within which two frames mean the same place"""
+"""tolerances for consistent poses, degrees and metres"""
 TRIALS = 300
 
 
 @dataclass(frozen=True)
 class DescribedFrame:
-    """One frame and its points that have depth."""
+    """One frame and its keypoints with depth."""
 
     shot: SampledFrame
     points: SiftPoints
 
 
 def describe(shots: Sequence[SampledFrame]) -> list[DescribedFrame]:
-    """Describe frames; those with too few points are left out."""
+    """Extract keypoints of frames; those with too few are omitted."""
     found = []
     for shot in shots:
         keypoints = sift.describe(shot.gray, POINTS)
         points = sift.lift(keypoints, shot.intrinsics, shot.depth, shot.depth_intrinsics)
-        if len(points.points_camera) >= MIN:
+        if len(points.points_camera) >= MIN_INLIERS:
             found.append(DescribedFrame(shot, points))
     return found
 
@@ -42,7 +42,7 @@ def describe(shots: Sequence[SampledFrame]) -> list[DescribedFrame]:
 def placed_share(
     walkthrough: Sequence[DescribedFrame], session: Sequence[DescribedFrame], rng: np.random.Generator
 ) -> float:
-    """Return the share (0..1) of session frames that are found in the walk-through, at places that agree."""
+    """Return the share (0..1) of session frames localized in the walk-through with consistent poses."""
     if not session or not walkthrough:
         return 0.0
     votes = [_best_place(walkthrough, frame, rng) for frame in session]
@@ -60,8 +60,8 @@ def placed_share(
 def _best_place(
     walkthrough: Sequence[DescribedFrame], frame: DescribedFrame, rng: np.random.Generator
 ) -> Float[np.ndarray, "4 4"] | None:
-    """Return where one frame puts its odometry in the walk-through's, None where no frame of that fits."""
-    best, place = MIN - 1, None
+    """Return the pose of the session's odometry in the walk-through's by one frame, None without a fit."""
+    best, place = MIN_INLIERS - 1, None
     for known in walkthrough:
         mine, theirs = sift.matches(frame.points.descriptors, known.points.descriptors).T
         if len(mine) <= best:

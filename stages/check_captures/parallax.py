@@ -1,4 +1,4 @@
-"""Whether a video without depth can be mapped: do neighbours show the same things, from elsewhere."""
+"""Check that a video without depth can be mapped: neighbouring pictures overlap with parallax."""
 
 import itertools
 from collections.abc import Sequence
@@ -12,29 +12,29 @@ from pipeline.mapping.sift import Keypoints
 from stages.check_captures.sampling import SampledFrame
 
 SIDE_PX, POINTS, WITHIN_PX = 480, 800, 2.0
-LINKED = 25
-"""matches on which two views must agree to show the same things"""
+MIN_INLIERS = 25
+"""minimum inliers of two overlapping views"""
 CONFIDENCE = 0.999
-"""of RANSAC, that it has found the geometry of two views"""
-TURNED = 0.9
-"""share of these explained by a mere turn of the camera (or one plane) beyond which there is no parallax"""
+"""confidence of RANSAC"""
+MAX_ROTATION_SHARE = 0.9
+"""share of inliers explained by a rotation (or one plane) beyond which there is no parallax"""
 
 
 @dataclass(frozen=True)
 class Parallax:
-    """What pairs of neighbouring sample pictures have in common, shares 0..1."""
+    """Overlap and parallax of pairs of neighbouring sampled pictures, shares 0..1."""
 
     linked: float
-    """pairs that show the same things"""
+    """overlapping pairs"""
     with_parallax: float
-    """of these, pairs in which things shift against each other"""
+    """pairs with parallax among these"""
 
 
 def parallax(shots: Sequence[SampledFrame]) -> Parallax:
-    """Match neighbouring pictures and compare two views of a scene with a mere turn."""
+    """Match neighbouring pictures and compare epipolar geometry with a rotation."""
     described = [_described(shot) for shot in shots]
     links = [link for pair in itertools.pairwise(described) if (link := _link(*pair)) is not None]
-    with_parallax = float(np.mean([turned < TURNED for turned in links])) if links else 0.0
+    with_parallax = float(np.mean([turned < MAX_ROTATION_SHARE for turned in links])) if links else 0.0
     return Parallax(len(links) / max(len(shots) - 1, 1), with_parallax)
 
 
@@ -45,13 +45,13 @@ def _described(shot: SampledFrame) -> Keypoints:
 
 
 def _link(first: Keypoints, second: Keypoints) -> float | None:
-    """Return the share of a pair's matches that a turn explains; None where the pair has too few."""
+    """Return the share of a pair's inliers that a rotation explains; None with too few."""
     pairs = sift.matches(first.descriptors, second.descriptors)
-    if len(pairs) < LINKED:
+    if len(pairs) < MIN_INLIERS:
         return None
     mine, theirs = first.pixel[pairs[:, 0]], second.pixel[pairs[:, 1]]
     _, two_views = cv2.findFundamentalMat(mine, theirs, cv2.FM_RANSAC, WITHIN_PX, CONFIDENCE)
     _, turn = cv2.findHomography(mine, theirs, cv2.RANSAC, WITHIN_PX)
-    if two_views is None or turn is None or two_views.sum() < LINKED:
+    if two_views is None or turn is None or two_views.sum() < MIN_INLIERS:
         return None
     return float(turn.sum() / two_views.sum())

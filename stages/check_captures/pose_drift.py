@@ -1,4 +1,4 @@
-"""How far device poses drift: depth of frames that see the same place long after each other, compared."""
+"""Drift of device poses: depth compared between frames that revisit a place."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ LATER_S = 5.0
 MIN_OVERLAP = 0.3
 MAX_PAIRS = 60
 SAME_DIRECTION, NEAR_M = 0.8, 1.5
-"""Cosine between optical axes, and distance, of cameras that can see the same."""
+"""Minimum cosine between optical axes, and maximum distance, of cameras with overlapping views."""
 
 
 def drift_m(shots: Sequence[SampledFrame]) -> float:
@@ -35,6 +35,6 @@ def drift_m(shots: Sequence[SampledFrame]) -> float:
 
 
 def _similar_views(first: SampledFrame, second: SampledFrame) -> bool:
-    """Return whether two cameras look into about the same direction from about the same place."""
+    """Return whether two cameras have similar poses."""
     relative = first.camera_from_odometry @ second.odometry_from_camera
     return relative[2, 2] > SAME_DIRECTION and float(np.linalg.norm(relative[:3, 3])) < NEAR_M

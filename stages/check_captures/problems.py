@@ -1,4 +1,4 @@
-"""What may be wrong with a recording, as stable codes with one remedy each; thresholds stand beside them.
+"""What may be wrong with a recording, as stable codes with one remedy each; with their thresholds.
 
 CAP-001 to CAP-022 (cannot be read or used) come from `pipeline.recordings`; these here are warnings.
 """
@@ -15,7 +15,7 @@ from stages.check_captures.sampling import RecordingSample
 
 @dataclass(frozen=True)
 class CaptureProblem:
-    """One thing to do better."""
+    """One problem with its remedy."""
 
     code: str
     what: str
@@ -24,14 +24,14 @@ class CaptureProblem:
 
 @dataclass(frozen=True)
 class CaptureMeasurements:
-    """Everything measured of one recording; None where it was not measured."""
+    """Measurements of one recording; None if not measured."""
 
     sample: RecordingSample
     drift_m: float = np.nan
-    """NaN where no place was seen twice"""
+    """NaN if no place was revisited"""
     moving: MotionShare | None = None
     placed: float | None = None
-    """share of frames found in the walk-through, 0..1"""
+    """share of frames localized in the walk-through, 0..1"""
     parallax: Parallax | None = None
     """of a walk-through without depth"""
 

@@ -14,13 +14,13 @@ from pipeline.recordings.extraction import ExtractionPlan
 from pipeline.recordings.recording import Recording, damaged
 
 SIDE_PX, JPEG_QUALITY = 640, 50
-"""of the pictures, which nobody keeps"""
+"""of the pictures, which are not kept"""
 DEPTH_SIDE_PX = 192
 """longer side of the sampled depth"""
 BLURRED_SHARE = 0.4
 """share of the recording's median sharpness below which a picture is blurred"""
 BLURRED = 4.0
-"""sharpness below which a picture is blurred whatever the others are like"""
+"""absolute sharpness below which a picture is blurred"""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class SampledFrame:
 
     @property
     def camera_from_odometry(self) -> Float[np.ndarray, "4 4"]:
-        """The inverse of the device's pose; only where there is one."""
+        """The inverse of the device pose, which must be known."""
         assert self.odometry_from_camera is not None, "the recording has no poses"
         return rigid.inverse(self.odometry_from_camera)
 
@@ -80,7 +80,7 @@ class RecordingSample:
 
     @property
     def blurred(self) -> float:
-        """Share of blurred pictures, 0..1: for their recording, or for any."""
+        """Share of blurred pictures, 0..1: relative to the recording, or absolutely."""
         sharpness = np.array([shot.sharpness for shot in self.shots])
         return float((sharpness < max(BLURRED_SHARE * float(np.median(sharpness)), BLURRED)).mean())
 
@@ -91,7 +91,7 @@ class RecordingSample:
 
     @property
     def depth_m(self) -> float:
-        """Typical depth, metres; NaN where none is known."""
+        """Median depth, metres; NaN without any."""
         known = np.concatenate([shot.depth[shot.depth > 0] for shot in self.shots] or [np.zeros(0)])
         return float(np.median(known)) if len(known) else np.nan
 
@@ -102,7 +102,7 @@ class RecordingSample:
 
 
 def sample(recording: Recording, count: int, *, max_depth_m: float) -> RecordingSample:
-    """Read about ``count`` frames spread over a recording; `InputError` where it cannot be used at all."""
+    """Read about ``count`` frames spread over a recording; `InputError` if it is unusable."""
     if recording.depth_size is None:
         return _look_at_pictures(recording, count)
     plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=max_depth_m, max_side_px=SIDE_PX)

@@ -20,12 +20,12 @@ MAX_DEPTH_M = 6.0
 
 @dataclass(frozen=True)
 class CaptureVerdict:
-    """What was found of one recording."""
+    """Verdict on one recording."""
 
     name: str
     role: Role
     seen: CaptureMeasurements | None
-    """None where it cannot be used"""
+    """None if it is unusable"""
     problems: tuple[CaptureProblem, ...]
     text: str
 
@@ -45,7 +45,7 @@ def run(files: Sequence[tuple[Path, Role]], config: Config) -> Iterator[CaptureV
             seen = _seen(sample, role, room, rng)
         except InputError as error:
             yield refused(path, role, error)
-        except Exception as error:  # one file must not take the others' verdicts with it
+        except Exception as error:  # one broken file must not prevent the other verdicts
             traceback.print_exception(error)
             what = f"reading it fails in a way that is not foreseen: {error!r}"
             remedy = "export it again; if that does not help, report the traceback above"
@@ -74,7 +74,7 @@ def _seen(
         room += overlap.describe(sample.shots)
         return CaptureMeasurements(sample, drift_m)
     placed = None
-    if room and role != "turnaround":  # that may be filmed anywhere: it makes the animal's template alone
+    if room and role != "turnaround":  # may be filmed anywhere: only the animal's template is made from it
         placed = overlap.placed_share(room, overlap.describe(sample.shots), rng)
     moving = moving_objects.find_motion(sample.shots) if role == "session" else None
     return CaptureMeasurements(sample, drift_m, moving, placed)

@@ -12,7 +12,7 @@ from stages.check_captures.problems import CaptureMeasurements, CaptureProblem
 def describe_capture(
     name: str, role: Role, seen: CaptureMeasurements, found: Sequence[CaptureProblem]
 ) -> str:
-    """Return what a recording is, its figures, and each problem with its remedy."""
+    """Return a recording's format, measurements, and problems with remedies."""
     sample, recording = seen.sample, seen.sample.recording
     height, width = recording.color_size
     lines = [
@@ -34,7 +34,7 @@ def describe_capture(
 
 
 def refused(path: Path, role: Role, error: InputError) -> str:
-    """Return why a recording cannot be used, and for which of its files."""
+    """Return why a recording is unusable, and because of which file."""
     file = error.where.removeprefix(str(path)).lstrip("/:") if error.where.startswith(str(path)) else ""
     what = f"{file}: {error.what}" if file else error.what
     return f"{path.name}  {role}\n  {error.code} {what}\n    -> {error.remedy}"

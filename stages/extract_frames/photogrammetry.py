@@ -1,4 +1,4 @@
-"""Poses, lens and depth of a video without depth, filmed through a room in which nothing moves.
+"""Poses, intrinsics and depth of a video without depth, filmed in a static room.
 
 Keyframes (`structure`) are posed by COLMAP, `plane_sweep` gives depth, `scaling` metres where a recording
 with depth shows the same room. Keyframes that were not registered are left out and reported.
@@ -28,22 +28,22 @@ from stages.extract_frames.config import Config, PhotogrammetryConfig
 from stages.extract_frames.structure import Structure
 
 LISTED = 12
-"""lost pictures that the log names at most"""
+"""maximum number of lost pictures named in the log"""
 MIN_AGREEING = 2
-"""pictures that must confirm a depth; one more makes it trusted"""
+"""minimum number of consistent views of a depth; one more makes it of high confidence"""
 MIN_MAPPED = 0.3
-"""share of the keyframes below which the largest model is no map of the walk"""
+"""minimum share of keyframes in the largest model"""
 TYPICAL_DEPTH_M = 2.0
-"""median depth that a model without metric scale is given: a room's, metres"""
+"""median depth to which a model without metric scale is scaled: a room's, metres"""
 SEED = 0
-"""of COLMAP's random choices"""
+"""seed for COLMAP"""
 KEYFRAME_JPEG_QUALITY = 98
-"""of the keyframes that COLMAP reads: no visible loss"""
+"""JPEG quality of COLMAP's keyframes, visually lossless"""
 
 
 @dataclass(frozen=True)
 class PicturesMapped:
-    """Frames made from pictures alone, and a sentence about them."""
+    """Frames reconstructed from pictures, and a sentence about them."""
 
     plan: ExtractionPlan
     frames: Iterator[ExtractedFrame]
@@ -119,7 +119,7 @@ def _solved(
 
 
 def no_map(recording: Recording, why: str) -> InputError:
-    """Make the error for pictures from which no map can be made."""
+    """Return the error for pictures that cannot be mapped."""
     remedy = "walk sideways, slowly, in good light, do not turn on the spot; or record with a LiDAR phone"
     return InputError("MAP-004", f"no map can be made from pictures alone: {why}", recording.where, remedy)
 

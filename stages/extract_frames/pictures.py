@@ -1,4 +1,4 @@
-"""Pictures of a recording without depth, upright at a steady rate; `estimate_depth` gives them the rest."""
+"""Upright pictures of a recording without depth, at a fixed rate; `estimate_depth` adds the rest."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ SHEET_FRAMES, SHEET_HEIGHT_PX = 12, 200
 
 
 def write(folder: Path, recording: Recording, config: Config) -> None:
-    """Write a recording's pictures. Raises CAP-001 where most are damaged, CAP-007 where few are left."""
+    """Write a recording's pictures. Raises CAP-001 if most are damaged, CAP-007 if too few are left."""
     rows = extraction.choose_frames(recording.timestamp_s, config.rate_hz)
     size = extraction.reduced_size(recording.color_size, config.max_side_px)
     chosen, statistics, strip = [], [], []

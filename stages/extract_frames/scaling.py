@@ -1,4 +1,4 @@
-"""Metres for a map without them: recordings with depth of the same room give the length of its unit.
+"""Metric scale of a map without depth, from recordings of the same room with depth.
 
 Points that look alike in a frame of the map and in a frame with measured depth are fitted by a
 similarity; the median of its scale over the pairs that agree is taken, and only when enough of them do.
@@ -19,26 +19,26 @@ from pipeline.recordings import extraction
 from pipeline.recordings.recording import Recording
 
 FRAMES = 24
-"""frames looked at per recording with depth"""
+"""frames used per recording with depth"""
 POINTS = 800
 """SIFT points per frame"""
 WITHIN_M = 0.08
-"""matched points this close after the fit agree, metres: the noise of phone depth at some metres"""
+"""inlier threshold of the fit, metres: the noise of phone depth at a few metres"""
 MIN_EXTENT_M = 5 * WITHIN_M
-"""the points that agree must reach this far along some axis, or their scale is uncertain"""
+"""minimum extent of the inliers along some axis for a reliable scale"""
 MIN_POINTS = 15
-"""points that must agree for a pair of frames to count"""
+"""minimum number of inliers of a pair of frames"""
 MIN_PAIRS = 4
-"""pairs that must agree for the scale to be believed"""
+"""minimum number of pairs with consistent scale"""
 AGREE_SHARE = 0.1
-"""relative difference of scale within which pairs agree"""
+"""relative difference of scale within which pairs are consistent"""
 RANSAC_TRIALS = 2000
 RATE_HZ, MAX_DEPTH_M, MAX_SIDE_PX, JPEG_QUALITY = 10.0, 5.0, 640, 50
-"""how a recording with depth is read here; its pictures are never kept"""
+"""extraction settings for recordings with depth, whose pictures are not kept"""
 
 
 def meters_per_unit(mapped: Sequence[SiftPoints], measured: Recording, seed: int) -> float | None:
-    """Return how many metres a unit of the map is by one recording with depth, None where too few agree."""
+    """Return metres per unit of the map by one recording with depth, None if too few pairs agree."""
     scales = []
     for frame in _described(measured):
         scales += [scale for known in mapped if (scale := _scale(known, frame, seed)) is not None]
@@ -63,7 +63,7 @@ def _described(recording: Recording) -> Iterator[SiftPoints]:
 
 
 def _scale(known: SiftPoints, frame: SiftPoints, seed: int) -> float | None:
-    """Return metres per unit by one pair of frames, None where too few points agree."""
+    """Return metres per unit by one pair of frames, None with too few inliers."""
     mine, theirs = sift.matches(frame.descriptors, known.descriptors).T
     if len(mine) < MIN_POINTS:
         return None

@@ -20,7 +20,7 @@ class Inputs:
     recording: Path
     """File or folder as the recording app exported it."""
     captures: Path | None = None
-    """Folder of all recordings, where a walk-through without depth looks for metric scale."""
+    """Folder of all recordings, which may supply metric scale to a walk-through without depth."""
 
 
 def run(

@@ -1,4 +1,4 @@
-"""Where the camera stood, from pictures alone: COLMAP on one thread with fixed seeds.
+"""Structure from motion by COLMAP, on one thread with fixed seeds.
 
 `choose_keyframes` thins a video by motion in its pictures, `solve` finds poses and, if unknown, the
 lens. The model's scale is its own.
@@ -19,44 +19,44 @@ from pipeline.mapping.colmap import SparseModel, read_sparse_model
 from stages.extract_frames.config import PhotogrammetryConfig
 
 MIN_KEYFRAMES = 8
-"""a model with fewer pictures is none"""
+"""minimum number of pictures of a model"""
 PEAK_THRESHOLD = 0.004
 """SIFT's contrast threshold; plain walls need a low one (COLMAP's default is 0.0067)"""
 VISUAL_WORDS, DESCRIPTORS_PER_WORD = 256, 40
-"""learned from so many descriptors of the recording itself"""
+"""size of the vocabulary, and descriptors of the recording per word to train it"""
 MIN_PARALLAX_PAIRS = 0.03
-"""share of the matched pairs that must show parallax, not a mere rotation or one plane"""
+"""minimum share of matched pairs with parallax, beyond a rotation or a homography"""
 MOTION_WIDTH_PX = 240
-"""width to which pictures are reduced before corners are followed"""
+"""width to which pictures are reduced before corners are tracked"""
 LOST_STEP = 0.1
-"""share of the width by which a picture counts as moved where too few corners survive"""
-MAX_CORNERS, FOLLOWED_PX = 200, (15, 15)
-"""corners of a picture, and the window by which they are found again"""
-MIN_CORNERS, MIN_FOLLOWED = 12, 0.4
-"""corners in a picture, and share of them found again, below which the tracking is lost"""
+"""assumed motion, as a share of the width, if tracking is lost"""
+MAX_CORNERS, WINDOW_PX = 200, (15, 15)
+"""maximum number of corners of a picture, and window size of the tracker"""
+MIN_CORNERS, MIN_TRACKED = 12, 0.4
+"""number of corners, and share of them tracked, below which tracking is lost"""
 
 
 @dataclass(frozen=True)
 class Structure:
-    """The largest model, the lens it was seen through, and how many models the pictures fell into."""
+    """The largest model, its intrinsics, and the number of models."""
 
     sparse: SparseModel
     intrinsics: Float[np.ndarray, "3 3"]
-    """Pixels of the pictures that were given."""
+    """Pixels of the input pictures."""
     radial: float
     """First radial distortion coefficient, OpenCV's and COLMAP's k1."""
     models: int
 
 
 class PictureMotion:
-    """How far the picture has moved since the first one, shares of its width, picture by picture."""
+    """Accumulates the motion of a video's pictures, in shares of their width."""
 
     def __init__(self) -> None:
         self.travelled: list[float] = []
         self._last: UInt8[np.ndarray, "height width"] | None = None
 
     def add(self, gray: UInt8[np.ndarray, "height width"]) -> None:
-        """Follow corners into the next picture; where too few survive it counts as moved by `LOST_STEP`."""
+        """Track corners into the next picture; if too few are found it counts as moved by `LOST_STEP`."""
         size = MOTION_WIDTH_PX, round(MOTION_WIDTH_PX * gray.shape[0] / gray.shape[1])
         small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
         step = 0.0 if self._last is None else self._step(self._last, small)
@@ -70,10 +70,10 @@ class PictureMotion:
             return LOST_STEP
         no_guess = np.zeros(0, np.float32)
         moved, found, _ = cv2.calcOpticalFlowPyrLK(
-            before, after, corners, no_guess, winSize=FOLLOWED_PX, maxLevel=3
+            before, after, corners, no_guess, winSize=WINDOW_PX, maxLevel=3
         )
         good = found[:, 0] == 1
-        if good.sum() < MIN_FOLLOWED * len(corners):
+        if good.sum() < MIN_TRACKED * len(corners):
             return LOST_STEP
         return float(np.median(np.linalg.norm((moved - corners)[good, 0], axis=1)) / before.shape[1])
 
@@ -97,7 +97,7 @@ def solve(
     workspace: Path,
     seed: int,
 ) -> Structure | None:
-    """Pose the pictures ``names`` (six digits, in time order); None where no model of enough comes out."""
+    """Pose the pictures ``names`` (six digits, in time order); None without a model of enough pictures."""
     colmap.seed_everything(seed)
     database = workspace / "database.db"
     reader = pycolmap.ImageReaderOptions(
@@ -125,7 +125,7 @@ def solve(
 
 
 def _parallax_share(database: Path) -> float:
-    """Return the share of matched pairs that only two different places explain."""
+    """Return the share of matched pairs with parallax."""
     kind = pycolmap.TwoViewGeometryConfiguration
     with pycolmap.Database.open(database) as table:
         found = [kind(geometry.config) for geometry in table.read_two_view_geometries()[1]]
@@ -141,7 +141,7 @@ def _descriptors(database: Path, names: list[str]) -> list[UInt8[np.ndarray, "fe
 def _pairs(
     descriptors: list[np.ndarray], config: PhotogrammetryConfig, seed: int
 ) -> Int[np.ndarray, "pair 2"]:
-    """Pair each keyframe with its successors and with those that share the most words."""
+    """Pair each keyframe with its successors and with those of the most similar words."""
     count = len(descriptors)
     first, second = np.triu_indices(count, 1)
     chosen = second - first <= config.overlap

@@ -16,9 +16,9 @@ from pipeline.recordings.extraction import DARK, MEASURED, RELATIVE, ExtractedFr
 from pipeline.recordings.recording import Recording, damaged
 
 MAX_LOST = 0.5
-"""share of damaged pictures (0..1) beyond which a recording is refused"""
+"""maximum share of damaged pictures (0..1)"""
 MIN_FRAMES = 5
-"""frames below which there is no motion to speak of: half a second"""
+"""minimum number of frames: half a second"""
 BLURRED_SHARE = 0.4
 """a frame less sharp than this share of the median is blurred"""
 SHEET_FRAMES = 12
@@ -27,12 +27,12 @@ SHEET_HEIGHT_PX = 200
 
 @dataclass(frozen=True)
 class WrittenFrames:
-    """What came out of a recording."""
+    """Summary of the written frames."""
 
     usable: Bool[np.ndarray, "frame"]
-    """of the plan's frames, those with enough depth"""
+    """which of the plan's frames have enough depth"""
     lost: float
-    """share (0..1) of the plan's frames at which the file is damaged"""
+    """share (0..1) of damaged frames"""
     sharpness: Float[np.ndarray, "usable_frame"]
     brightness: Float[np.ndarray, "usable_frame"]
     depth_valid: Float[np.ndarray, "usable_frame"]
@@ -99,13 +99,13 @@ def write_table(folder: Path, recording: Recording, plan: ExtractionPlan, writte
 
 
 def write_mesh(folder: Path, recording: Recording, plan: ExtractionPlan) -> None:
-    """Write the app's own surface of the room as ``mesh.ply`` where device poses give its place."""
+    """Write the app's own mesh of the room as ``mesh.ply`` if device poses are usable."""
     if recording.read_mesh is not None and plan.odometry_from_camera is not None:
         ply.write_ply(folder / "mesh.ply", recording.read_mesh())
 
 
 def report_quality(folder: Path, plan: ExtractionPlan, written: WrittenFrames, *, rate_hz: float) -> None:
-    """Write the stage's own judgement: what was understood, how much of it is usable, a contact sheet."""
+    """Write the quality checks, the share of usable frames and a contact sheet."""
     timestamp_s = plan.timestamp_s[written.usable]
     duration_s = float(timestamp_s[-1] - timestamp_s[0])
     blurred = written.sharpness < BLURRED_SHARE * max(float(np.median(written.sharpness)), 1e-6)
@@ -140,7 +140,7 @@ def report_quality(folder: Path, plan: ExtractionPlan, written: WrittenFrames, *
 
 
 def _check_of_poses(plan: ExtractionPlan) -> qa.Check:
-    """Say how well device poses fit the depth, or, of a map from pictures, what its lengths are worth."""
+    """Return the check of device poses against depth or, for a map from pictures, of its scale."""
     check = plan.pose_check
     if plan.scale != MEASURED:
         relative = plan.scale == RELATIVE
