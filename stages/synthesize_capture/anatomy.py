@@ -1,4 +1,4 @@
-"""What a species is: bones at rest, flesh around them, a coat and a gait, all of them data.
+"""A species as data: bones at rest, flesh around them, a coat and a gait.
 
 `skeleton` mirrors the limbs of the left side. The 25 bones have the same names and order in all species:
 fore limbs are wings where `Gait.wings` says so. Frame: `agent`, metres.
@@ -17,7 +17,7 @@ BoneRow = tuple[str, str, Point, Point, tuple[float, float]]
 Coat = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 """Linear RGB albedo and strength of the fine pattern ``[vertex 4]`` of vertices ``[vertex 3]``."""
 SHADED = ("pelvis", "spine", "loin", "chest", "head", "left hand", "right hand", "left toes", "right toes")
-"""Bones that darken the ground near the animal."""
+"""Bones that cast the soft shadow on the ground."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Flesh:
     tail: Point
     radius: tuple[float, float]
     softness: float
-    """Width of the smooth union with what is there, metres."""
+    """Width of the smooth union with other parts, metres."""
 
 
 @dataclass(frozen=True)
@@ -61,22 +61,22 @@ class Gait:
     """Phase of left and right fore foot, left and right hind foot, in strides."""
     trot_offset: tuple[float, ...] = (0.5, 0.0, 0.0, -0.5)
     duty: Point = (0.70, 0.36, 0.68)
-    """Share of the stride that a foot carries weight: standing still, least, most."""
+    """Duty factor (share of the stride in stance): standing still, minimum, maximum."""
     forward: tuple[float, float] = (0.0, 0.03)
-    """How far before their places at rest the feet are put down."""
+    """Distance in front of their rest positions at which feet are placed."""
     sitting: tuple[tuple[float, float], tuple[float, float]] = ((0.036, 0.105), (0.075, -0.05))
     lying: tuple[tuple[float, float], tuple[float, float]] = ((0.05, 0.19), (0.095, -0.08))
     eye: Point = (0.0, 0.1, 0.2)
     fold_m: float = 0.20
     """Below this distance from hip to toes the hock folds."""
     hop_m: float = 0.0
-    """How far the body rises in the flight of a stride."""
+    """Height by which the body rises in the flight phase of a stride."""
     hop_pitch: float = 0.0
-    """How far it raises its head at the take-off, radians."""
+    """Pitch of the body at take-off, radians."""
     nod: float = 0.0
-    """How far the neck swings forth at every step so that the head stays where it is, radians."""
+    """Swing of the neck at every step that keeps the head still (head bobbing), radians."""
     flex: float = 1.0
-    """How far the back bends, in that of a cat; likewise the tail."""
+    """Flexibility of the back and tail relative to a cat's."""
     tail_sway: float = 1.0
     wings: bool = False
 
@@ -91,24 +91,24 @@ class Anatomy:
     coat: Coat
     gait: Gait = field(default_factory=Gait)
     size: float = 1.0
-    """Its bones are so many times as long as `bones`."""
+    """Scale of the bones in `bones`."""
     box: tuple[tuple[float, float], ...] = ((-0.13, 0.131), (-0.26, 0.19), (-0.54, 0.36))
     """Bounds of the surface along x, y and z."""
     shadow_balls: tuple[tuple[str, Point, float], ...] = ()
-    """Bone, rest point and radius of the balls that darken the ground; none = made of `SHADED` bones."""
+    """Bone, rest point and radius of the balls that cast the soft shadow; empty: from `SHADED` bones."""
 
     @cached_property
     def heads(self) -> Float[np.ndarray, "bone 3"]:
-        """Where the bones begin at rest."""
+        """Heads of the bones at rest."""
         return np.array([bone.head for bone in self.bones], float)
 
     @cached_property
     def tails(self) -> Float[np.ndarray, "bone 3"]:
-        """Where the bones end at rest."""
+        """Tails of the bones at rest."""
         return np.array([bone.tail for bone in self.bones], float)
 
     def balls(self) -> tuple[tuple[str, Point, float], ...]:
-        """Return the balls that darken the ground near the animal."""
+        """Return the balls that cast the soft shadow on the ground."""
         found = tuple(
             (bone.name, tuple(np.add(bone.head, bone.tail) / 2), float(np.mean(bone.radius)))
             for bone in self.bones

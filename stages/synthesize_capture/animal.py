@@ -22,7 +22,7 @@ from stages.synthesize_capture.rabbit import RABBIT
 BODIES: dict[Species, Anatomy] = {"cat": CAT, "dog": DOG, "rabbit": RABBIT, "hen": HEN}
 BONES, HEADS = CAT.bones, CAT.heads
 INDEX = {bone.name: index for index, bone in enumerate(BONES)}
-"""Number of a bone by its name, in every species."""
+"""Index of a bone by name, the same in every species."""
 SOFTNESS = [0.03] * 6 + [0.012] * 5 + [0.024, 0.012, 0.008, 0.03, 0.014, 0.008, 0.008] * 2
 """Width of each bone's smooth union with those before it, metres."""
 
@@ -36,12 +36,12 @@ class Animal:
     bone: Int[np.ndarray, "vertex 4"]
     weight: Float[np.ndarray, "vertex 4"]
     fur: Float[np.ndarray, "vertex 4"]
-    """Linear RGB albedo and how strongly the fine pattern shows."""
+    """Linear RGB albedo and strength of the fine pattern."""
     anatomy: Anatomy
 
 
 def grow(rng: np.random.Generator, *, cell_m: float = 0.013, species: Species = "cat") -> Animal:
-    """Make an animal; the generator chooses its coat."""
+    """Make an animal; the random generator determines its coat."""
     return embody(BODIES[species], rng, cell_m)
 
 
@@ -79,7 +79,7 @@ def _cone(points: Float[np.ndarray, "point 3"], part: Bone | Flesh) -> Float[np.
 def _skin(
     anatomy: Anatomy, vertices: Float[np.ndarray, "vertex 3"]
 ) -> tuple[Int[np.ndarray, "vertex 4"], Float[np.ndarray, "vertex 4"]]:
-    """Weigh bones by a soft minimum of their distances; far limbs of the other side never mix in."""
+    """Return skinning weights by a soft minimum of bone distances, without bones of the opposite limbs."""
     distance = np.stack([_cone(vertices, bone) for bone in anatomy.bones], axis=-1)
     score = np.exp(-np.maximum(distance - distance.min(1, keepdims=True), 0) / 0.009)
     for name, sign in (("left", 1), ("right", -1)):
@@ -92,7 +92,7 @@ def _skin(
 
 
 def surface(animal: Animal, a_from_bone: Float[np.ndarray, "bone 4 4"]) -> Float[np.ndarray, "vertex 3"]:
-    """Blend the bones' motions linearly; return vertices in frame a (at rest, bones sit at their heads)."""
+    """Apply linear blend skinning; return vertices in frame a (at rest, bones are at their heads)."""
     a_from_rest = a_from_bone.copy()
     a_from_rest[:, :3, 3] -= np.einsum(
         "bij,bj->bi", a_from_bone[:, :3, :3], animal.anatomy.size * animal.anatomy.heads

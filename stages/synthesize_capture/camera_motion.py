@@ -1,4 +1,4 @@
-"""Where the phone is: hand-held paths for the walk-through, the turnaround, the filming person and a
+"""Camera paths of the hand-held phone for the walk-through, the turnaround, the filming person and a
 bystander.
 
 Every path is a smooth function of time plus the bob of steps, the sway of arms and the tremor of hands.
@@ -16,17 +16,17 @@ from stages.synthesize_capture.session import STEP_S, AnimalCourse, SessionTraje
 
 Cameras = Float[np.ndarray, "sample 4 4"]
 ARM_M = 0.3
-"""How far in front of the body the phone is held."""
+"""Distance of the phone in front of the body."""
 
 
 def walkthrough(room: Room, rng: np.random.Generator, duration_s: float) -> Cameras:
-    """Sweep an empty room all round, from across it: along the floor, into corners, over furniture."""
+    """Scan an empty room all around: along the floor, into corners, over furniture."""
     timestamp_s = np.arange(steps(duration_s)) * STEP_S
     share = timestamp_s / timestamp_s[-1]
     floor = floor_for(room.obstacles(), PERSON_M)
     rounds = 2.0 + 0.5 * (duration_s > 30)
     angle = 2 * np.pi * rounds * share + rng.uniform(0, 2 * np.pi)
-    # The person stands across the room from what is filmed, so that near walls do not fill the picture.
+    # The person films the opposite side of the room, so that near walls do not fill the picture.
     wanted = np.stack([-0.24 * WIDTH_M * np.sin(angle), -0.2 * DEPTH_M * np.cos(angle)], axis=-1)
     wanted *= (0.75 + 0.25 * np.sin(2 * np.pi * 1.3 * share))[:, None]
     position = np.array([floor.nearest(point) for point in wanted[::10]])
@@ -40,7 +40,7 @@ def walkthrough(room: Room, rng: np.random.Generator, duration_s: float) -> Came
 
 
 def turnaround(course: AnimalCourse, rng: np.random.Generator) -> Cameras:
-    """Walk once and a bit around the animal, 1.0 to 1.4 m away, looking down at it from changing heights."""
+    """Circle the animal slightly more than once, 1.0 to 1.4 m away, looking down from varying heights."""
     share = course.timestamp_s / course.timestamp_s[-1]
     angle = rng.uniform(0, 2 * np.pi) + 2 * np.pi * 1.08 * share + 0.05 * np.sin(2 * np.pi * 5 * share)
     radius = 1.12 + 0.12 * np.sin(2 * np.pi * 1.7 * share + 1.0)
@@ -51,7 +51,7 @@ def turnaround(course: AnimalCourse, rng: np.random.Generator) -> Cameras:
 
 
 def filming(session: SessionTrajectories, rng: np.random.Generator) -> Cameras:
-    """Return the filming phone: in front of the body, at chest height, on what the person looks at."""
+    """Return the filming phone's path: in front of the chest, aimed at what the person looks at."""
     looks_at, ground = session.observer_looks_at, session.observer_position
     toward = looks_at[:, [0, 2]] - ground
     toward = gaussian_filter1d(toward, 0.15 / STEP_S, axis=0)
@@ -63,7 +63,7 @@ def filming(session: SessionTrajectories, rng: np.random.Generator) -> Cameras:
 
 
 def bystanding(session: SessionTrajectories, room: Room, rng: np.random.Generator) -> Cameras:
-    """Return a second phone that keeps to the side of the animal opposite to the filming person."""
+    """Return a second phone's path, on the opposite side of the animal from the filming person."""
     floor = floor_for(room.obstacles(), PERSON_M)
     animal = session.animal.position[:, [0, 2]]
     opposite = animal + (animal - session.observer_position)
@@ -104,13 +104,13 @@ def _handheld(eye: np.ndarray, target: np.ndarray, rng: np.random.Generator, *, 
 
 
 def _inside(eye: np.ndarray) -> np.ndarray:
-    """Keep the phone off the walls."""
+    """Clip positions to the room, off the walls."""
     from_wall = np.array([WIDTH_M / 2 - 0.16, 9.0, DEPTH_M / 2 - 0.16])
     return np.clip(eye, -from_wall, from_wall)
 
 
 def _wander(rng: np.random.Generator, count: int, seconds: float) -> Float[np.ndarray, "sample 3"]:
-    """Return smooth noise of unit deviation that changes over about ``seconds``."""
+    """Return smooth noise of unit standard deviation with a correlation time of about ``seconds``."""
     pad = int(4 * seconds / STEP_S) + 1
     noise = gaussian_filter1d(rng.standard_normal((count + 2 * pad, 3)), seconds / STEP_S, axis=0)
     return noise[pad : pad + count] * np.sqrt(2 * np.sqrt(np.pi) * seconds / STEP_S)

@@ -20,25 +20,25 @@ NEXT: dict[Mode, tuple[tuple[Mode, ...], tuple[float, ...]]] = {
     "play": (("avoid", "follow", "own"), (0.5, 0.25, 0.25)),
     "avoid": (("own", "follow"), (0.5, 0.5)),
 }
-"""What follows a mode, and how likely."""
+"""Successors of each mode with their probabilities."""
 LASTING_S: dict[Mode, tuple[float, float]] = {
     mode: (4.0, 8.0) if mode == "follow" else (2.0, 4.0) for mode in NEXT
 }
 PACE_M_S: dict[Mode, float] = {"own": 0.7, "follow": 0.9, "play": 1.5, "avoid": 1.2}
 REACH_M: dict[Mode, float] = {"follow": 0.95, "play": 0.75}
-"""How near it comes to the other, centre to centre."""
+"""Distance to which it approaches the other, centre to centre."""
 PLANNED_S = 0.4
-"""It looks again where the other is after so long."""
+"""Interval of replanning."""
 APART_M, PUSH_M_S = 0.62, 1.2
-"""Centres of two bodies on the floor are no nearer, and how fast they get out of each other's way."""
-MINDED_M = 1.0
-"""The cat reacts to a dog that comes nearer."""
+"""Minimum distance of two bodies on the floor, and the speed at which they separate."""
+REACTION_M = 1.0
+"""Distance below which the cat reacts to the dog."""
 FOCUS_PERIOD_S, BOTH_M = 9.0, 1.5
-"""The phone goes from one animal to the other and back in this time; both are filmed when so near."""
+"""Period of alternating between the animals, and distance below which both are filmed."""
 
 
 class Companion(Policy):
-    """A dog's decisions: it stays on the floor and goes by where the other animal is."""
+    """A dog's decisions: it stays on the floor and reacts to the other animal."""
 
     def __init__(self, floor: Floor, places: tuple[Place, ...], position: Ground, rng: np.random.Generator):
         low = tuple(place for place in places if place.position[1] < 0.1)
@@ -97,7 +97,7 @@ def live(
         case [animal]:
             animal.step(seconds, _nearest(animal, people))
         case [cat, Companion() as dog]:
-            cat.step(seconds, _minded(cat, _nearest(cat, people), others[1]))
+            cat.step(seconds, _reacts_to(cat, _nearest(cat, people), others[1]))
             dog.other = others[0]
             dog.step(seconds, _nearest(dog, people))
             _keep_apart(seconds, cat, dog)
@@ -114,14 +114,14 @@ def _nearest(animal: Policy, people: Sequence[SeenWalker]) -> SeenWalker:
     return min(people, key=lambda each: float(np.linalg.norm(each.position - animal.walker.position)))
 
 
-def _minded(cat: Policy, person: SeenWalker, dog: SeenWalker) -> SeenWalker:
-    """Return whom the cat reacts to: the dog when it is near and nearer than the person."""
+def _reacts_to(cat: Policy, person: SeenWalker, dog: SeenWalker) -> SeenWalker:
+    """Return whom the cat reacts to: the dog if it is near and nearer than the person."""
     apart = [float(np.linalg.norm(each.position - cat.walker.position)) for each in (person, dog)]
-    return dog if apart[1] < min(MINDED_M, apart[0]) else person
+    return dog if apart[1] < min(REACTION_M, apart[0]) else person
 
 
 def _keep_apart(seconds: float, cat: Policy, dog: Companion) -> None:
-    """Have bodies on the floor make way for each other: the dog, or the cat where the dog cannot."""
+    """Separate bodies on the floor: move the dog, or the cat if the dog is blocked."""
     if cat.height > 0.1 or cat.leap is not None:
         return
     off = dog.walker.position - cat.walker.position
@@ -138,7 +138,7 @@ def _keep_apart(seconds: float, cat: Policy, dog: Companion) -> None:
 
 
 def focus(animals: list[Policy], now_s: float, phase: float) -> Float[np.ndarray, "3"]:
-    """Return what the person films: of two that are near each other the middle, else one after the other."""
+    """Return what the person films: the midpoint of two animals near each other, else them in turn."""
     if len(animals) == 1:
         return animals[0].position
     cat, dog = animals

@@ -26,9 +26,9 @@ from stages.synthesize_capture.room import (
 )
 
 GAP_M = 0.06
-"""Between a wall and what stands at it."""
+"""Gap between a wall and furniture."""
 BREADTH_M = 0.5
-"""Free floor wanted between two pieces, so that the animal passes."""
+"""Minimum free floor between two pieces, so that the animal can pass."""
 IN_FRONT_OF_SOFA_M = 1.15
 PLACES: dict[str, tuple[tuple[str, tuple[float, float, float], float, tuple[float, float]], ...]] = {
     "sofa": (
@@ -48,7 +48,7 @@ RUG = Piece([], (1.9, 1.35), 0.0)
 
 
 def rearranged(home: Room, rng: np.random.Generator, attempts: int = 500) -> Room:
-    """Return a home after people moved its loose things, none of them so that it shuts the animal in."""
+    """Return a home with loose things moved, without trapping the animal."""
     for _ in range(attempts):
         room = home.arranged(rng)
         if _livable(room):
@@ -57,7 +57,7 @@ def rearranged(home: Room, rng: np.random.Generator, attempts: int = 500) -> Roo
 
 
 def furnish_otherwise(rng: np.random.Generator, attempts: int = 2000) -> Room:
-    """Draw homes until one can be lived in."""
+    """Draw homes until one is livable."""
     pieces = {name: make(rng) for name, make in furniture.MAKERS.items()} | {"window": WINDOW, "rug": RUG}
     things = furniture.loose_things(rng)
     for _ in range(attempts):
@@ -71,13 +71,13 @@ def furnish_otherwise(rng: np.random.Generator, attempts: int = 2000) -> Room:
 
 
 def filmed_elsewhere(rng: np.random.Generator) -> Room:
-    """Draw a home with walls, window and prints of its own, to be filmed."""
+    """Draw a home with its own walls, window and prints, for filming."""
     home = furnish_otherwise(rng)
     return replace(home, fixed=(*shell(rng), *home.fixed), window=WINDOW_CORNER)
 
 
 def _arranged(pieces: dict[str, Piece], rng: np.random.Generator) -> tuple[Standing, ...] | None:
-    """Put the pieces at walls, largest first, each where it has room; None where one finds none."""
+    """Place the pieces at walls, largest first; None if one does not fit."""
     found: list[Standing] = []
     for name in sorted(AT_WALLS, key=lambda name: -pieces[name].size[0]):
         for _ in range(12):
@@ -111,7 +111,7 @@ def _at_wall(name: str, piece: Piece, rng: np.random.Generator) -> Standing:
 
 
 def _apart(first: Standing, second: Standing) -> bool:
-    """Return whether two pieces along the axes leave a way between them, or at least touch nowhere."""
+    """Return whether two axis-aligned pieces leave a passage between them, or at least do not touch."""
     gap = 0.15 if {"window", "bowls", "plant", "lamp"} & {first.name, second.name} else BREADTH_M
 
     def half(thing: Standing) -> np.ndarray:
@@ -144,7 +144,7 @@ def _places(standing: tuple[Standing, ...]) -> tuple[Place, ...]:
 
 
 def _livable(room: Room) -> bool:
-    """Return whether the free floor hangs together for animal and person, with all favourite places on it."""
+    """Return whether the free floor is connected for animal and person and reaches all favourite places."""
     for size_m in (ANIMAL_M, PERSON_M):
         floor = floor_for(room.obstacles(), size_m)
         parts, count = cast("tuple[np.ndarray, int]", label(floor.free))

@@ -1,4 +1,4 @@
-"""Film a script: render each frame, pass it through the sensor, and keep what is true of it."""
+"""Film a script: render each frame, apply the sensor model, and keep its ground truth."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,19 +13,19 @@ from stages.synthesize_capture.script import Script
 from stages.synthesize_capture.visitor import PERSON
 
 VISITOR_CELL_M = 0.006
-"""Spacing of the grid of which the visitor's surface is made, before it is scaled."""
+"""Grid spacing of the visitor's surface, before scaling."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One recorded frame and its truth, all on the stored canvas."""
+    """One recorded frame and its ground truth, all in the stored orientation."""
 
     color: UInt8[np.ndarray, "height width 3"]
     depth: Float[np.ndarray, "rows columns"]
     confidence: UInt8[np.ndarray, "rows columns"]
     true_depth: Float[np.ndarray, "rows columns"]
     masks: Bool[np.ndarray, "body height width"]
-    """Of the animal, of the companion and of a visitor."""
+    """Masks of the animal, the companion and a visitor."""
     vertices_world: Sequence[Float[np.ndarray, "vertex 3"] | None]
 
 
@@ -37,11 +37,11 @@ class Body:
     world_from_bone: Float[np.ndarray, "bone 4 4"]
     vertices_world: Float[np.ndarray, "vertex 3"]
     number: int
-    """0 of the animal, 1 of the companion, 2 of the visitor."""
+    """0: animal, 1: companion, 2: visitor."""
 
 
 class Stage:
-    """The lit set of one script: the room's mesh with its pictures, and the animals."""
+    """The lit scene of one script: the room's textured mesh, and the animals."""
 
     def __init__(self, script: Script, creature: Animal, companion: Animal | None = None):
         dressing, visited = np.random.default_rng([script.seed, 8]), script.motions[2] is not None
@@ -52,7 +52,7 @@ class Stage:
         self.room = shade.backdrop(script.room.sheets(), lit)
 
     def bodies(self, index: int) -> list[Body]:
-        """Return the bodies that are there in a frame, in the order of their numbers."""
+        """Return the bodies present in a frame, ordered by number."""
         found = []
         for number, (creature, motion) in enumerate(zip(self.creatures, self.script.motions, strict=True)):
             if creature is not None and motion is not None:
@@ -81,7 +81,8 @@ class Stage:
         vertices, faces = self.mesh(bodies)
         fx, fy, cx, cy = focal = script.intrinsics[index]
         doubled = np.array([[2 * fx, 0, 2 * cx], [0, 2 * fy, 2 * cy], [0, 0, 1]])
-        view = raster.see(rigid.apply(camera_from_world, vertices), faces, doubled, 2 * height, 2 * width)
+        points_camera = rigid.apply(camera_from_world, vertices)
+        view = raster.rasterize(points_camera, faces, doubled, 2 * height, 2 * width)
         coat = self._coat(bodies, camera_from_world)
         linear = shade.shade(view.face, view.inverse_corners, focal, self.room, coat, camera_from_world)
         color = sensor.picture(linear, script.exposure, float(script.gain[index]), blur_px, self._rng)
@@ -121,7 +122,7 @@ class Stage:
 
 
 def _faces(bodies: Sequence[Body], start: int) -> Iterator[Int[np.ndarray, "face 3"]]:
-    """Return the faces of bodies whose vertices follow one another from number ``start`` on."""
+    """Return the faces of bodies whose vertices are concatenated from index ``start``."""
     for body in bodies:
         yield body.creature.faces + np.int32(start)
         start += len(body.vertices_world)
@@ -142,7 +143,7 @@ def true_flow(
     here, there = (stage.mesh(stage.bodies(index)) for index in pair)
     cells = (height // stride, width // stride)
     coarse = cameras.scale_intrinsics(lenses[0], (height, width), cells)
-    view = raster.see(rigid.apply(upright_from_world[0], here[0]), here[1], coarse, *cells)
+    view = raster.rasterize(rigid.apply(upright_from_world[0], here[0]), here[1], coarse, *cells)
     rays = cameras.ray_directions(coarse, *cells)
     share = np.einsum("hwij,hwj->hwi", view.inverse_corners[np.maximum(view.face, 0)], rays)
     share /= np.maximum(share.sum(-1, keepdims=True), 1e-9)
@@ -151,7 +152,7 @@ def true_flow(
     pixel, depth = cameras.project(moved.reshape(*cells, 3), lenses[1])
     flow = (pixel - (cameras.pixel_grid(*cells) * stride)).astype(np.float32)
     inside = (pixel >= 0).all(-1) & (pixel < [width, height]).all(-1) & (depth > 0.05) & (view.face >= 0)
-    seen = raster.see(rigid.apply(upright_from_world[1], there[0]), there[1], lenses[1], height, width)
+    seen = raster.rasterize(rigid.apply(upright_from_world[1], there[0]), there[1], lenses[1], height, width)
     at = np.clip(np.nan_to_num(pixel), 0, [width - 1, height - 1]).astype(int)
     nearest = seen.inverse_depth[at[..., 1], at[..., 0]]
     hidden = depth > 1.0 / np.maximum(nearest, 1e-3) + 0.02 + 0.01 * depth
@@ -160,13 +161,13 @@ def true_flow(
 
 
 def matrices(intrinsics: Float[np.ndarray, "frame 4"]) -> Float[np.ndarray, "frame 3 3"]:
-    """Turn rows of fx, fy, cx, cy into matrices."""
+    """Convert rows of fx, fy, cx, cy to matrices."""
     out = np.zeros((len(intrinsics), 3, 3))
     out[:, 0, 0], out[:, 1, 1], out[:, 0, 2], out[:, 1, 2], out[:, 2, 2] = *intrinsics.T, 1.0
     return out
 
 
 def _four_sums(flags: Bool[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "height width"]:
-    """Count the flags in each two by two block."""
+    """Count the flags in each 2 x 2 block."""
     counts = flags.view(np.uint8)
     return counts[::2, ::2] + counts[1::2, ::2] + counts[::2, 1::2] + counts[1::2, 1::2]

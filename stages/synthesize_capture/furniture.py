@@ -11,14 +11,14 @@ from stages.synthesize_capture.texture import books, carton, fabric, plain, post
 
 @dataclass(frozen=True)
 class Piece:
-    """A thing to be put up: what is seen of it, and the block of space it takes."""
+    """A piece of furniture: its visible sheets, and the box that it occupies."""
 
     sheets: list[Sheet]
     size: tuple[float, float]
     """Along x and z."""
     top: float
     bottom: float = 0.0
-    """Above 0 where one can walk under it."""
+    """Above 0 if one can walk under it."""
 
 
 def sofa(rng: np.random.Generator) -> Piece:

@@ -1,4 +1,4 @@
-"""From the animal's course to its bones: footfalls, postures, limbs by inverse kinematics, head and tail.
+"""From the animal's trajectory to its bones: footfalls, postures, limbs by inverse kinematics, head and tail.
 
 `footfalls` plants each foot for the part of the stride that it carries weight: while planted it does not
 move in the world. `poses` then places the body, reaches the feet with the legs, and turns head and tail.
@@ -31,7 +31,7 @@ class AnimalMotion:
 
 @dataclass(frozen=True)
 class Rig:
-    """The bones of a species, agent frame, as they are placed."""
+    """The bones of a species being posed, agent frame."""
 
     anatomy: Anatomy
     bones: Float[np.ndarray, "frame bone 4 4"]
@@ -41,19 +41,19 @@ class Rig:
         return float(np.linalg.norm(self._axis(name)))
 
     def joint(self, name: str, parent: str) -> Float[np.ndarray, "frame 3"]:
-        """Return where a bone begins on its parent."""
+        """Return the position of a bone's joint on its posed parent."""
         index, above = INDEX[name], INDEX[parent]
         offset = self.anatomy.heads[index] - self.anatomy.heads[above]
         return self.bones[:, above, :3, 3] + np.einsum("fij,j->fi", self.bones[:, above, :3, :3], offset)
 
     def hang(self, name: str, parent: str, rotation: Float[np.ndarray, "frame 3 3"]) -> None:
-        """Attach a bone to its parent's joint with an absolute rotation."""
+        """Attach a bone to its parent's joint with a rotation in the agent frame."""
         self.bones[:, INDEX[name], :3, :3] = rotation
         at = self.joint(name, parent) if parent else self.anatomy.heads[INDEX[name]]
         self.bones[:, INDEX[name], :3, 3] = at
 
     def two_bones(self, first: str, second: str, start: Places, end: Places, *, pole: Direction) -> None:
-        """Place two bones between two points by the law of cosines, the middle joint towards ``pole``."""
+        """Solve two-bone inverse kinematics between two points, with the middle joint towards ``pole``."""
         a, b = self.length(first), self.length(second)
         axis = end - start
         distance = np.clip(np.linalg.norm(axis, axis=-1), abs(a - b) + 1e-4, a + b - 1e-5)
@@ -66,13 +66,13 @@ class Rig:
         self.aim(second, middle, end, pole=pole)
 
     def aim(self, name: str, head: Places, tail: Places, *, pole: Direction) -> None:
-        """Put a bone at ``head`` so that it points to ``tail``, rolled as at rest relative to ``pole``."""
+        """Place a bone at ``head`` pointing to ``tail``, with the rest pose's roll relative to ``pole``."""
         rest = _axes(self._axis(name)[None], pole)
         self.bones[:, INDEX[name], :3, :3] = _axes(tail - head, pole) @ np.swapaxes(rest, -1, -2)
         self.bones[:, INDEX[name], :3, 3] = head
 
     def mostly_level(self, parent: str) -> Float[np.ndarray, "frame 3 3"]:
-        """Keep a paw nearly level: a quarter of its parent's turn."""
+        """Keep a paw nearly level: apply a quarter of its parent's rotation."""
         turn = rigid.vector_from_rotation(self.bones[:, INDEX[parent], :3, :3])
         return rigid.rotation_from_vector(0.25 * turn)
 
@@ -115,7 +115,7 @@ def poses(
 
 
 def _neutral(anatomy: Anatomy) -> Float[np.ndarray, "foot 3"]:
-    """Return where the feet stand under the body, agent frame."""
+    """Return the neutral positions of the feet under the body, agent frame."""
     fore, hind = anatomy.gait.forward
     forward = np.repeat([[0, 0, fore], [0, 0, hind]], 2, axis=0)
     return anatomy.heads[[INDEX[name] for name in FEET]] + forward
@@ -144,7 +144,7 @@ def footfalls(
 
 
 def _rhythm(course: AnimalCourse, gait: Gait) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return phase and share on the ground of strides, phase offset per foot, lift of the feet (metres)."""
+    """Return stride phase, duty factor, phase offset per foot, and lift of the feet (metres)."""
     step = float(course.timestamp_s[1] - course.timestamp_s[0])
     speed = gaussian_filter1d(np.where(course.airborne > 0.5, 0.0, course.speed()), 0.08 / step)
     turn = gaussian_filter1d(np.abs(np.gradient(course.yaw, step)), 0.08 / step)
@@ -160,7 +160,7 @@ def _rhythm(course: AnimalCourse, gait: Gait) -> tuple[np.ndarray, np.ndarray, n
 def _planted(
     course: AnimalCourse, cycle: np.ndarray, index: np.ndarray, half_duty: float, neutral: np.ndarray
 ) -> Float[np.ndarray, "frame 3"]:
-    """Return where a foot stands in a stride: under its neutral place at the middle of that stance."""
+    """Return where a foot is planted in a stride: its neutral position at mid-stance."""
     rising = cycle + 1e-9 * np.arange(len(cycle))
     when = np.interp(index + half_duty, rising, course.timestamp_s)
     yaw = np.interp(when, course.timestamp_s, course.yaw)
@@ -232,7 +232,7 @@ def _root(state: _State, timestamp_s: np.ndarray, gait: Gait) -> Float[np.ndarra
 def _posed_feet(
     feet_agent: np.ndarray, world_from_agent: np.ndarray, state: _State, anatomy: Anatomy
 ) -> Float[np.ndarray, "frame foot 3"]:
-    """Blend planted feet with those of sitting, lying and flying."""
+    """Blend planted feet with those of sitting, lying and jumping."""
     level_from_agent = _turn(1, -state.yaw) @ world_from_agent[:, :3, :3]
     ground = state.position[:, 1] - world_from_agent[:, 1, 3] + anatomy.gait.sole_m
 
@@ -249,7 +249,7 @@ def _posed_feet(
 
 
 def _bend_spine(rig: Rig, state: _State) -> None:
-    """Curve the back into turns, round it when sitting, and flex it at a run."""
+    """Bend the back into turns, round it when sitting, and flex it when running."""
     flex = rig.anatomy.gait.flex
     bend = flex * np.clip(0.10 * state.turn, -0.3, 0.3)
     run = np.clip((state.speed - 1.0) / 1.0, 0, 1) * 0.14 * np.sin(2 * np.pi * state.phase)
@@ -265,7 +265,7 @@ def _bend_spine(rig: Rig, state: _State) -> None:
 
 
 def _turn_head(rig: Rig, world_from_agent: np.ndarray, state: _State) -> None:
-    """Point the head at the gaze, shared with the neck and limited to what a neck can do."""
+    """Turn the head to the gaze, shared with the neck and within its limits."""
     gaze_agent = rigid.apply(rigid.inverse(world_from_agent), state.gaze[:, None])[:, 0]
     toward = gaze_agent - np.array(rig.anatomy.gait.eye)
     yaw = np.clip(np.arctan2(toward[:, 0], toward[:, 2]), -1.25, 1.25)
@@ -331,7 +331,7 @@ def _axes(direction: np.ndarray, pole: np.ndarray) -> Float[np.ndarray, "frame 3
 
 
 def _reach(joint: np.ndarray, target: np.ndarray, length: float) -> np.ndarray:
-    """Let the joint give (shoulder blade, hip) when the leg is too short for the step."""
+    """Shift the joint (shoulder blade, hip) if the leg is too short for the step."""
     away = target - joint
     distance = np.linalg.norm(away, axis=-1, keepdims=True)
     return joint + away / np.maximum(distance, 1e-9) * np.clip(distance - 0.985 * length, 0, 0.09)

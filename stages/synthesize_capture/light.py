@@ -43,7 +43,7 @@ def light_of_session(rng: np.random.Generator, hour: Hour) -> Light:
         lamp = rng.uniform(0.0, 0.25) * warm
         ambient = rng.uniform(0.42, 0.55) * (1.0 + rng.uniform(-0.05, 0.05, 3))
     sun = np.array([1.0, rng.uniform(0.3, 0.7), rng.uniform(-0.8, 0.8)])
-    if hour == "sunset":  # as many draws as by day, so that life goes on as it would have
+    if hour == "sunset":  # as many random draws as by day, so that behaviour stays the same
         red = np.array([1.3, 0.7, 0.4])
         window, lamp, ambient = 3.0 * window * red, 0.0 * warm, 0.4 * ambient * red
         sun[1:] *= (0.2, 1.5)
@@ -86,7 +86,7 @@ def _lit_picture(
 
 
 def _light_grid(sheet: Sheet) -> tuple[np.ndarray, np.ndarray]:
-    """Return points a little in front of the sheet and their normals, on a grid of about `LIGHT_CELL_M`."""
+    """Return points slightly in front of the sheet and their normals, on a grid of about `LIGHT_CELL_M`."""
     down, right = sheet.size_m()
     rows, columns = (int(np.clip(np.ceil(size / LIGHT_CELL_M), 2, 80)) for size in (down, right))
     v, u = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")

@@ -1,4 +1,4 @@
-"""Find ways around furniture: a grid of free floor, shortest paths on it, and walking along them."""
+"""Path planning around furniture: an occupancy grid, shortest paths on it, and path following."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,14 +11,14 @@ from stages.synthesize_capture.room import DEPTH_M, WIDTH_M, Standing
 
 CELL_M = 0.1
 ANIMAL_M, PERSON_M = (0.46, 0.34), (0.40, 1.7)
-"""Breadth and height of who walks."""
+"""Width and height of walkers."""
 Ground = Float[np.ndarray, "2"]
 """A point (x, z) on the floor."""
 
 
 @dataclass(frozen=True)
 class Floor:
-    """Which cells a walker of some breadth can stand on."""
+    """Grid of the cells that are free for a walker."""
 
     free: Bool[np.ndarray, "x z"]
 
@@ -33,11 +33,11 @@ class Floor:
         return bool(self.free[self.cell(point)])
 
     def centers(self) -> Float[np.ndarray, "cell 2"]:
-        """Return the middle of every free cell."""
+        """Return the centres of all free cells."""
         return (np.argwhere(self.free) + 0.5) * CELL_M - [WIDTH_M / 2, DEPTH_M / 2]
 
     def nearest(self, point: Ground) -> Ground:
-        """Return the point itself if free, else the nearest free cell's middle."""
+        """Return the point itself if free, else the centre of the nearest free cell."""
         if self.is_free(point):
             return np.asarray(point, float)
         centers = self.centers()
@@ -46,7 +46,7 @@ class Floor:
     def route(
         self, start: Ground, goal: Ground, *, avoid: Ground | None = None, avoid_m: float = 1.0
     ) -> Float[np.ndarray, "waypoint 2"]:
-        """Return a shortest way that keeps off ``avoid``; blocked cells are crossed as a last resort."""
+        """Return a shortest path that avoids ``avoid``; blocked cells are crossed as a last resort."""
         cost = np.where(self.free, 1.0, 60.0)
         if avoid is not None:
             x = (np.arange(self.free.shape[0]) + 0.5) * CELL_M - WIDTH_M / 2 - avoid[0]
@@ -62,7 +62,7 @@ class Floor:
 
 
 def floor_for(obstacles: Sequence[Standing], size_m: tuple[float, float]) -> Floor:
-    """Return where a walker of this breadth and height can stand between the obstacles and the walls."""
+    """Return the free floor for a walker of this width and height between obstacles and walls."""
     x = (np.arange(round(WIDTH_M / CELL_M)) + 0.5) * CELL_M - WIDTH_M / 2
     z = (np.arange(round(DEPTH_M / CELL_M)) + 0.5) * CELL_M - DEPTH_M / 2
     x, z = np.meshgrid(x, z, indexing="ij")
@@ -76,7 +76,7 @@ def floor_for(obstacles: Sequence[Standing], size_m: tuple[float, float]) -> Flo
 
 
 class Walker:
-    """Walks a route: turns no faster and gains speed no faster than a body can."""
+    """Follows a path with limited angular speed and acceleration."""
 
     def __init__(self, floor: Floor, position: Ground, yaw: float, *, turn_rate: float, acceleration: float):
         self.floor, self.position, self.yaw = floor, np.asarray(position, float), yaw
@@ -85,19 +85,19 @@ class Walker:
         self.way: np.ndarray = np.zeros((0, 2))
 
     def go(self, goal: Ground, *, avoid: Ground | None = None) -> None:
-        """Take the way to a goal."""
+        """Plan the path to a goal."""
         self.way = self.floor.route(self.position, self.floor.nearest(goal), avoid=avoid)
 
     def stop(self) -> None:
-        """Forget the way."""
+        """Discard the path."""
         self.way = np.zeros((0, 2))
 
     def arrived(self) -> bool:
-        """Return whether nothing of the way is left."""
+        """Return whether the path is finished."""
         return len(self.way) == 0
 
     def step(self, seconds: float, desired_speed: float, *, face: float | None = None) -> None:
-        """Move on, heading along the way or, if given, towards the angle ``face`` (a person who films)."""
+        """Advance, heading along the path or, if given, towards the angle ``face`` (a person who films)."""
         while len(self.way) and np.linalg.norm(self.way[0] - self.position) < (
             0.22 if len(self.way) > 1 else 0.05 + 0.06 * self.speed
         ):
@@ -132,5 +132,5 @@ class Walker:
 
 
 def wrapped(angle: float) -> float:
-    """Bring an angle to -pi..pi, radians."""
+    """Wrap an angle to -pi..pi, radians."""
     return float((angle + np.pi) % (2 * np.pi) - np.pi)

@@ -19,7 +19,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class ObserverStyle:
-    """How a person moves; ranges are drawn from evenly, times in seconds, paces in m/s."""
+    """How a person moves; ranges are sampled uniformly, times in seconds, speeds in m/s."""
 
     watch_s: Range = (7.0, 9.0)
     approach_s: Range = (2.0, 3.0)
@@ -27,11 +27,11 @@ class ObserverStyle:
     retreat_s: Range = (1.4, 2.2)
     retreat_m_s: Range = (0.6, 0.85)
     far_m: float = 2.7
-    """from farther off the animal is not walked up to, but strolled to a film's distance first"""
+    """from beyond this distance, the person first strolls to filming distance before an approach"""
     stays: float = 0.8
-    """probability to stand where an approach ended, rather than to step back"""
+    """probability of standing still after an approach, rather than stepping back"""
     comes_up: float = 0.88
-    """probability to walk up after standing, rather than to stroll"""
+    """probability of an approach after standing, rather than a stroll"""
 
 
 FILMING = ObserverStyle()
@@ -48,7 +48,7 @@ AT_HOME = ObserverStyle(
 
 
 class Observer:
-    """A person who films; `step` moves it once, `looks_at` is what the phone points to."""
+    """A person who films; `step` advances it, `looks_at` is what the phone points to."""
 
     def __init__(
         self, floor: Floor, position: Ground, rng: np.random.Generator, style: ObserverStyle = FILMING
@@ -62,7 +62,7 @@ class Observer:
         self._glance: tuple[float, np.ndarray] | None = None
 
     def step(self, seconds: float, animal: Float[np.ndarray, "3"]) -> None:
-        """Move on, given where the animal is (x, y, z)."""
+        """Advance by one step, given the animal's position (x, y, z)."""
         before = self.walker.position.copy()
         self._last = animal if self._last is None else self._last
         ground = animal[[0, 2]]
@@ -83,7 +83,7 @@ class Observer:
         self._look(seconds, animal)
 
     def _choose(self, animal: Ground) -> None:
-        """Take up the next mode."""
+        """Choose the next mode."""
         style = self.style
         self.walker.stop()
         self.speed_m_s = 0.0

@@ -15,12 +15,12 @@ from stages.synthesize_capture.navigation import Floor, Ground, Walker, wrapped
 from stages.synthesize_capture.room import Place
 
 STEP_S = 1.0 / 30.0
-"""Everyone moves on by so much at once."""
+"""Time step of the simulation."""
 DELAY_S = 0.25
-"""How long it takes to notice what the person does."""
+"""Reaction time to the person."""
 NOTICE_M = 3.0
 FLIGHT_M = 2.2
-"""How far it runs when it can run straight away."""
+"""Distance that it flees if it can run straight away."""
 JUMP_S = 0.5
 Reason = Literal["own", "flee", "approach"]
 REASONS: tuple[Reason, ...] = ("own", "flee", "approach")
@@ -28,7 +28,7 @@ REASONS: tuple[Reason, ...] = ("own", "flee", "approach")
 
 @dataclass(frozen=True)
 class SeenWalker:
-    """A person or another animal as it is seen: position and velocity on the floor."""
+    """A perceived person or other animal: position and velocity on the floor."""
 
     position: Ground
     velocity: Ground
@@ -36,7 +36,7 @@ class SeenWalker:
 
 @dataclass
 class Leap:
-    """A jump under way."""
+    """A jump in progress."""
 
     start: Float[np.ndarray, "3"]
     end: Float[np.ndarray, "3"]
@@ -44,7 +44,7 @@ class Leap:
 
 
 class Policy:
-    """The animal's decisions and its way over the floor."""
+    """The animal's decisions and its path over the floor."""
 
     def __init__(self, floor: Floor, places: tuple[Place, ...], position: Ground, rng: np.random.Generator):
         self.rng, self.places = rng, places
@@ -64,12 +64,12 @@ class Policy:
 
     @property
     def position(self) -> Float[np.ndarray, "3"]:
-        """Where it stands: x, height of the ground under it, z."""
+        """Position: x, height of the ground under it, z."""
         return np.array([self.walker.position[0], self.height, self.walker.position[1]])
 
     def step(self, seconds: float, seen: SeenWalker) -> None:
-        """Decide, then move on by one step."""
-        self._feel(seconds, seen)
+        """Decide, then advance by one step."""
+        self._perceive(seconds, seen)
         if self.leap is not None:
             self._fly(seconds)
         else:
@@ -89,8 +89,8 @@ class Policy:
         self.posture += rate * (wanted - self.posture)
         self._look(seconds, seen)
 
-    def _feel(self, seconds: float, seen: SeenWalker) -> None:
-        """Follow how long the person has been calm and how threatening it is."""
+    def _perceive(self, seconds: float, seen: SeenWalker) -> None:
+        """Update distance and closing speed of the person, and how long it has been calm."""
         away = self.walker.position - seen.position
         distance = float(np.linalg.norm(away))
         closing = float(seen.velocity @ away) / max(distance, 1e-6)
@@ -140,7 +140,7 @@ class Policy:
         self.rest_s = self.rng.uniform(1.4, 2.0)
 
     def _refuge(self, goal: Ground, seen: SeenWalker) -> Place | None:
-        """Return a high place close to where it runs, not on the person's side."""
+        """Return a high place near its direction of flight, not on the person's side."""
         for place in self.places:
             entry = np.asarray(place.entry)
             if (
@@ -163,7 +163,7 @@ class Policy:
         self.rest_s = self.rng.uniform(4.0, 7.0)
 
     def _visit(self) -> None:
-        """Go to a favourite place, or just somewhere."""
+        """Go to a favourite place, or to a random one."""
         away = np.array([np.linalg.norm(self.walker.position - place.entry) for place in self.places])
         weight = np.array([0.5 if place is self.perch else 1.0 for place in self.places]) * np.exp(
             -0.25 * away
@@ -198,7 +198,7 @@ class Policy:
         self.walker.speed = 0.0
 
     def _faces(self, seen: SeenWalker) -> float | None:
-        """Return what it turns to at rest: out from a perch, towards a person that it notices, or nothing."""
+        """Return its heading at rest: outward from a perch, towards a noticed person, or None."""
         if self.perch is not None:
             return self.perch.yaw
         if self.reason == "own" or self.distance > NOTICE_M or self.posture[:2].max() > 0.3:

@@ -28,10 +28,10 @@ THUMBNAILS, OUTLINE = 6, (255, 0, 255)
 
 @dataclass(frozen=True)
 class FilmedRecording:
-    """What the quality page shows of a finished recording."""
+    """A finished recording, as shown on the quality page."""
 
     visible_share: float | None
-    """Share of the frames that show an animal; None where none is there."""
+    """Share of the frames that show an animal; None if none is present."""
     thumbnails: list[UInt8[np.ndarray, "height width 3"]]
     """Some frames with the animals' outlines."""
 

@@ -1,4 +1,4 @@
-"""See surfaces through a pinhole camera: scan-convert triangles without clipping.
+"""Rasterize triangles for a pinhole camera, without clipping.
 
 For a triangle with corners M = [v0 v1 v2] in camera axes, the barycentric coordinates of the ray d = (x, y,
 1) divided by its depth are M^-1 d, and their sum is 1 / depth (Olano and Greer 1997). Each is linear along a
@@ -17,21 +17,21 @@ NEAR_M = 0.03
 
 @dataclass(frozen=True)
 class RasterView:
-    """What a camera sees: nearest face per sample (-1 none), 1 / depth, and M^-1 per face."""
+    """Rasterized view: nearest face per sample (-1: none), 1 / depth, and M^-1 per face."""
 
     face: Int[np.ndarray, "height width"]
     inverse_depth: Float[np.ndarray, "height width"]
     inverse_corners: Float[np.ndarray, "face 3 3"]
 
 
-def see(
+def rasterize(
     points_camera: Float[np.ndarray, "vertex 3"],
     faces: Int[np.ndarray, "face 3"],
     intrinsics: Float[np.ndarray, "3 3"],
     height: int,
     width: int,
 ) -> RasterView:
-    """Find the nearest face through each pixel centre; both sides of a face are seen."""
+    """Find the nearest face at each pixel centre, without back-face culling."""
     face = np.full((height, width), -1, np.int32)
     inverse_depth = np.zeros((height, width), np.float32)
     inverse_corners = np.zeros((len(faces), 3, 3), np.float64)

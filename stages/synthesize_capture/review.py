@@ -1,4 +1,4 @@
-"""Judge the made world: does the animal move, does it answer people, is it seen."""
+"""Quality checks of the synthetic world: the animal moves, reacts to people, and is visible."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +37,7 @@ def manner(sessions: list[SessionTrajectories]) -> Manner:
         moving += [float(speed[start : start + reach].mean() > MOVING_M_S) for start in starts]
         flee = _begins(lived.reason == REASONS.index("flee"))
         away = lived.animal.position[:, [0, 2]] - lived.observer_position
-        pressed = _pressed(away, lived)
+        pressed = _approached(away, lived)
         approaches = np.flatnonzero(_begins(pressed))
         ran += [bool(flee[max(start - 15, 0) : start + 30].any()) for start in approaches]
         left = ~pressed & (np.linalg.norm(away, axis=-1) > 1.6)
@@ -50,7 +50,7 @@ def manner(sessions: list[SessionTrajectories]) -> Manner:
 
 
 def report_quality(folder: Path, scripts: list[Script], made: list[FilmedRecording]) -> None:
-    """Write the stage's checks and pictures into the artifact in the making."""
+    """Write the stage's checks and pictures into the unfinished artifact."""
     shown = manner([part.session for part in scripts if part.session is not None])
     visible = _mean([part.visible_share for part in made if part.visible_share is not None])
     flees, alone = shown.flees_when_approached, shown.flees_when_left_alone
@@ -67,8 +67,8 @@ def report_quality(folder: Path, scripts: list[Script], made: list[FilmedRecordi
     qa.write(folder, good=good, bad=bad, checks=checks, pictures=[Picture("contact_sheet", sheet, caption)])
 
 
-def _pressed(away: Float[np.ndarray, "sample 2"], lived: SessionTrajectories) -> np.ndarray:
-    """Return when someone comes quickly and is within 1.5 m."""
+def _approached(away: Float[np.ndarray, "sample 2"], lived: SessionTrajectories) -> np.ndarray:
+    """Return in which samples someone approaches quickly within 1.5 m."""
     distance = np.linalg.norm(away, axis=-1)
     velocity = np.gradient(lived.observer_position, STEP_S, axis=0)
     closing = (velocity * away).sum(-1) / np.maximum(distance, 1e-6)

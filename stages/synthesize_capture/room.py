@@ -42,7 +42,7 @@ class Standing:
     yaw: float
 
     def at(self, x: float, z: float) -> tuple[float, float]:
-        """Return the floor point that lies at (x, z) from its origin, in its own axes."""
+        """Return the floor point at (x, z) in its own axes."""
         cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
         return float(self.x + cosine * x + sine * z), float(self.z - sine * x + cosine * z)
 
@@ -88,7 +88,7 @@ class Room:
         return [*self.fixed, *(sheet for thing in self.loose for sheet in thing.sheets())]
 
     def obstacles(self) -> list[Standing]:
-        """Return everything that stands in the way."""
+        """Return all obstacles."""
         return [
             *(thing for thing in self.standing if thing.piece.top > 0.1 and thing.name != "window"),
             *self.loose,

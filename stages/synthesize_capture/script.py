@@ -39,11 +39,11 @@ PHONE = PhoneFormat()
 
 @dataclass(frozen=True)
 class Script:
-    """All that a recording shows, frame by frame, before the sensor."""
+    """Content of a recording, frame by frame, before the sensor."""
 
     name: str
     seed: int
-    """Of the sensor's noise and the light map's sampling."""
+    """Seed of the sensor's noise and the light map's sampling."""
     room: Room
     light: Light
     exposure: Exposure
@@ -64,7 +64,7 @@ class Script:
 
 
 MOVING_M_S = 0.15
-"""Above this speed over ground the animal counts as moving."""
+"""Minimum ground speed of a moving animal."""
 
 
 def scripts(config: Config, room: Room, phone: PhoneFormat = PHONE) -> list[Script]:

@@ -1,4 +1,4 @@
-"""What the phone makes of light and motion: timestamps, lens, picture, LiDAR depth, drifting odometry.
+"""Sensor model of the phone: timestamps, intrinsics, picture, LiDAR depth, drifting odometry.
 
 Each function turns truth into what a Record3D phone would store; none of them knows about files.
 """
@@ -187,7 +187,7 @@ def _vignette(height: int, width: int) -> Float[np.ndarray, "height width 1"]:
 
 
 def _slow(rng: np.random.Generator, timestamp_s: np.ndarray, seconds: float) -> Float[np.ndarray, "frame"]:
-    """Return smooth noise of unit deviation over time."""
+    """Return smooth noise of unit standard deviation over time."""
     grid = np.arange(-4 * seconds, timestamp_s[-1] + 4 * seconds, seconds / 5)
     noise = gaussian_filter1d(rng.standard_normal(len(grid)), 5) * np.sqrt(2 * np.sqrt(np.pi) * 5)
     return np.interp(timestamp_s, grid, noise)

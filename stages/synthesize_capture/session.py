@@ -1,4 +1,4 @@
-"""Let animal and person live together for a while, without pictures.
+"""Simulate animal and person together, without rendering.
 
 `simulate_session` steps both at `STEP_S` and returns plain time series; poses, cameras and pictures
 follow from them elsewhere, so this runs alone and fast.
@@ -118,21 +118,21 @@ CourseRow = tuple[np.ndarray, float, np.ndarray, float, np.ndarray, float]
 
 
 def course_row(animal: Policy) -> CourseRow:
-    """Return where the animal is now, for `course_from_rows`."""
+    """Return the animal's current state, for `course_from_rows`."""
     mood = {"flee": -0.9, "approach": 0.9, "own": 0.1}[animal.reason]
     tail, airborne = mood * (1.0 - 0.6 * animal.posture[:2].sum()), float(animal.leap is not None)
     return animal.position, animal.walker.yaw, animal.posture.copy(), airborne, animal.gaze.copy(), tail
 
 
 def visitor_row(visitor: Visitor) -> CourseRow:
-    """Return where a visitor is now, who looks ahead, for `course_from_rows`."""
+    """Return a visitor's current state, looking ahead, for `course_from_rows`."""
     (x, z), yaw = visitor.walker.position, visitor.walker.yaw
     gaze = np.array([x + 3 * np.sin(yaw), PERSON_M[1], z + 3 * np.cos(yaw)])
     return np.array([x, 0.0, z]), yaw, np.zeros(3), 0.0, gaze, 0.0
 
 
 def course_from_rows(rows: Sequence[CourseRow]) -> AnimalCourse:
-    """Put the rows of steps of `STEP_S` together."""
+    """Stack rows of states at steps of `STEP_S`."""
     position, yaw, *others = (np.array(column) for column in zip(*rows, strict=True))
     return AnimalCourse(np.arange(len(rows)) * STEP_S, position, np.unwrap(yaw), *others)
 

@@ -1,5 +1,4 @@
-"""Turn what the camera sees into light: lit pictures through mip maps, fur on the animal, a soft shadow under
-it.
+"""Shading of a rasterized view: lit textures with mip maps, fur, and a soft shadow under the animal.
 
 `Backdrop` holds a recording's lit room as one mesh with an atlas of mip maps; `shade` makes a linear RGB
 image from a view at twice the image's size: pixels whose four samples agree are shaded once, edges four
@@ -92,7 +91,7 @@ def shade(
 
 @njit(cache=True, error_model="numpy")
 def _shade(view_face, inverse_corners, focal_center, surface, room, coat, out):
-    """Add the light of every pixel to ``out``; the room's normals are in the camera."""
+    """Add the light of every pixel to ``out``; the room's normals are in camera axes."""
     height, width, _ = out.shape
     fx, fy, cx, cy = focal_center
     pixel = np.empty(3, np.float32)

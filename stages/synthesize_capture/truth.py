@@ -27,7 +27,7 @@ class TruthWriter:
     script: Script
     keep_depth: bool
     number: int = 0
-    """1: the companion is the agent, and the first animal the other."""
+    """1: the companion is the agent."""
     masks: list[np.ndarray] = field(default_factory=list)
     others: list[np.ndarray] = field(default_factory=list)
     visitor_seen: list[float] = field(default_factory=list)
@@ -35,7 +35,7 @@ class TruthWriter:
     vertices: list[np.ndarray] = field(default_factory=list)
 
     def add(self, frame: Frame, index: int) -> None:
-        """Take over one frame."""
+        """Add one frame."""
         turns, motion = self.script.quarter_turns, self.script.motions[self.number]
         self.masks.append(cameras.turn_image(frame.masks[self.number], turns))
         if any(other is not None for other in self.script.motions[1:]):
@@ -49,7 +49,7 @@ class TruthWriter:
             self.vertices.append((vertices_world - motion.world_from_agent[index, :3, 3]).astype(np.float16))
 
     def visible(self) -> Bool[np.ndarray, "frame"]:
-        """Return in which frames the animal can be seen."""
+        """Return in which frames the animal is visible."""
         return np.array([mask.mean() > VISIBLE_SHARE for mask in self.masks])
 
     def write(self, folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""A person who walks through the room while it is filmed: a body on two legs, its clothes, and its ways."""
+"""A person who walks through the room while it is filmed: a body on two legs, its clothes, and its paths."""
 
 import numpy as np
 from jaxtyping import Float
@@ -27,15 +27,15 @@ LEFT: list[BoneRow] = [
 BELLY = Flesh((0.016, 0.02, 0.0), (-0.016, 0.02, 0.0), (0.03, 0.03), 0.02)
 SHOULDERS = Flesh((0.04, 0.108, -0.002), (-0.04, 0.108, -0.002), (0.02, 0.02), 0.02)
 SPEED_M_S, PAUSE_S = (0.6, 1.1), (0.5, 3.0)
-"""How fast a visitor walks, and how long it stands where it came to."""
+"""Ranges of a visitor's walking speed and of its pauses."""
 APART_M = 1.0
-"""How far a visitor keeps from who films."""
+"""Minimum distance of a visitor from the filming person."""
 
 
 def _dressed(
     vertices: Float[np.ndarray, "vertex 3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "vertex 4"]:
-    """Draw trousers, a striped shirt, shoes, skin and hair in colours of chance."""
+    """Draw trousers, a striped shirt, shoes, skin and hair in random colours."""
     _, y, z = vertices.T
     trousers, shirt, stripe = (0.02 + 0.5 * rng.random(3) ** 2 for _ in range(3))
     skin, hair = np.array([0.5, 0.28, 0.19]) * rng.uniform(0.4, 1.2), np.array([0.09, 0.05, 0.03])
@@ -70,7 +70,7 @@ PERSON = Anatomy(
 
 
 class Visitor:
-    """Goes from place to place over the floor, stands there for a while, and keeps clear of who films."""
+    """Walks from place to place with pauses, and keeps its distance from the filming person."""
 
     def __init__(self, floor: Floor, rng: np.random.Generator):
         self.rng, self.centers, self.pause_s = rng, floor.centers(), 0.0
@@ -79,7 +79,7 @@ class Visitor:
         self.speed_m_s, self.velocity = rng.uniform(*SPEED_M_S), np.zeros(2)
 
     def step(self, seconds: float, observer: Ground) -> None:
-        """Move on, given where the person who films stands."""
+        """Advance by one step, given the filming person's position."""
         before = self.walker.position.copy()
         if self.walker.arrived():
             self.pause_s -= seconds

@@ -22,7 +22,7 @@ KINDS = (
 CODES = np.linalg.qr(np.random.default_rng(5).standard_normal((CHANNELS, CHANNELS)))[0][: len(KINDS)]
 """One orthonormal vector per kind."""
 HEADROOM_M = 0.5
-"""Free above a place to rest."""
+"""Free height above a place to rest."""
 
 
 def volume_of(home: Room) -> FeatureVolume:

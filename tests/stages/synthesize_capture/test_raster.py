@@ -16,7 +16,9 @@ def test_depth_agrees_with_embree():
     faces = np.arange(240).reshape(-1, 3).astype(np.int32)
     world_from_camera = rigid.exp(np.array([0.1, -0.2, 0.05, 0.1, 0.0, 0.3]))
     expected, _hits = render_view(RayCaster(Mesh(vertices, faces)), world_from_camera, INTRINSICS, 64, 80)
-    view = raster.see(rigid.apply(rigid.inverse(world_from_camera), vertices), faces, INTRINSICS, 64, 80)
+    view = raster.rasterize(
+        rigid.apply(rigid.inverse(world_from_camera), vertices), faces, INTRINSICS, 64, 80
+    )
     seen = (expected > 2 * raster.NEAR_M) & (view.face >= 0)
     assert (seen == (expected > 2 * raster.NEAR_M)).mean() > 0.998, (
         "the same pixels are covered, but for edges"
@@ -27,7 +29,7 @@ def test_depth_agrees_with_embree():
 
 def test_depth_of_another_size_is_exact_on_a_plane():
     wall = np.array([[-9, -9, 2.0], [9, -9, 2.0], [0, 18, 5.0]])
-    view = raster.see(wall, np.array([[0, 1, 2]], np.int32), INTRINSICS, 64, 80)
+    view = raster.rasterize(wall, np.array([[0, 1, 2]], np.int32), INTRINSICS, 64, 80)
     depth = raster.depth_through(
         view.face, view.inverse_depth, view.inverse_corners, np.array([72.0, 66.0, 32.24, 23.325]), 48, 64
     )
