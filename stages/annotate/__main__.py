@@ -21,7 +21,7 @@ PORT = 8765
 
 
 def main(arguments: list[str]) -> int:
-    """Serve until Ctrl-C; return 2 where the build does not go that far."""
+    """Serve until Ctrl-C; return 2 if the build lacks what the page needs."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -47,7 +47,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _inputs(build: Path) -> stage.Inputs:
-    """Find frames and template of a build. Raises ART-001 where they are not finished."""
+    """Find frames and template of a build. Raises ART-001 if they are not finished."""
     artifact.opened(build / "scene_template", "scene_template")
     shown = [video for video in videos.read(build / "plan" / "videos.json") if video.role in ROLES]
     for video in shown:

@@ -21,13 +21,13 @@ from pipeline.data import clicks
 from pipeline.data.clicks import ClickedClip, ClickedPair
 
 MAX_DIGITS = 10
-"""a Content-Length of more digits is refused"""
+"""maximum digits of a Content-Length"""
 PICTURE = re.compile(r"/picture/([0-9]{1,9})/([0-9]{1,9})\.jpg\Z")
 
 
 @dataclass(frozen=True)
 class ClickSession:
-    """What is clicked on, and where clicks are kept."""
+    """The recordings to click in, and the file of clicks."""
 
     recordings: Mapping[str, ClickedClip]
     """by file name"""
@@ -40,7 +40,7 @@ class ClickSession:
     """file of clicks"""
 
     def state(self) -> dict[str, Any]:
-        """Return what the page needs to begin."""
+        """Return the initial state of the page."""
         names = list(self.recordings)
 
         def frame_of(name: str, frame: int) -> dict[str, Any]:
@@ -52,7 +52,7 @@ class ClickSession:
         return {"reference": self.reference, "wanted": clicks.WANTED, "frames": frames, "pairs": pairs}
 
     def fits(self, pairs: list[ClickedPair]) -> dict[str, Any]:
-        """Return, per frame with enough pairs, what is left of each in millimetres (null without depth)."""
+        """Return the residual of each pair in millimetres (null without depth), for frames with enough."""
         found = {}
         for name, recorded in self.recordings.items():
             for source_index, group in clicks.by_frame(pairs, name).items():
@@ -64,7 +64,7 @@ class ClickSession:
         return found
 
     def keep(self, pairs: list[ClickedPair]) -> None:
-        """Replace the file of clicks; names must be of recordings that are shown."""
+        """Replace the file of clicks, which must name recordings that are shown."""
         for pair in pairs:
             if pair.seen.recording not in self.recordings or pair.reference.recording != self.reference:
                 names = f"{pair.seen.recording!r} and {pair.reference.recording!r}"
@@ -86,17 +86,17 @@ class ClickSession:
 
 
 class ClickServer(ThreadingHTTPServer):
-    """Serves one session of clicking; bound, but not yet running."""
+    """Server of one session of clicking; bound, but not yet running."""
 
     def __init__(self, desk: ClickSession, port: int) -> None:
-        """Bind to a port of this machine; 0 takes any free one."""
+        """Bind to a local port; 0 takes any free one."""
         super().__init__((loopback.HOST, port), Handler)
         self.desk = desk
-        self.keeping = threading.Lock()  # requests have a thread each, and write one file
+        self.keeping = threading.Lock()  # each request has its own thread, and all write one file
 
 
 class Handler(BaseHTTPRequestHandler):
-    """One request; only the page itself, asked for by its own address, is served."""
+    """One request; only requests of the page itself are served."""
 
     server: "ClickServer"
 
@@ -111,18 +111,18 @@ class Handler(BaseHTTPRequestHandler):
         if self.path == "/state":
             try:
                 return self._json(self.server.desk.state())
-            except InputError as error:  # the file of clicks broke since the server began
+            except InputError as error:  # the file of clicks was damaged since the server started
                 return self._send(HTTPStatus.INTERNAL_SERVER_ERROR, str(error).encode(), "text/plain")
         try:
             found = self.server.desk.picture(int(match[1]), int(match[2])) if match else b""
-        except (LookupError, OSError):  # the build may go on beside it
+        except (LookupError, OSError):  # the build may run at the same time
             found = b""
         if not found:
             return self._send(HTTPStatus.NOT_FOUND, b"", "text/plain")
         return self._send(HTTPStatus.OK, found, "image/jpeg")
 
     def do_POST(self) -> None:
-        """Keep the clicks and answer with their fits."""
+        """Save the clicks and respond with their fits."""
         stated = self.headers.get("Content-Length") or ""
         length = int(stated) if stated.isascii() and stated.isdigit() and len(stated) < MAX_DIGITS else 0
         wanted = self.path == "/clicks" and self.headers.get("Content-Type") == "application/json"
@@ -139,7 +139,7 @@ class Handler(BaseHTTPRequestHandler):
         return self._json({"fits": self.server.desk.fits(pairs)})
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Stay silent."""
+        """Log nothing."""
 
     def _from_here(self) -> bool:
         hosts, origins = (self.headers.get_all(name, []) for name in ("Host", "Origin"))

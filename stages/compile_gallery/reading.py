@@ -13,13 +13,13 @@ from pipeline.data import qa
 from pipeline.metrics import bars, words
 
 PICTURES = ("simulator/qa/visits.webp", "simulator/qa/heat_maps.webp", "splats/qa/frames.webp")
-"""Pictures that stand for a build, the best first; all of them are in its report."""
+"""Candidate pictures for a build's card, the best first; all of them are in its report."""
 METRICS = (
     "behavior/ats/goal_minde_m",
     "reconstruction/agent_root_m_median",
     "registration/translation_m_median",
 )
-"""Keys of `metrics.json` that a visitor can picture."""
+"""Keys of `metrics.json` that are easy to interpret."""
 _CHECKS = ("sessions to replay", "size of the page")
 _QUALITY = 82
 _THUMBNAIL_PX = 480
@@ -28,7 +28,7 @@ _THUMBNAIL_PX = 480
 
 @dataclass(frozen=True)
 class Figure:
-    """A number in words."""
+    """A number with its label."""
 
     words: str
     value: float
@@ -53,7 +53,7 @@ class Card:
     thumbnail: str | None
     """WebP as a data address"""
     status: qa.Status | Literal["none"]
-    """worst of its artifacts' checks and of the report's bars; "none" where no artifact reported a check"""
+    """worst of its artifacts' checks and of the report's thresholds; "none" without any check"""
     figures: tuple[Figure, ...]
     page: Link
     links: tuple[Link, ...]

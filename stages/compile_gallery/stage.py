@@ -15,7 +15,7 @@ _WORDS = {"ok": "all checks fine", "warn": "checks to look at", "fail": "checks 
 def run(root: Path) -> str:
     """Return the page for all builds in `root` (`build/`); variants, and animals of one home, have cards too.
 
-    Raises InputError ART-003 where no simulator is finished.
+    Raises InputError ART-003 if no simulator is finished.
     """
     folders = [
         folder
@@ -35,7 +35,7 @@ def run(root: Path) -> str:
 
 
 def number(value: float) -> str:
-    """Write a number with three significant digits; whole ones as they are."""
+    """Format a number with three significant digits; integers exactly."""
     if value == round(value) or abs(value) >= 100:
         return f"{value:.0f}"
     digits = max(0, 2 - math.floor(math.log10(abs(value))))

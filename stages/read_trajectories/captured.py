@@ -1,4 +1,4 @@
-"""Motion capture as joint positions becomes a root and bones, whatever the skeleton.
+"""Root and bone poses from motion capture joint positions, for any skeleton.
 
 Nobody says which joint hangs on which: joints that keep their distance are joined (a minimum spanning tree
 over how much distances vary), and each joint's bone points to its neighbour away from the root.
@@ -14,7 +14,7 @@ from stages.read_trajectories.config import Config
 
 
 def parents(joints: Float[np.ndarray, "frame joint 3"], root: int) -> Int[np.ndarray, "joint"]:
-    """Return the neighbour of each joint towards the root; -1 for the root."""
+    """Return the parent of each joint; -1 for the root."""
     distance = np.linalg.norm(joints[::7, :, None] - joints[::7, None], axis=-1)
     cost = distance.std(0) + 1e-3 * distance.mean(0) + 1e-9
     tree = minimum_spanning_tree(csr_array(np.triu(cost, 1)))
@@ -25,7 +25,7 @@ def parents(joints: Float[np.ndarray, "frame joint 3"], root: int) -> Int[np.nda
 def root_from_joints(
     joints: Float[np.ndarray, "frame joint 3"], config: Config
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Return ``world_from_agent``: at the root joint, +z to the front joint, +y as far up as that allows."""
+    """Return ``world_from_agent``: origin at the root joint, +z to the front joint, +y closest to up."""
     forward = joints[:, config.front_joint] - joints[:, config.root_joint]
     forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
     side = np.cross([0.0, 1.0, 0.0], forward)
@@ -38,7 +38,7 @@ def root_from_joints(
 def bones_from_joints(
     joints_agent: Float[np.ndarray, "frame joint 3"], parent: Int[np.ndarray, "joint"]
 ) -> tuple[Float[np.ndarray, "frame joint 4 4"], Float[np.ndarray, "joint 4 4"]]:
-    """Return ``agent_from_bone`` and its rest, one bone per joint, turned from its mean direction."""
+    """Return ``agent_from_bone`` and its rest pose, one bone per joint, relative to its mean direction."""
     child = np.array(
         [next((c for c in range(len(parent)) if parent[c] == j), -1) for j in range(len(parent))]
     )
@@ -52,7 +52,7 @@ def bones_from_joints(
 def _shortest_turn(
     start: Float[np.ndarray, "joint 3"], end: Float[np.ndarray, "frame joint 3"]
 ) -> Float[np.ndarray, "frame joint 3 3"]:
-    """Return the smallest rotations from ``start`` to ``end``; identity where a joint has no direction."""
+    """Return the smallest rotations from ``start`` to ``end``; identity for directions of length 0."""
     start = np.broadcast_to(start, end.shape)
     axis = np.cross(start, end)
     angle = np.arctan2(np.linalg.norm(axis, axis=-1), (start * end).sum(-1))

@@ -1,4 +1,4 @@
-"""How tables of motion are to be read."""
+"""Settings for reading tables of motion."""
 
 from dataclasses import dataclass
 

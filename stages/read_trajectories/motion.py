@@ -1,4 +1,4 @@
-"""One recording's motion, whatever it was read from."""
+"""Motion of one recording, independent of its file format."""
 
 from dataclasses import dataclass
 
@@ -9,10 +9,10 @@ from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.trajectories import ABSENT_M
 
 CLIP_GAP_S = 5.0
-"""Between two clips of one recording, so that no window spans them."""
+"""Gap between two clips of one recording, so that no window spans them."""
 
 STEP_TOLERANCE = 1e-3
-"""Share of a step by which a gap may be too short: times are rounded."""
+"""Tolerance of gaps for rounded times, as a share of a step."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class MeasuredMotion:
     agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
     volume: FeatureVolume
     companions: Float[np.ndarray, "frame companion 4"] | None = None
-    """others beside the observer: world position, and kind as a number of `KINDS`; NaN where absent"""
+    """others besides the observer: world position, and kind as index into `KINDS`; NaN where absent"""
 
     def arrays(self) -> dict[str, Float[np.ndarray, "..."] | Bool[np.ndarray, "frame"]]:
         """Return the arrays of a ``motion.npz``."""
@@ -42,7 +42,7 @@ class MeasuredMotion:
 
 
 def absent_observer(frames: int) -> Float[np.ndarray, "frame 4 4"]:
-    """Return an observer who is not there."""
+    """Return the poses of an absent observer."""
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, 0, 3] = ABSENT_M
     return poses

@@ -11,16 +11,16 @@ from stages.read_trajectories.tables import columns, numbers
 
 CHANNELS = 16
 FLOOR, OBSTACLE = 0, 1
-"""Channels that are 1 in the floor's and in obstacles' voxels."""
+"""Channels with value 1 in voxels of the floor and of obstacles."""
 MARGIN_M = 1.0
 HEADROOM_M = 1.0
 OBSTACLE_TOP_M = 1.0
-"""Height of obstacles whose table has none, metres above the floor: as high as furniture."""
+"""Default height of obstacles, metres above the floor: that of furniture."""
 MAX_VOXELS = 10_000_000
 
 
 def no_scene() -> FeatureVolume:
-    """Return a volume of one voxel of which nothing is known."""
+    """Return a volume of a single unknown voxel."""
     features, unseen = np.zeros((CHANNELS, 1, 1, 1), np.float16), np.full((1, 1, 1), 2, np.uint8)
     return FeatureVolume(features, unseen, np.zeros(3), 0.1)
 

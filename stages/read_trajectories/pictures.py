@@ -1,4 +1,4 @@
-"""What the quality page of a table of motion shows."""
+"""Quality page of a table of motion."""
 
 import numpy as np
 from jaxtyping import Float
@@ -9,13 +9,13 @@ from pipeline.geometry import rigid
 from stages.read_trajectories.motion import MeasuredMotion
 
 FASTEST_M_S = 12.0
-"""Hardly any animal at home is faster."""
+"""Maximum plausible speed of an animal at home."""
 FASTEST_RAD_S = 10.0
-"""Nor does any turn faster; degrees that are read as radians do."""
+"""Maximum plausible angular speed; degrees read as radians exceed it."""
 
 
 def pictures(motion: MeasuredMotion) -> list[Picture]:
-    """Draw the way from above, blue, over what stands in it, grey."""
+    """Draw the trajectory (blue) from above over obstacles (grey)."""
     figure, axes = plots.panels(1, 1, width_in=5, height_in=4)
     volume, axis = motion.volume, axes[0, 0]
     plots.floor_plan(axis, (volume.occupancy[:, 3:] == 1).any(1), volume.origin[[0, 2]], volume.voxel_m)
@@ -26,7 +26,7 @@ def pictures(motion: MeasuredMotion) -> list[Picture]:
 
 
 def checks(motion: MeasuredMotion) -> list[Check]:
-    """Judge the motion."""
+    """Return quality checks of the motion."""
     step, rotation = np.diff(motion.timestamp_s), motion.world_from_agent[:, :3, :3]
     way = np.linalg.norm(np.diff(motion.world_from_agent[:, :3, 3], axis=0), axis=-1)
     known = (step < 1.0) & np.isfinite(way)

@@ -1,4 +1,4 @@
-"""Which kind of recording it is, and how each becomes a `MeasuredMotion`."""
+"""Recognise the format of a table of motion and read it into a `MeasuredMotion`."""
 
 from pathlib import Path
 
@@ -16,10 +16,10 @@ MOTION_KEYS = (
     "timestamp_s", "world_from_agent", "agent_from_bone", "world_from_camera", "agent_from_bone_rest",
 )  # fmt: skip
 VOLUME_KEYS = ("volume/features", "volume/occupancy", "volume/origin", "volume/voxel_m")
-MAX_BYTES = 2 << 30  # of all arrays of a file, which are read at once
+MAX_BYTES = 2 << 30  # limit for all arrays of a file, which are read at once
 FLOOR_QUANTILE = 0.002
 MAX_DISTANCE_M = 10_000.0
-"""Further from the origin single precision resolves no more than millimetres, of which walks are made."""
+"""Maximum distance from the origin: beyond it float32 resolves only millimetres."""
 
 
 def read(path: Path, config: Config) -> MeasuredMotion:
@@ -76,7 +76,7 @@ def _from_life(path: Path, stored: dict[str, np.ndarray]) -> MeasuredMotion:
 
 
 def _from_joints(path: Path, stored: dict[str, np.ndarray], config: Config) -> MeasuredMotion:
-    """Put the clips of a motion capture one after another; the lowest joint touches the floor at y = 0."""
+    """Concatenate the clips of a motion capture; the lowest joint touches the floor at y = 0."""
     clips: list[np.ndarray] = [
         np.asarray(clip, float) if clip.dtype.kind in "fiu" else np.zeros(0) for clip in stored.values()
     ]

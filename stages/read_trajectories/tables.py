@@ -14,14 +14,14 @@ from stages.read_trajectories.motion import CLIP_GAP_S, absent_observer, concate
 REQUIRED_COLUMNS = ("time", "x", "y", "z", "heading")
 OBSERVER_COLUMNS = ("observer_x", "observer_y", "observer_z")
 MAX_STEP_S = 1.0
-"""Rows that are typically further apart hold no motion: their times are no seconds."""
+"""Maximum median time step: larger ones are not seconds, or hold no motion."""
 SURPLUS = "more cells than the header"
 
 
 def columns(path: Path, needed: tuple[str, ...]) -> dict[str, list[str]]:
     """Read a CSV table by column, names in lower case; cells that a short row lacks are empty.
 
-    Raises TRJ-001 when a needed column is missing or a row has more cells than the header.
+    Raises TRJ-001 if a required column is missing or a row has more cells than the header.
     """
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
@@ -68,13 +68,12 @@ def motion_from_csv(
     Float[np.ndarray, "frame 4 4"],
     Float[np.ndarray, "frame companion 4"] | None,
 ]:
-    """Return times, ``world_from_agent``, ``world_from_camera`` and companions; ids follow each other on one
-    clock, as do stretches of one id that lie further apart than clips are put. The observer looks at the
-    animal.
+    """Return times, ``world_from_agent``, ``world_from_camera`` and companions.
 
-    In a table with a column ``kind``, ids share the clock of the table and perceive each other. Those of kind
-    animal are the agents, people only where there are no animals. Rows without a position are frames in which
-    the animal was not seen (NaN). Raises TRJ-001, TRJ-002.
+    Ids are concatenated as clips on one clock, as are parts of an id with long gaps between them. The observer
+    looks at the animal. In a table with a column ``kind``, ids share the table's clock and perceive each other;
+    animals are the agents, or people if there are no animals. Rows without a position are frames in which the
+    animal was not seen (NaN). Raises TRJ-001, TRJ-002.
     """
     table = columns(path, REQUIRED_COLUMNS)
     observed = any(name in table for name in OBSERVER_COLUMNS)
@@ -117,7 +116,7 @@ def motion_from_csv(
 
 
 def being_kinds(path: Path, table: dict[str, list[str]], names: list[str]) -> Int[np.ndarray, "row"] | None:
-    """Return the number in `KINDS` of each row's being; None where the table does not name kinds.
+    """Return the index into `KINDS` of each row; None if the table does not name kinds.
 
     Raises TRJ-001 for other kinds, and for an id of two.
     """
@@ -175,7 +174,7 @@ def companions_of(
 def interpolated(
     time: Float[np.ndarray, "known"], beings: Float[np.ndarray, "known 4"], query: Float[np.ndarray, "frame"]
 ) -> Float[np.ndarray, "frame 4"]:
-    """Return rows between known ones at most `MAX_STEP_S` apart; NaN elsewhere."""
+    """Interpolate rows between known ones at most `MAX_STEP_S` apart; NaN elsewhere."""
     after = np.searchsorted(time, query).clip(0, len(time) - 1)
     before = (np.searchsorted(time, query, side="right") - 1).clip(0)
     within = (time[before] <= query) & (query <= time[after]) & (time[after] - time[before] <= MAX_STEP_S)
@@ -185,7 +184,7 @@ def interpolated(
 
 
 def _refuse_impossible_times(path: Path, clips: list[Float[np.ndarray, "row"]]) -> None:
-    """Raise TRJ-001 where sorted times of an id repeat, or can be no seconds."""
+    """Raise TRJ-001 if the sorted times of an id repeat, or cannot be seconds."""
     for time in clips:
         step = np.diff(time)
         if (step == 0).any():

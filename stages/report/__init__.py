@@ -1,1 +1,1 @@
-"""The report of a build: what every stage said about itself, on pages that can be sent."""
+"""The report of a build: the quality checks of every stage, on self-contained pages."""

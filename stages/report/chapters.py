@@ -1,4 +1,4 @@
-"""The words of the report, from `templates/words.toml`: chapters in flow order, what to do about checks."""
+"""The texts of the report, from `templates/words.toml`: chapters in flow order, remedies for checks."""
 
 import tomllib
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ class Chapter:
     artifact: str
     title: str
     sentence: str
-    """what happened here, in plain words"""
+    """what this step does, in plain words"""
     per_video: bool = False
     nobody_in: tuple[str, ...] = ()
     """its pictures (names with *) that are drawn from numbers or show the animal alone: nobody, and no more
@@ -32,6 +32,6 @@ CHAPTERS = tuple(
 
 
 def remedy(artifact: str, check: str) -> str:
-    """Return what to do about a check that warns or fails, or nothing where nothing is known."""
+    """Return the remedy for a check that warns or fails; empty if there is none."""
     known = WORDS["remedies"].get(artifact, {})
     return next((words for begin, words in known.items() if check.lower().startswith(begin)), "")

@@ -24,28 +24,28 @@ _PICTURE_BYTES = 10_000_000
 _SMALLEST_PX = 160
 _JPEG_QUALITY, _BLURRED_JPEG_QUALITY = 85, 80
 _BLUR_PX = 24
-"""what lies within this distance becomes one colour"""
+"""size of blocks that become one colour"""
 _STRIP = 2.4
-"""width over height of a picture that is a strip"""
+"""minimum aspect ratio of a strip"""
 
 
 @dataclass(frozen=True)
 class EmbeddedPicture:
-    """One picture, ready to stand in a page."""
+    """One picture, ready to embed in a page."""
 
     source: str
     """data URI"""
     caption: str
     wide: bool
-    """a strip that wants the page's whole width"""
+    """a strip that needs the full width of the page"""
 
 
 @dataclass(frozen=True)
 class RecordingLabel:
-    """How a recording is called."""
+    """Label of a recording."""
 
     name: str = ""
-    """its file's name; its id where names may reveal people"""
+    """its file name; its id if names may reveal people"""
     role: str = ""
 
 
@@ -69,41 +69,41 @@ class ChapterReport:
     chapter: Chapter
     notes: list[Note]
     settings: dict[str, Any]
-    stands_on: frozenset[str] = frozenset()
-    """artifacts that it was made from"""
+    depends_on: frozenset[str] = frozenset()
+    """artifacts that it depends on"""
     bars: str = "ok"
-    """the worst light of the bars that it is judged by"""
+    """the worst status of the thresholds on its metrics"""
     causes: tuple[Chapter, ...] = ()
-    """chapters it stands on, at whatever distance, whose own light is worse than its own"""
+    """direct and indirect dependencies whose own status is worse"""
     inherited: str = "ok"
-    """the worst light of these"""
+    """the worst status of these"""
 
     @property
     def own_light(self) -> str:
-        """The worst light of all notes and bars."""
+        """The worst status of all notes and thresholds."""
         found = [note.light for note in self.notes] + ([self.bars] if self.bars != "ok" else [])
         return max(found, key=LIGHTS.index, default="none")
 
     @property
     def light(self) -> str:
-        """The verdict: the worst of its own light and of what it stands on."""
+        """The verdict: the worst of its own status and that of its dependencies."""
         return max(self.own_light, self.inherited, key=LIGHTS.index) if self.causes else self.own_light
 
     @property
     def worries(self) -> list[tuple[Note, dict[str, Any]]]:
-        """Checks that are not fine, worst first."""
+        """Checks that are not ok, worst first."""
         bad = ("warn", "fail")
         found = [(note, check) for note in self.notes for check in note.checks if check["status"] in bad]
         return sorted(found, key=lambda pair: -LIGHTS.index(pair[1]["status"]))
 
     @property
     def cover(self) -> EmbeddedPicture | None:
-        """The first picture there is."""
+        """The first picture, if any."""
         return next((picture for note in self.notes for picture in note.pictures), None)
 
 
 def label(video: Video, safe: bool) -> RecordingLabel:
-    """Return how a recording is called, by its file's name where the report need not be ``safe``."""
+    """Return the label of a recording; its file name only if the report is not ``safe``."""
     role = f"{video.role}, {video.split}" if video.role == "session" else video.role
     return RecordingLabel(video.id if safe else video.file, role)
 
@@ -132,17 +132,17 @@ def read_chapter(
         _note(video, labels.get(video or "", RecordingLabel()), folders[video], qa, shrink, blurred)
         for video, qa in raw.items()
     ]
-    stands_on = frozenset(name.partition("/")[0] for manifest in manifests for name in manifest["inputs"])
-    return ChapterReport(chapter, notes, dict(manifests[0]["config"]) if manifests else {}, stands_on)
+    depends_on = frozenset(name.partition("/")[0] for manifest in manifests for name in manifest["inputs"])
+    return ChapterReport(chapter, notes, dict(manifests[0]["config"]) if manifests else {}, depends_on)
 
 
 def with_verdicts(chapters: Sequence[ChapterReport], bars: Mapping[str, str]) -> list[ChapterReport]:
-    """Give every chapter the light of its bars, and of what it stands on; chapters come in flow order."""
+    """Add to chapters, in flow order, the status of their thresholds and of their dependencies."""
     found: dict[str, ChapterReport] = {}
     reached: dict[str, frozenset[str]] = {}
     for each in chapters:
         name, mine = each.chapter.artifact, replace(each, bars=bars.get(each.chapter.artifact, "ok"))
-        direct = [below for below in mine.stands_on if below in found]
+        direct = [each for each in mine.depends_on if each in found]
         reached[name] = frozenset(direct).union(*(reached[below] for below in direct))
         own = LIGHTS.index(mine.own_light)
         worse = [found[below] for below in found if below in reached[name]]
@@ -182,7 +182,7 @@ def _note(
 
 
 def _picture(path: Path, caption: str, shrink: float, blurred: bool) -> EmbeddedPicture:
-    """Embed a picture; where a page would grow too big to send, smaller."""
+    """Embed a picture, downscaled if the page would get too large to send."""
     color = images.read_color(path)
     kind, content = path.suffix[1:], path.read_bytes()
     if blurred:
@@ -196,7 +196,7 @@ def _picture(path: Path, caption: str, shrink: float, blurred: bool) -> Embedded
 
 
 def _beyond_recognition(color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
-    """Keep one colour per 24 pixels: layout and light stay, faces, pictures and writing go."""
+    """Pixelate to blocks of 24 pixels: layout and light remain, faces, pictures and text do not."""
     height, width, _ = color.shape
     size = max(1, width // _BLUR_PX), max(1, height // _BLUR_PX)
     few = cv2.resize(color, size, interpolation=cv2.INTER_AREA)

@@ -15,9 +15,9 @@ from stages.report.collect import read_manifest
 
 FILE = "ro-crate-metadata.json"
 BUILTIN = "synthetic_capture"
-"""Stands beside the other artifacts where a build has no recordings of a user's."""
+"""Artifact of a build without a user's recordings."""
 PLANNED = ("role", "split", "sha256", "synchronized_with", "offset_s", "animal")
-"""What is kept of a recording, so that it is planned the same again."""
+"""Attributes of a recording needed to reproduce its plan."""
 Entity = dict[str, Any]
 
 

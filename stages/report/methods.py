@@ -1,4 +1,4 @@
-"""The methods of a build in words, with BibTeX entries of what was used by the settings in its manifests."""
+"""The methods section of a build, with BibTeX entries, from the settings in its manifests."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -10,12 +10,12 @@ from stages.report.chapters import WORDS
 from stages.report.collect import read_manifest
 
 Folders = Mapping[str, Mapping[str | None, Path]]
-"""Folders of every artifact, by recording; None where there is one in all."""
+"""Folders of every artifact by recording; the key None if there is only one."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """One sentence about one artifact; it holds where the settings are those of `when`."""
+    """One sentence about an artifact, which applies if its settings match `when`."""
 
     artifact: str
     sentence: str
@@ -23,7 +23,7 @@ class Method:
     when: Mapping[str, Any] = field(default_factory=dict)
 
     def holds(self, settings: Mapping[str, Any]) -> bool:
-        """Return whether the artifact was made in this way; a setting that it lacks decides nothing."""
+        """Return whether the sentence applies to the artifact; missing settings are ignored."""
         return all(settings.get(key, value) == value for key, value in self.when.items())
 
 
@@ -45,7 +45,7 @@ def paragraph(folders: Folders) -> str:
 
 
 def document(folders: Folders) -> str:
-    """Return the paragraph with the versions of what computed it, as Markdown."""
+    """Return the paragraph with software versions, as Markdown."""
     manifests = (read_manifest(folder) for each in folders.values() for folder in each.values())
     versions = sorted({f"{name} {v}" for m in manifests if m for name, v in m["versions"].items()})
     computed = f"\n\nComputed with {', '.join(versions)}." if versions else ""
@@ -67,7 +67,7 @@ def _used(folders: Folders) -> Iterator[tuple[Method, Mapping[str, Any]]]:
 
 
 class _Settings(dict[str, Any]):
-    """Settings of which a sentence may name one that older artifacts did not have."""
+    """Settings for formatting a sentence; those missing in older artifacts are allowed."""
 
     def __missing__(self, key: str) -> float:
         return float("nan")

@@ -41,13 +41,13 @@ def render(
 
 
 def in_words(check: str) -> str:
-    """Return a check's name; one that is a key of the metrics in words."""
+    """Return a check's name; metric keys are spelled out in words."""
     group, _, rest = check.partition("/")
     return f"{group}: {metric_words.describe(check).text}" if rest and " " not in check else check
 
 
 def number(value: Any) -> str:
-    """Write a number as a reader wants it: three significant digits, no exponent where it can be helped."""
+    """Format a number with three significant digits, without exponent if possible."""
     if value is None:
         return "–"
     if isinstance(value, bool) or not isinstance(value, int | float):

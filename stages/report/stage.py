@@ -42,13 +42,13 @@ class Inputs:
     evaluation: Path
 
     def folders(self, artifact: str) -> dict[str | None, Path]:
-        """Return an artifact's folders by recording; None where there is one in all."""
+        """Return an artifact's folders by recording; the key None if there is only one."""
         given: Path | Mapping[str | None, Path] = getattr(self, artifact)
         return {None: given} if isinstance(given, Path) else dict(given)
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] = ()) -> None:
-    """Collect, judge, render."""
+    """Collect notes, derive verdicts, render pages."""
     measured = Metrics.read(inputs.evaluation)
     folders = {chapter.artifact: inputs.folders(chapter.artifact) for chapter in CHAPTERS}
     judged = bars.judge(measured.values, measured.reasons)
