@@ -70,10 +70,10 @@ def motion_from_csv(
 ]:
     """Return times, ``world_from_agent``, ``world_from_camera`` and companions.
 
-    Ids are concatenated as clips on one clock, as are parts of an id with long gaps between them. The observer
-    looks at the animal. In a table with a column ``kind``, ids share the table's clock and perceive each other;
-    animals are the agents, or people if there are no animals. Rows without a position are frames in which the
-    animal was not seen (NaN). Raises TRJ-001, TRJ-002.
+    Ids are concatenated as clips on one clock, as are parts of an id with long gaps between them. The
+    observer looks at the animal. In a table with a column ``kind``, ids share the table's clock and perceive
+    each other; animals are the agents, or people if there are no animals. Rows without a position are frames
+    in which the animal was not seen (NaN). Raises TRJ-001, TRJ-002.
     """
     table = columns(path, REQUIRED_COLUMNS)
     observed = any(name in table for name in OBSERVER_COLUMNS)
