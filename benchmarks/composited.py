@@ -338,7 +338,7 @@ class Compositor:
         focal = (k[0, 0], k[1, 1], k[0, 2], k[1, 2])
         if body[:, 2].max() < 0.3:
             return Composite(color, depth, np.zeros(depth.shape, bool))
-        view = raster.see(body, self.creature.faces, np.diag([2, 2, 1]) @ k, 2 * height, 2 * width)
+        view = raster.rasterize(body, self.creature.faces, np.diag([2, 2, 1]) @ k, 2 * height, 2 * width)
         normals = animal.normals_of(body, self.creature.faces) @ world_from_camera[:3, :3].T
         shine = (
             0.45 + 0.4 * (0.5 + 0.5 * normals[:, 1:2]) + 0.25 * np.clip(normals[:, :1], 0, 1)

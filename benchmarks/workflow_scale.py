@@ -62,7 +62,7 @@ def pretend_built(folder: Path, agent: str) -> str:
     """Write every stamp; return the id of one job whose artifact stands and is up to date."""
     code = (
         "from pathlib import Path; from pipeline.workflow import artifact, jobs, run;"
-        f"job = jobs.planned(jobs.Home({agent!r}), 'frames.v000'); key = run._key(job)\n"
+        f"job = jobs.read_job(jobs.Home({agent!r}), 'frames.v000'); key = run._key(job)\n"
         "with artifact.create(Path(job['out']), stage='extract_frames', config={}, inputs={}, key=key) as made:\n"
         "    (made / 'x').write_text('x')\n"
     )
