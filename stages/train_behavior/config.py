@@ -69,9 +69,6 @@ class ObjectiveConfig:
     """Error with equal weight at all noise levels: of the noise, as in the paper; of the velocity
     (v-prediction), which weights noisy steps, where the coarse shape is decided, more; or of the flow of
     rectified flow, with its noise levels in place of the paper's 50 linear ones."""
-    motion_weight: float = 4.0
-    """Weight of the frame-to-frame change of a body's error relative to the error itself (velocity loss of
-    Tevet et al. 2022), against foot skate."""
     path_share: float = 0.5
     """Share of a batch that trains paths, whose network is costly."""
     body_share: float = 0.5

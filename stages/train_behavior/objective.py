@@ -23,6 +23,9 @@ CONDITION_DROPOUT = 0.1
 """Probability of replacing a condition by its null, independently, for classifier-free guidance"""
 EARLIEST_GOAL = 0.2
 """Earliest time of training targets of goals, as a share of the horizon"""
+MOTION_WEIGHT: dict[Weighting, float] = {"noise": 0.0, "velocity": 4.0, "flow": 4.0}
+"""Weight of the frame-to-frame change of a body's error beside the error itself, like the velocity loss of
+Tevet et al. 2022: errors that change make feet skate. The paper's loss has none."""
 TrainingPhase = Literal["goals", "sequences", "all"]
 """Trained networks: perception and goals; path and body, with frozen perception; or all"""
 
@@ -44,7 +47,7 @@ def losses(
     def error(denoise: Denoise, clean: Tensor, motion_weight: float = 0.0) -> Tensor:
         return squared_error(denoise, clean, schedule, objective.weighting, generator, motion_weight)
 
-    of_body = partial(error, motion_weight=objective.motion_weight)
+    of_body = partial(error, motion_weight=MOTION_WEIGHT[objective.weighting])
     return level_losses(nets, batch, objective, generator, phase, goal, error, of_body)
 
 

@@ -14,6 +14,7 @@ from pipeline.rivals.samplers import LOG_STD_BOUNDS, LOG_STD_STEP, MEAN_STEP
 from stages.train_behavior.batches import TrainingBatch
 from stages.train_behavior.config import ObjectiveConfig
 from stages.train_behavior.objective import (
+    MOTION_WEIGHT,
     Denoise,
     TrainingPhase,
     joint_mask,
@@ -71,7 +72,7 @@ def one_stage_losses(
     seen = torch.where(known[:, None, None], batch.body, torch.zeros_like(batch.body))
     whole = torch.cat([batch.path, seen], dim=1)
     nothing = torch.zeros_like(batch.places), torch.zeros(len(code), 1, device=code.device)
-    motion = torch.full((whole.shape[1], 1), objective.motion_weight, device=code.device)
+    motion = torch.full((whole.shape[1], 1), MOTION_WEIGHT[objective.weighting], device=code.device)
     motion[:PATH_CHANNELS] = 0
     weights = objective.weighting, generator, motion
     error = squared_error(lambda x, t: nets.body(x, t, code, *nothing), whole, schedule, *weights)

@@ -274,7 +274,7 @@ def test_what_is_beyond_the_corner_of_a_picture_is_shown_from_nearer_too():
     labels[112:, 152:] = 255
     example, rng = Example(np.repeat(labels[..., None], 3, 2), labels), np.random.default_rng(0)
     for _ in range(50):
-        zoomed, _ = appearance._scaled(example, (119 + 53, 159 + 53), 144, 1.0, rng)
+        zoomed, _ = appearance._rescaled(example, (119 + 53, 159 + 53), 144, 1.0, rng)
         assert (zoomed.labels == 255).any()
 
 
