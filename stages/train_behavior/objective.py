@@ -44,7 +44,7 @@ def losses(
     def goal(code: Tensor) -> Tensor:
         return goal_error(nets, batch, code, schedule, objective, generator)
 
-    def error(denoise: Denoise, clean: Tensor, motion_weight: float = 0.0) -> Tensor:
+    def error(denoise: Denoise, clean: Tensor, motion_weight: float | None = None) -> Tensor:
         return squared_error(denoise, clean, schedule, objective.weighting, generator, motion_weight)
 
     of_body = partial(error, motion_weight=MOTION_WEIGHT[objective.weighting])
@@ -189,7 +189,7 @@ def squared_error(
     schedule: Schedule,
     weighting: Weighting,
     generator: torch.Generator,
-    motion_weight: float | Float[Tensor, "channel 1"] = 0.0,
+    motion_weight: float | Float[Tensor, "channel 1"] | None = None,
 ) -> Float[Tensor, "batch ..."]:
     """Return the squared error at a random step of the predicted noise, velocity, or flow (noise - clean).
 
@@ -203,7 +203,7 @@ def squared_error(
     noise = torch.randn(clean.shape, generator=generator).to(clean.device)
     residual = denoise(noised(clean, noise, alpha_bar_t), t.float().to(clean.device)) - noise
     error = residual**2
-    if clean.ndim > 2:
+    if motion_weight is not None:
         change = nn.functional.pad(residual.diff(dim=-1), (1, 0)) ** 2
         error = (error + motion_weight * change) / (1 + 2 * motion_weight)
     match weighting:
