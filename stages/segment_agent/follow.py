@@ -1,6 +1,6 @@
 """Masks of a recording without depth, from one box: colour and flow only.
 
-GrabCut segments the hinted frame, initialized with what moves against the background if enough does.
+GrabCut segments the prompted frame, initialized with what moves against the background if enough does.
 `propagation` then propagates this mask through the recording.
 """
 
@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from stages.segment_agent.config import LearningConfig
 from stages.segment_agent.footage import MOVING, STILL, Footage
-from stages.segment_agent.prompt import Prompt
+from stages.segment_agent.prompts import Prompt
 from stages.segment_agent.propagation import CERTAIN, MAX_LOG_ODDS, propagate
 from stages.segment_agent.segmenter import Mask
 
@@ -23,36 +23,36 @@ ITERATIONS, MODEL_SIZE = 8, 65
 CLICK_REACH = 0.2
 """half size of the box around a click, as a share of the picture's height"""
 MOTION_GAPS, MIN_MOVING = (4, 8), 0.15
-"""frame gaps over which motion is measured in the hinted frame, and share of the box that must move for it
+"""frame gaps over which motion is measured in the prompted frame, and share of the box that must move for it
 to be used"""
 
 
 def follow(
-    footage: Footage, hint: Prompt, learning: LearningConfig, rng: np.random.Generator
+    footage: Footage, prompt: Prompt, learning: LearningConfig, rng: np.random.Generator
 ) -> Iterator[Mask]:
     """Yield one mask per frame at colour resolution."""
     coarse = Footage(footage.clip, footage.flow, min(HEIGHT_PX, footage.height_px))
-    first = segment_hint(footage, hint, rng)
+    first = segment_prompt(footage, prompt, rng)
     first = cv2.resize(first, coarse.size[::-1], interpolation=cv2.INTER_AREA)
-    for log_odds in propagate(coarse, hint.frame, first, learning, rng):
+    for log_odds in propagate(coarse, prompt.frame, first, learning, rng):
         inside = cv2.resize(log_odds, footage.clip.color_size[::-1], interpolation=cv2.INTER_LINEAR) > 0
         yield Mask(np.where(inside, 255, 0).astype(np.uint8), bool(inside.any()), np.nan)
 
 
-def segment_hint(
-    footage: Footage, hint: Prompt, rng: np.random.Generator
+def segment_prompt(
+    footage: Footage, prompt: Prompt, rng: np.random.Generator
 ) -> Float[np.ndarray, "height width"]:
-    """Segment the animal in the hinted box, or in one around a click: log-odds, -`MAX_LOG_ODDS` outside."""
-    color = footage.color(hint.frame)
+    """Segment the animal in the prompt's box, or in one around a click: log-odds, -`MAX_LOG_ODDS` outside."""
+    color = footage.color(prompt.frame)
     height, width = color.shape[:2]
-    x0, y0, x1, y1 = np.array(hint.box_px) * height / footage.clip.color_size[0]
+    x0, y0, x1, y1 = np.array(prompt.box_px) * height / footage.clip.color_size[0]
     if min(x1 - x0, y1 - y0) < 4:
         x0, y0, x1, y1 = np.array([x0, y0, x1, y1]) + CLICK_REACH * height * np.array([-1, -1, 1, 1])
     low = np.clip(np.floor([x0, y0]), 1, [width - 8, height - 8]).astype(int)
     high = np.minimum(np.ceil([x1, y1]).astype(int), [width - 1, height - 1])
     in_box = np.zeros((height, width), bool)
     in_box[low[1] : high[1], low[0] : high[0]] = True
-    residual = footage.residual(hint.frame, *MOTION_GAPS)
+    residual = footage.residual(prompt.frame, *MOTION_GAPS)
     still = (residual < STILL) & ((residual[in_box] > MOVING).mean() > MIN_MOVING)
     trimap = np.where(in_box, np.where(still, cv2.GC_PR_BGD, cv2.GC_PR_FGD), cv2.GC_BGD).astype(np.uint8)
     inside = grabcut(color, trimap, rng)

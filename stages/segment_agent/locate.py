@@ -10,7 +10,7 @@ from pipeline.data.clips import Clip
 from stages.segment_agent import free_space, identity, movers
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.free_space import References, Votes
-from stages.segment_agent.movers import Candidate, Hint
+from stages.segment_agent.movers import Candidate, PlacedPrompt
 from stages.segment_agent.windows import Sphere, supported_depth
 
 COARSE_PX, FINE_PX = 111, 222
@@ -29,13 +29,13 @@ def find_mover(
     world_from_camera: Float[np.ndarray, "frame 4 4"],
     references: References,
     animal: AnimalConfig,
-    hint: Hint | None,
+    prompt: PlacedPrompt | None,
     appearance: AppearanceOf | None = None,
     margin_of: AppearanceOf | None = None,
 ) -> list[Sphere | None]:
     """Track the animal of a session: a sphere per frame, None where it is out of view.
 
-    Without known appearance, only the part of the track connected to a hint is certain; the rest may have
+    Without known appearance, only the part of the track connected to a prompt is certain; the rest may have
     switched to another mover and is presumed. ``margin_of`` gives log-odds against a home's other animals.
     """
     for share in movers.SURE_SHARES if appearance is None else (0.0,):
@@ -43,18 +43,18 @@ def find_mover(
             _candidates(clip, frame, pose, references, animal, (appearance, margin_of), share)
             for frame, pose in enumerate(world_from_camera)
         ]
-        choice = movers.track(found, clip.timestamp_s, animal, hint)
+        choice = movers.track(found, clip.timestamp_s, animal, prompt)
         chosen = [group[index] if index >= 0 else None for group, index in zip(found, choice, strict=True)]
         seen = np.array([candidate is not None for candidate in chosen])
         if appearance is not None:
             reliable = seen
-        elif hint is None:
+        elif prompt is None:
             reliable = movers.self_moving(chosen, clip.timestamp_s, animal)
         else:
-            reliable = movers.connected_to_hint(chosen, clip.timestamp_s, animal, hint)
+            reliable = movers.connected_to_prompt(chosen, clip.timestamp_s, animal, prompt)
         if reliable.any():
             break
-    if hint is None and not reliable.any():
+    if prompt is None and not reliable.any():
         reliable = seen
     radii = [each.radius_m for each, sure in zip(chosen, reliable, strict=True) if each and sure]
     radius = float(np.clip(SCALE * np.quantile(radii, 0.9), MIN_RADIUS_M, animal.largest_m)) if radii else 0.0

@@ -12,8 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip
 from pipeline.geometry import subsampling
-from stages.segment_agent import free_space, movers, people
-from stages.segment_agent import prompt as prompts
+from stages.segment_agent import free_space, movers, people, prompts
 from stages.segment_agent.appearance import Appearance, Example, learn
 from stages.segment_agent.config import Config
 from stages.segment_agent.evidence import motion_evidence, prefer_first
@@ -21,10 +20,10 @@ from stages.segment_agent.follow import follow
 from stages.segment_agent.footage import Footage
 from stages.segment_agent.free_space import References
 from stages.segment_agent.locate import AppearanceOf, find_mover
-from stages.segment_agent.movers import Hint
+from stages.segment_agent.movers import PlacedPrompt
 from stages.segment_agent.overlap import Subject
 from stages.segment_agent.people import People
-from stages.segment_agent.prompt import Prompt
+from stages.segment_agent.prompts import Prompt
 from stages.segment_agent.refine import ColorHistogram
 from stages.segment_agent.resting import find_resting, is_resting
 from stages.segment_agent.segmenter import Mask, Segmenter, learn_color_histogram
@@ -68,52 +67,52 @@ def segment(
     clip: Clip,
     flow: Path,
     role: Literal["turnaround", "session"],
-    hint: Prompt | None,
+    prompt: Prompt | None,
     config: Config,
     rng: np.random.Generator,
 ) -> Segmentation:
     """Return one mask per frame, generated lazily, with the camera poses used, and people.
 
-    ``flow`` is the recording's flow folder. Without any depth, the hint is propagated; there are no poses.
+    ``flow`` is the recording's flow folder. Without any depth, the prompt is propagated; there are no poses.
 
     Raises:
-        InputError: MSK-004 without depth and hint; MSK-002, MSK-003 where hint or cameras point at nothing.
+        InputError: MSK-004 without depth and prompt; MSK-002, MSK-003 if prompt or cameras point at nothing.
     """
     probes = subsampling.evenly(len(clip), PROBES).tolist()
     if not any((clip.depth(frame) > 0).any() for frame in probes):
-        if hint is None:
+        if prompt is None:
             what = "there is no depth, so motion alone does not separate the animal from the room"
-            remedy = "give a hint: one box around the animal in one frame (<recording>.prompt.toml)"
+            remedy = "give a prompt: one box around the animal in one frame (<recording>.prompt.toml)"
             raise InputError("MSK-004", what, str(clip.folder), remedy)
-        return Segmentation(follow(Footage(clip, flow, config.height_px), hint, config.learning, rng))
+        return Segmentation(follow(Footage(clip, flow, config.height_px), prompt, config.learning, rng))
     path = estimate_trajectory(clip, flow, rng)
     poses = path.world_from_camera
-    hint_world = None if hint is None else prompts.place(hint, clip, poses)
+    placed = None if prompt is None else prompts.place(prompt, clip, poses)
     match role:
         case "turnaround":
-            masks = _standing_segmenter(clip, poses, hint_world, config).masks(range(len(clip)))
+            masks = _standing_segmenter(clip, poses, placed, config).masks(range(len(clip)))
             references = free_space.gather(clip, poses, config.references)
             return Segmentation(masks, path, references=references, shown="resting")
         case "session":
             references, walkers = people.gather_without_people(clip, poses, config.references)
-            segmenter = _session_segmenter(clip, poses, references, hint_world, config, rng)
+            segmenter = _session_segmenter(clip, poses, references, placed, config, rng)
             masks = people.hide(segmenter.masks(range(len(clip))), walkers, clip, poses)
-            shown = "moving" if hint_world is None else "resting"
+            shown = "moving" if placed is None else "resting"
             return Segmentation(masks, path, walkers, references=references, shown=shown)
         case _:
             assert_never(role)
 
 
 def turnaround_segmenter(clip: Clip, flow: Path, config: Config, rng: np.random.Generator) -> Segmenter:
-    """Prepare the masks of a turnaround without a hint. Raises InputError MSK-003 as `segment` does."""
+    """Prepare the masks of a turnaround without a prompt. Raises InputError MSK-003 as `segment` does."""
     return _standing_segmenter(clip, estimate_trajectory(clip, flow, rng).world_from_camera, None, config)
 
 
 def _standing_segmenter(
-    clip: Clip, poses: Float[np.ndarray, "frame 4 4"], hint_world: Hint | None, config: Config
+    clip: Clip, poses: Float[np.ndarray, "frame 4 4"], placed: PlacedPrompt | None, config: Config
 ) -> Segmenter:
     """Prepare the masks of a turnaround: what stands on the ground where the optical axes meet."""
-    focus = axes_focus(poses) if hint_world is None else hint_world.centre_world
+    focus = axes_focus(poses) if placed is None else placed.centre_world
     spheres, evidence_of = find_standing(clip, poses, focus)
     segmenter = Segmenter(clip, poses, spheres, evidence_of, config.height_px, ColorHistogram(), EDGES)
     return replace(segmenter, appearance=learn_color_histogram(segmenter))
@@ -123,16 +122,16 @@ def _session_segmenter(
     clip: Clip,
     poses: Float[np.ndarray, "frame 4 4"],
     references: References,
-    hint_world: Hint | None,
+    placed: PlacedPrompt | None,
     config: Config,
     rng: np.random.Generator,
 ) -> Segmenter:
     """Prepare the masks of a session: by motion, from which appearance is learned, then by both."""
-    spheres = find_mover(clip, poses, references, config.animal, hint_world)
+    spheres = find_mover(clip, poses, references, config.animal, placed)
     evidence_of, resting = motion_evidence(references), None
     held = any(_certain(sphere) for sphere in spheres)
-    if hint_world is not None and (not held or is_resting(clip, poses, references, hint_world)):
-        spheres, resting = find_resting(clip, poses, hint_world, config.height_px, rng)
+    if placed is not None and (not held or is_resting(clip, poses, references, placed)):
+        spheres, resting = find_resting(clip, poses, placed, config.height_px, rng)
         evidence_of = resting
     segmenter = Segmenter(clip, poses, spheres, evidence_of, config.height_px, ColorHistogram())
     segmenter = replace(segmenter, appearance=learn_color_histogram(segmenter))
@@ -140,7 +139,7 @@ def _session_segmenter(
     if network is None:
         return segmenter
     room = free_space.masked(references, lambda frame: occlusion_mask(segmenter, frame, network))
-    found = find_mover(clip, poses, room, config.animal, hint_world, appearance_of(segmenter, network))
+    found = find_mover(clip, poses, room, config.animal, placed, appearance_of(segmenter, network))
     spheres = with_motion_radius(found, spheres)
     evidence_of = motion_evidence(room) if resting is None else prefer_first(resting, motion_evidence(room))
     return Segmenter(clip, poses, spheres, evidence_of, config.height_px, network)

@@ -16,8 +16,8 @@ from pipeline.geometry import viterbi
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.free_space import Votes
 
-HINT_REWARD, HINT_SLACK_M = 1000.0, 0.2
-"""score of a hinted candidate, above all else; tolerated distance of the hint from it"""
+PROMPT_REWARD, PROMPT_SLACK_M = 1000.0, 0.2
+"""score of a candidate at the prompt, above all else; tolerated distance of the prompt from it"""
 SURE_SHARES = (1.0, 0.3)
 """references that must have seen through a point for training, as a share of those that saw a surface there;
 the second is used if nothing travels by the first"""
@@ -63,8 +63,8 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Hint:
-    """Where a user says the animal is."""
+class PlacedPrompt:
+    """A prompt lifted to the world."""
 
     frame: int
     centre_world: Float[np.ndarray, "3"]
@@ -127,15 +127,17 @@ def track(
     found: Sequence[Sequence[Candidate]],
     timestamp_s: Float[np.ndarray, "frame"],
     animal: AnimalConfig,
-    hint: Hint | None = None,
+    prompt: PlacedPrompt | None = None,
 ) -> Int[np.ndarray, "frame"]:
     """Choose one candidate per frame (-1: none in view) by the Viterbi algorithm over scores and speeds.
 
-    In its frame, a hint outweighs everything else.
+    In its frame, a prompt outweighs everything else.
     """
     scores = [np.array([0.0] + [_score(candidate, animal) for candidate in group]) for group in found]
-    if hint is not None and hint.frame in range(len(found)):
-        scores[hint.frame][1:] += [HINT_REWARD * _hinted(candidate, hint) for candidate in found[hint.frame]]
+    if prompt is not None and prompt.frame in range(len(found)):
+        scores[prompt.frame][1:] += [
+            PROMPT_REWARD * _at_prompt(candidate, prompt) for candidate in found[prompt.frame]
+        ]
     scores[0][1:] -= APPEAR_COST
 
     def change(index: int) -> Float[np.ndarray, "before after"]:
@@ -145,18 +147,18 @@ def track(
     return viterbi.viterbi_decode([-score for score in scores], change) - 1
 
 
-def connected_to_hint(
+def connected_to_prompt(
     chosen: Sequence[Candidate | None],
     timestamp_s: Float[np.ndarray, "frame"],
     animal: AnimalConfig,
-    hint: Hint,
+    prompt: PlacedPrompt,
 ) -> Bool[np.ndarray, "frame"]:
-    """Return the frames of the track segment that contains the hint; none if the track misses the hint."""
+    """Return the frames of the track segment that contains the prompt; none if the track misses it."""
     seen = np.array([frame for frame, candidate in enumerate(chosen) if candidate is not None], int)
     reliable = np.zeros(len(chosen), bool)
-    wait_s = np.abs(timestamp_s[seen] - timestamp_s[hint.frame])
+    wait_s = np.abs(timestamp_s[seen] - timestamp_s[prompt.frame])
     nearest = chosen[int(seen[wait_s.argmin()])] if len(seen) else None
-    if nearest is None or wait_s.min() > ABSENT_S or not _hinted(nearest, hint):
+    if nearest is None or wait_s.min() > ABSENT_S or not _at_prompt(nearest, prompt):
         return reliable
     segment = split_track(chosen, seen, timestamp_s, animal)
     reliable[seen[segment == segment[wait_s.argmin()]]] = True
@@ -199,10 +201,10 @@ def self_moving(
     return reliable
 
 
-def _hinted(candidate: Candidate, hint: Hint) -> bool:
-    """Return whether a hint lies at a candidate."""
+def _at_prompt(candidate: Candidate, prompt: PlacedPrompt) -> bool:
+    """Return whether a prompt lies at a candidate."""
     return bool(
-        np.linalg.norm(candidate.centre_world - hint.centre_world) < candidate.radius_m + HINT_SLACK_M
+        np.linalg.norm(candidate.centre_world - prompt.centre_world) < candidate.radius_m + PROMPT_SLACK_M
     )
 
 

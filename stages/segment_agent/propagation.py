@@ -5,7 +5,7 @@ frame, forward and back. The unary is the mean of two networks of `appearance`, 
 against the background beside the colors. Messages come from the frames 1, 2, 4 and 8 before and after along
 the flow, as far as its two directions agree, and from neighbors in the picture up to its edges (domain
 transform, Gastal and Oliveira 2011). The networks learn from the one mask, then from all frames where motion
-does not contradict. They correct the first mask, too, within the hinted box.
+does not contradict. They correct the first mask, too, within the prompt's box.
 """
 
 from collections.abc import Callable
@@ -31,10 +31,10 @@ SPATIAL_PX, EDGE = 10.0, 25.0
 """spatial (working pixels) and range (of 255) standard deviation of the domain transform"""
 CONNECTED = 0.1
 """overlap with the propagated mask that a component needs, as a share of the largest overlap"""
-CERTAIN, HINTED_SHARE = 2.0, 0.17
-"""log-odds of training pixels; share of the hinted frame among the examples"""
+CERTAIN, PROMPTED_SHARE = 2.0, 0.17
+"""log-odds of training pixels; share of the prompted frame among the examples"""
 CROP_PX, STEPS = 112, (80, 120, 120)
-"""side of training crops; training steps on the hinted frame, on all, and again on all"""
+"""side of training crops; training steps on the prompted frame, on all, and again on all"""
 
 LogOdds = Float[np.ndarray, "height width"]
 Beliefs = list[LogOdds | None]
@@ -43,40 +43,40 @@ Picture = Callable[[int], UInt8[np.ndarray, "height width channel"]]
 
 
 def propagate(
-    footage: Footage, hinted: int, first: LogOdds, learning: LearningConfig, rng: np.random.Generator
+    footage: Footage, prompted: int, first: LogOdds, learning: LearningConfig, rng: np.random.Generator
 ) -> list[LogOdds]:
-    """Return log-odds of the animal in all frames, given ``first`` in the hinted one."""
+    """Return log-odds of the animal in all frames, given ``first`` in the prompted one."""
     frames = range(len(footage.clip))
     found: Beliefs = [None for _ in frames]
-    found[hinted], possible = first, first > MIN_LOG_ODDS - MAX_LOG_ODDS
-    forward = [*frames[hinted + 1 :], *frames[:hinted][::-1]]
+    found[prompted], possible = first, first > MIN_LOG_ODDS - MAX_LOG_ODDS
+    forward = [*frames[prompted + 1 :], *frames[:prompted][::-1]]
     for iteration, steps in enumerate(STEPS):
         options = replace(learning, steps=steps, crop_px=CROP_PX)
         unary = np.zeros((len(frames), *footage.size), np.float16)
         for picture in (footage.color, footage.with_motion):
-            shown = examples(footage, found, hinted, learning.examples, picture)
+            shown = examples(footage, found, prompted, learning.examples, picture)
             network = learn(shown, options, rng, min_px=1, scaled=0.0)
-            assert network is not None, "the hinted frame shows the animal"
+            assert network is not None, "the prompted frame shows the animal"
             for frame in frames:
                 unary[frame] += network.log_odds(picture(frame)) / 2
-        unary[hinted][~possible] = -np.inf
-        for frame in [*(forward[::-1] if iteration else []), *forward, hinted]:
+        unary[prompted][~possible] = -np.inf
+        for frame in [*(forward[::-1] if iteration else []), *forward, prompted]:
             found[frame] = update_frame(footage, frame, unary[frame], found)
     return [each.astype(np.float32) for each in found if each is not None]
 
 
-def examples(footage: Footage, found: Beliefs, hinted: int, count: int, picture: Picture) -> list[Example]:
-    """Return ``count`` evenly spaced training examples, and the hinted one repeatedly; pixels that are
+def examples(footage: Footage, found: Beliefs, prompted: int, count: int, picture: Picture) -> list[Example]:
+    """Return ``count`` evenly spaced training examples, and the prompted one repeatedly; pixels that are
     uncertain or contradicted by motion are unknown."""
     chosen = subsampling.evenly(len(found), count, rounded=True).tolist()
     shown = []
-    for frame in (hinted, *(each for each in chosen if each != hinted)):
+    for frame in (prompted, *(each for each in chosen if each != prompted)):
         log_odds = found[frame]
         if log_odds is not None:
             sure = (np.abs(log_odds) >= CERTAIN) & (log_odds * footage.moving(frame, log_odds > 0) >= 0)
             labels = np.where(sure, np.where(log_odds > 0, 255, 0), 128)
             shown.append(Example(picture(frame), labels.astype(np.uint8)))
-    return shown[:1] * max(1, round(HINTED_SHARE * len(chosen))) + shown[1:]
+    return shown[:1] * max(1, round(PROMPTED_SHARE * len(chosen))) + shown[1:]
 
 
 def update_frame(footage: Footage, frame: int, unary: LogOdds, found: Beliefs) -> LogOdds:

@@ -12,7 +12,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import log, track
 from pipeline.core.videos import Video, role_of_animal
 from pipeline.data.clips import Clip
-from stages.segment_agent import pictures, prompt, several, writing
+from stages.segment_agent import pictures, prompts, several, writing
 from stages.segment_agent.config import Config
 from stages.segment_agent.identity import Identities, load_portraits
 from stages.segment_agent.masks import segment
@@ -29,7 +29,7 @@ class Inputs:
     flow: Path
     """`flow/<id>` of the recording."""
     prompt: Path | None = None
-    """A user's hint where the animal is."""
+    """A box or a click on the animal, given by a user."""
     identities: Path | None = None
     """The artifact `identities`, in a home of several animals."""
 
@@ -46,19 +46,19 @@ def run(
     """Segment one recording and write its masks into `out`.
 
     With several animals, the one whose turnaround is among `videos` is segmented. Raises InputError
-    MSK-006 for a hint or a backend that cannot distinguish them.
+    MSK-006 for a prompt or a backend that cannot distinguish them.
     """
     if inputs.identities is not None and role_of_animal(video, config.role) == "session":
         return _run_of_several(inputs, inputs.identities, config, out, videos)
     clip = Clip.open(inputs.frames)
-    hint = None if inputs.prompt is None else prompt.parse(inputs.prompt, clip)
+    prompt = None if inputs.prompt is None else prompts.parse(inputs.prompt, clip)
     found = None
     match config.backend:
         case "weightless":
             if clip.odometry_from_camera is None:
                 log("no usable odometry: camera motion is estimated from depth and flow, which drifts more")
             rng = np.random.default_rng(config.seed)
-            found = segment(clip, inputs.flow, role_of_animal(video, config.role), hint, config, rng)
+            found = segment(clip, inputs.flow, role_of_animal(video, config.role), prompt, config, rng)
             masks = found.masks
             if found.path is not None:
                 millimeters = MM * found.path.residual_m
@@ -67,13 +67,13 @@ def run(
         case "foundation":
             from stages.segment_agent.backends import foundation
 
-            masks = foundation.segment(clip, hint, config.foundation, device)
+            masks = foundation.segment(clip, prompt, config.foundation, device)
         case _:
             assert_never(config.backend)
     summary = writing.write(out, track(masks, "masks", len(clip)), len(clip))
     pictures.report_quality(out, clip, summary, config.animal, found)
     if not any(summary.visible):
-        log("the animal was never seen: does it move here? A hint (<recording>.prompt.toml) helps")
+        log("the animal was never seen: does it move here? A prompt (<recording>.prompt.toml) helps")
     return summary
 
 
@@ -82,7 +82,7 @@ def _run_of_several(
 ) -> writing.Summary:
     """Segment a session of several animals."""
     if inputs.prompt is not None or config.backend != "weightless":
-        what = "a hint" if inputs.prompt is not None else f"the backend {config.backend!r}"
+        what = "a prompt" if inputs.prompt is not None else f"the backend {config.backend!r}"
         raise InputError(
             "MSK-006",
             f"{what} does not say which of several animals is meant",

@@ -80,7 +80,7 @@ def find_standing(
     """
 
     def refused(what: str) -> InputError:
-        remedy = "circle the resting animal, pointing at it, with the ground in view, or give a hint"
+        remedy = "circle the resting animal, pointing at it, with the ground in view, or give a prompt"
         return InputError("MSK-003", what, str(clip.folder), remedy)
 
     if focus is None:

@@ -24,7 +24,7 @@ class Sphere:
     centre_world: Float[np.ndarray, "3"]
     radius_m: float
     presumed: bool = False
-    """interpolated or extrapolated in time, or not connected to the hint"""
+    """interpolated or extrapolated in time, or not connected to the prompt"""
 
 
 @dataclass(frozen=True)

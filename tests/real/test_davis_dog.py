@@ -16,7 +16,7 @@ from stages.estimate_flow.estimation import STRIDE_PX, Estimator, flows
 from stages.segment_agent.config import Config
 from stages.segment_agent.follow import follow
 from stages.segment_agent.footage import Footage
-from stages.segment_agent.prompt import Prompt
+from stages.segment_agent.prompts import Prompt
 
 DOG = Path(os.environ.get("ATS_REALDATA", Path(__file__).parents[3] / "shared" / "realdata")) / "davis_dog"
 FRAMES = 60
@@ -67,9 +67,9 @@ def dog(tmp_path_factory):
 def test_masks_from_one_box(dog):
     folder, clip, truth, _ = dog
     rows, columns = np.nonzero(truth[0])
-    hint = Prompt(0, (columns.min(), rows.min(), columns.max() + 1.0, rows.max() + 1.0))
+    prompt = Prompt(0, (columns.min(), rows.min(), columns.max() + 1.0, rows.max() + 1.0))
     footage = Footage(clip, folder, Config().height_px)
-    found = list(follow(footage, hint, Config().learning, np.random.default_rng(0)))
+    found = list(follow(footage, prompt, Config().learning, np.random.default_rng(0)))
     iou = [
         ((m.labels == 255) & t).sum() / ((m.labels == 255) | t).sum()
         for m, t in zip(found, truth, strict=True)

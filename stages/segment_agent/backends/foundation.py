@@ -1,7 +1,7 @@
 """Grounding DINO detects the animal from a text prompt in some frames; SAM 2 tracks the best detection.
 
-A user's hint replaces the detector. Masks are generated lazily; those before the first frame are stored
-compressed, so that memory hardly grows with the recording.
+A user's box or click replaces the detector. Masks are generated lazily; those before the first frame are
+stored compressed, so that memory hardly grows with the recording.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip
 from pipeline.geometry import subsampling
 from stages.segment_agent.config import FoundationConfig
-from stages.segment_agent.prompt import Prompt
+from stages.segment_agent.prompts import Prompt
 from stages.segment_agent.segmenter import Mask
 
 if TYPE_CHECKING:
@@ -31,16 +31,16 @@ UNSURE = 1.0
 """pixels with log-odds below this magnitude are unknown"""
 
 
-def segment(clip: Clip, hint: Prompt | None, options: FoundationConfig, device: str) -> Iterator[Mask]:
+def segment(clip: Clip, prompt: Prompt | None, options: FoundationConfig, device: str) -> Iterator[Mask]:
     """Yield one mask per frame. Raises MSK-004 if the animal is not found, MOD-001..003 without models."""
     from pipeline.backends.grounding_dino import GroundingDino
     from pipeline.backends.sam2 import Sam2
 
     tracker = Sam2(options.tracker, device)
-    if hint is None:
+    if prompt is None:
         frame, box_px = _find(clip, GroundingDino(options.detector, device), options)
     else:
-        frame, box_px = hint.frame, widened(hint, clip.color_size)
+        frame, box_px = prompt.frame, widened(prompt, clip.color_size)
     return _follow(clip, tracker, frame, box_px, options)
 
 
@@ -59,9 +59,9 @@ def _find(clip: Clip, detector: GroundingDino, options: FoundationConfig) -> tup
     return best[1], best[2]
 
 
-def widened(hint: Prompt, size: tuple[int, int], least: float = 0.04) -> Float[np.ndarray, 4]:
-    """Return a hint's box (x0, y0, x1, y1, pixels), enlarged to a minimum size around a click."""
-    x0, y0, x1, y1 = hint.box_px
+def widened(prompt: Prompt, size: tuple[int, int], least: float = 0.04) -> Float[np.ndarray, 4]:
+    """Return the box of a prompt (x0, y0, x1, y1, pixels), enlarged to a minimum size around a click."""
+    x0, y0, x1, y1 = prompt.box_px
     grow = np.maximum(least * max(size) - np.array([x1 - x0, y1 - y0]), 0) / 2
     low, high = np.array([x0, y0]) - grow, np.array([x1, y1]) + grow
     return np.concatenate([np.maximum(low, 0), np.minimum(high, size[::-1])])

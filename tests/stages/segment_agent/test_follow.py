@@ -9,9 +9,9 @@ from pipeline.data import images, npz
 from pipeline.data.clips import Clip
 from pipeline.data.flow import GAPS
 from stages.segment_agent.config import LearningConfig
-from stages.segment_agent.follow import MOTION_GAPS, follow, segment_hint
+from stages.segment_agent.follow import MOTION_GAPS, follow, segment_prompt
 from stages.segment_agent.footage import Footage
-from stages.segment_agent.prompt import Prompt
+from stages.segment_agent.prompts import Prompt
 from stages.segment_agent.propagation import MAX_LOG_ODDS, Beliefs, connected, examples, message
 
 SIZE = (120, 160)
@@ -59,7 +59,7 @@ def test_motion_tells_the_animal_from_what_else_is_in_its_box(tmp_path):
     frames = MOTION_GAPS[0] + 1
     step = 1.5 * animal[..., None] * np.array([1, 0])
     footage = _footage(tmp_path, frames * [noisy], frames * [step])
-    found = segment_hint(footage, Prompt(0, (40, 30, 120, 90)), rng) > 0
+    found = segment_prompt(footage, Prompt(0, (40, 30, 120, 90)), rng) > 0
     assert (found & animal).sum() > 0.95 * (found | animal).sum()
 
 
@@ -80,12 +80,12 @@ def walk(tmp_path_factory) -> tuple[Footage, list[np.ndarray]]:
     return _footage(tmp_path_factory.mktemp("walk"), pictures, steps), masks
 
 
-@pytest.mark.parametrize("hinted", [0, 5])
-def test_an_animal_is_followed_both_ways(walk, hinted):
+@pytest.mark.parametrize("prompted", [0, 5])
+def test_an_animal_is_followed_both_ways(walk, prompted):
     footage, masks = walk
-    left = 20.0 + SHIFT_PX * hinted
-    hint = Prompt(hinted, (left, 40, left + 50, 80))
-    found = list(follow(footage, hint, LearningConfig(), np.random.default_rng(0)))
+    left = 20.0 + SHIFT_PX * prompted
+    prompt = Prompt(prompted, (left, 40, left + 50, 80))
+    found = list(follow(footage, prompt, LearningConfig(), np.random.default_rng(0)))
     assert len(found) == len(masks)
     for mask, true in zip(found, masks, strict=True):
         assert ((mask.labels == 255) & true).sum() > 0.9 * ((mask.labels == 255) | true).sum()

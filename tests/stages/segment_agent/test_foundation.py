@@ -8,7 +8,7 @@ import pytest
 from pipeline.core.errors import InputError
 from stages.segment_agent.backends import foundation
 from stages.segment_agent.config import FoundationConfig
-from stages.segment_agent.prompt import Prompt
+from stages.segment_agent.prompts import Prompt
 from tests.pipeline.backends import small_checkpoints
 
 
@@ -35,23 +35,23 @@ def options(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_hint_is_followed_to_both_ends(options):
+def test_a_prompt_is_followed_to_both_ends(options):
     from pipeline.backends.sam2 import Sam2
 
-    hint, clip = Prompt(4, (14.0, 14, 40, 36)), Clip()
-    masks = list(foundation.segment(clip, hint, options, "cpu"))
+    prompt, clip = Prompt(4, (14.0, 14, 40, 36)), Clip()
+    masks = list(foundation.segment(clip, prompt, options, "cpu"))
     assert len(masks) == 9
     tracker = Sam2(options.tracker, "cpu")
     for order in (range(4, -1, -1), range(4, 9)):
         for frame, (log_odds, presence) in zip(
-            order, tracker.track(clip.color, order, np.array(hint.box_px)), strict=True
+            order, tracker.track(clip.color, order, np.array(prompt.box_px)), strict=True
         ):
             np.testing.assert_array_equal(
                 masks[frame].labels, foundation.labelled(log_odds, presence, foundation.UNSURE).labels
             )
 
 
-def test_the_detector_takes_a_hint_s_place_or_says_that_it_found_nothing(options):
+def test_the_detector_takes_the_place_of_a_prompt_or_says_that_it_found_nothing(options):
     assert len(list(foundation.segment(Clip(), None, options, "cpu"))) == 9
     strict = FoundationConfig(options.detector, options.tracker, threshold=1.0)
     with pytest.raises(InputError, match="MSK-004.*a cat"):

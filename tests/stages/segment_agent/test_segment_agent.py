@@ -1,4 +1,4 @@
-"""Masks of small rendered recordings with truth: walking, resting, away; standing; hints."""
+"""Masks of small rendered recordings with truth: walking, resting, away; standing; prompts."""
 
 import importlib.util
 from pathlib import Path
@@ -9,10 +9,10 @@ import pytest
 from pipeline.core.errors import InputError
 from pipeline.data import images, npz
 from pipeline.data.clips import Clip
-from stages.segment_agent import appearance, masks, movers, prompt
+from stages.segment_agent import appearance, masks, movers, prompts
 from stages.segment_agent.appearance import Example, learn
 from stages.segment_agent.config import AnimalConfig, Config, LearningConfig
-from stages.segment_agent.movers import Candidate, Hint
+from stages.segment_agent.movers import Candidate, PlacedPrompt
 
 _spec = importlib.util.spec_from_file_location(
     "room_with_animal", Path(__file__).parent.parent / "room_with_animal.py"
@@ -28,10 +28,10 @@ def iou(found, truth) -> float:
     return (found & truth).sum() / max((found | truth).sum(), 1)
 
 
-def make(folder, role, poses, agent, odometry, flow=Path("none"), hint=None):
+def make(folder, role, poses, agent, odometry, flow=Path("none"), prompt=None):
     """Record, segment, and return the masks with the truth."""
     truth = scenery.record(folder, poses, agent, odometry)
-    found = masks.segment(Clip.open(folder), flow, role, hint, OPTIONS, np.random.default_rng(0)).masks
+    found = masks.segment(Clip.open(folder), flow, role, prompt, OPTIONS, np.random.default_rng(0)).masks
     return list(found), truth
 
 
@@ -126,14 +126,14 @@ def test_the_track_prefers_a_steady_mover_to_larger_flashes():
     assert movers.track(estimate_path, np.arange(12) * 0.1, AnimalConfig()).tolist() == [0] * 12
 
 
-def test_a_hint_decides_between_two_movers():
+def test_a_prompt_decides_between_two_movers():
     both = [[candidate(0.0, 0.05), candidate(2.0, 0.02)] for _ in range(10)]
     time = np.arange(10) * 0.1
     assert set(movers.track(both, time, AnimalConfig())) == {0}
-    assert set(movers.track(both, time, AnimalConfig(), Hint(4, np.array([2.0, 0.0, 0.0])))) == {1}
+    assert set(movers.track(both, time, AnimalConfig(), PlacedPrompt(4, np.array([2.0, 0.0, 0.0])))) == {1}
 
 
-def test_a_hint_holds_what_hangs_together_with_it():
+def test_a_prompt_holds_what_hangs_together_with_it():
     """Seen, hidden for two frames, seen, gone for more than a second, and something else in its place or far
     away.
     """
@@ -143,7 +143,9 @@ def test_a_hint_holds_what_hangs_together_with_it():
 
     def held(frame, x):
         return np.flatnonzero(
-            movers.connected_to_hint(chosen, time, AnimalConfig(), Hint(frame, np.array([x, 0.0, 0.0])))
+            movers.connected_to_prompt(
+                chosen, time, AnimalConfig(), PlacedPrompt(frame, np.array([x, 0.0, 0.0]))
+            )
         ).tolist()
 
     first = [*range(7), *range(9, 20)]
@@ -156,24 +158,26 @@ def test_a_hint_holds_what_hangs_together_with_it():
 def click(mask, frame):
     """Return a click on the middle of what a true mask shows."""
     row, column = np.argwhere(mask)[mask.sum() // 2]
-    return prompt.Prompt(frame, (column + 0.5, row + 0.5) * 2)
+    return prompts.Prompt(frame, (column + 0.5, row + 0.5) * 2)
 
 
 @pytest.mark.slow
-def test_an_animal_that_never_moves_is_found_by_a_hint(tmp_path):
+def test_an_animal_that_never_moves_is_found_by_a_prompt(tmp_path):
     poses, agent = scenery.session()
     agent = np.repeat(agent[20:21], 40, axis=0)
     truth = scenery.record(tmp_path / "frames", poses, agent, scenery.drifted(poses))
     clip, scores = Clip.open(tmp_path / "frames"), {}
-    for hint in (None, click(truth.masks[20], 20)):
-        found = masks.segment(clip, Path("none"), "session", hint, OPTIONS, np.random.default_rng(0)).masks
-        scores[hint] = [iou(mask.labels == 255, true) for mask, true in zip(found, truth.masks, strict=True)]
+    for prompt in (None, click(truth.masks[20], 20)):
+        found = masks.segment(clip, Path("none"), "session", prompt, OPTIONS, np.random.default_rng(0)).masks
+        scores[prompt] = [
+            iou(mask.labels == 255, true) for mask, true in zip(found, truth.masks, strict=True)
+        ]
     assert np.max(scores.pop(None)) == 0, "nothing moves"
     assert np.mean(*scores.values()) > 0.7
 
 
 @pytest.mark.slow
-def test_with_a_hint_another_mover_does_not_take_over(tmp_path):
+def test_with_a_prompt_another_mover_does_not_take_over(tmp_path):
     """The animal leaves for good after 1.6 s; something of its size and of another colour walks about all the
     time.
     """
@@ -186,8 +190,8 @@ def test_with_a_hint_another_mover_does_not_take_over(tmp_path):
     )
     agent[16:] = np.nan
     truth = scenery.record(tmp_path / "frames", poses, agent, poses, world_from_other=other)
-    clip, hint = Clip.open(tmp_path / "frames"), click(truth.masks[8], 8)
-    found = masks.segment(clip, Path("none"), "session", hint, OPTIONS, np.random.default_rng(0)).masks
+    clip, prompt = Clip.open(tmp_path / "frames"), click(truth.masks[8], 8)
+    found = masks.segment(clip, Path("none"), "session", prompt, OPTIONS, np.random.default_rng(0)).masks
     found = list(found)
     assert (
         np.mean(
@@ -215,31 +219,31 @@ def test_with_a_hint_another_mover_does_not_take_over(tmp_path):
         "frame = 0\nbox = " + "[" * 5000 + "]" * 5000,
     ],
 )
-def test_a_wrong_hint_is_refused(tmp_path, text):
+def test_a_wrong_prompt_is_refused(tmp_path, text):
     poses, agent = scenery.turnaround(2)
     scenery.record(tmp_path / "frames", poses, agent, poses)
-    (tmp_path / "hint.toml").write_text(text)
+    (tmp_path / "prompt.toml").write_text(text)
     with pytest.raises(InputError, match="MSK-001"):
-        prompt.parse(tmp_path / "hint.toml", Clip.open(tmp_path / "frames"))
+        prompts.parse(tmp_path / "prompt.toml", Clip.open(tmp_path / "frames"))
 
 
-def test_a_hint_speaks_in_seconds_and_shares_too(tmp_path):
+def test_a_prompt_speaks_in_seconds_and_shares_too(tmp_path):
     poses, agent = scenery.turnaround(3)
     scenery.record(tmp_path / "frames", poses, agent, poses)
     clip = Clip.open(tmp_path / "frames")
     passed_s = clip.timestamp_s[2] - clip.timestamp_s[0]
-    (tmp_path / "hint.toml").write_text(f"time_s = {passed_s}\nbox = [0.1, 0.25, 0.5, 1]")
-    hint = prompt.parse(tmp_path / "hint.toml", clip)
+    (tmp_path / "prompt.toml").write_text(f"time_s = {passed_s}\nbox = [0.1, 0.25, 0.5, 1]")
+    prompt = prompts.parse(tmp_path / "prompt.toml", clip)
     height, width = clip.color_size
-    assert hint == prompt.Prompt(2, (0.1 * width, 0.25 * height, 0.5 * width, height))
+    assert prompt == prompts.Prompt(2, (0.1 * width, 0.25 * height, 0.5 * width, height))
 
 
 def test_a_click_finds_the_surface(tmp_path):
     poses, agent = scenery.turnaround(2)
     scenery.record(tmp_path / "frames", poses, agent, poses)
     clip = Clip.open(tmp_path / "frames")
-    (tmp_path / "hint.toml").write_text("frame = 1\nclick = [45, 60]")
-    place = prompt.position(prompt.parse(tmp_path / "hint.toml", clip), clip, poses)
+    (tmp_path / "prompt.toml").write_text("frame = 1\nclick = [45, 60]")
+    place = prompts.position(prompts.parse(tmp_path / "prompt.toml", clip), clip, poses)
     assert np.linalg.norm(place - agent[0, :3, 3]) < 0.2, (
         "the middle of the picture shows the body, 14 cm thick"
     )
@@ -278,7 +282,7 @@ def test_what_is_beyond_the_corner_of_a_picture_is_shown_from_nearer_too():
         assert (zoomed.labels == 255).any()
 
 
-def test_a_recording_without_depth_asks_for_a_hint(tmp_path):
+def test_a_recording_without_depth_asks_for_a_prompt(tmp_path):
     poses, agent = scenery.turnaround(2)
     scenery.record(tmp_path / "frames", poses, agent, poses)
     for path in (tmp_path / "frames" / "depth").iterdir():

@@ -177,10 +177,10 @@ def test_a_third_animal_without_a_turnaround_is_reported(network, portraits, tmp
         several.segment(clip, Path("none"), "green", network, portraits, OPTIONS)
 
 
-def test_a_hint_that_names_no_animal_is_refused(network, together, tmp_path):
+def test_a_prompt_that_names_no_animal_is_refused(network, together, tmp_path):
     network.save(tmp_path)
-    hint = tmp_path / "hint.toml"
-    hint.write_text("frame = 0\nclick = [0.5, 0.5]\n")
-    inputs = stage.Inputs(together[0], Path("none"), hint, tmp_path)
+    prompt = tmp_path / "prompt.toml"
+    prompt.write_text("frame = 0\nclick = [0.5, 0.5]\n")
+    inputs = stage.Inputs(together[0], Path("none"), prompt, tmp_path)
     with pytest.raises(InputError, match="MSK-006"):
         stage.run(inputs, OPTIONS, tmp_path, videos=VIDEOS[:1])

@@ -1,4 +1,4 @@
-"""A user's hint where the animal is: a box or a click in one frame, read from `<recording>.prompt.toml`."""
+"""A user's prompt: a box or a click on the animal in one frame, read from `<recording>.prompt.toml`."""
 
 import tomllib
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip
 from pipeline.geometry import cameras, rigid
 from stages.segment_agent.free_space import clean_depth
-from stages.segment_agent.movers import Hint
+from stages.segment_agent.movers import PlacedPrompt
 
 FORESHORTENED, MIN_BOX_M = 1.5, 0.02
 """reach of an animal in half box sizes, since it may be longer along the line of sight; half box size below
@@ -51,18 +51,18 @@ def parse(path: Path, clip: Clip) -> Prompt:
     except (OSError, KeyError, ValueError, TypeError, OverflowError, RecursionError) as error:
         places = "`box = [x0, y0, x1, y1]` or `click = [x, y]` in pixels or in shares of the picture"
         remedy = f"give `frame = 12` or `time_s = 1.2`, and {places}"
-        raise InputError("MSK-001", f"not a usable hint: {error}", str(path), remedy) from error
+        raise InputError("MSK-001", f"not a usable prompt: {error}", str(path), remedy) from error
     return Prompt(frame, (x0, y0, x1, y1))
 
 
-def place(prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Hint:
+def place(prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]) -> PlacedPrompt:
     """Lift a prompt to the world; a box gives the animal's reach. Raises InputError MSK-002."""
     centre = position(prompt, clip, world_from_camera)
     x0, y0, x1, y1 = prompt.box_px
     distance = rigid.apply(rigid.inverse(world_from_camera[prompt.frame]), centre[None])[0, 2]
     half_m = max(x1 - x0, y1 - y0) / 2 * distance / clip.intrinsics[prompt.frame, 0, 0]
-    hint = Hint(prompt.frame, centre)
-    return replace(hint, reach_m=FORESHORTENED * half_m) if half_m > MIN_BOX_M else hint
+    placed = PlacedPrompt(prompt.frame, centre)
+    return replace(placed, reach_m=FORESHORTENED * half_m) if half_m > MIN_BOX_M else placed
 
 
 def position(
@@ -76,7 +76,7 @@ def position(
     low, high = np.maximum(np.floor(centre - half), 0).astype(int), np.ceil(centre + half).astype(int)
     depth = clean_depth(clip, prompt.frame)[low[1] : high[1] + 1, low[0] : high[0] + 1]
     if not (depth > 0).any():
-        what = "the hint lies where depth is unknown"
+        what = "the prompt lies where depth is unknown"
         remedy = "point at another part of the animal or another frame"
         raise InputError("MSK-002", what, f"frame {prompt.frame}", remedy)
     z = float(np.quantile(depth[depth > 0], 0.3))
