@@ -164,7 +164,7 @@ def main() -> None:
     parser.add_argument("--queries", type=int, default=60, help="fresh renders that are localized")
     parser.add_argument("--frames", type=int, default=12, help="frames of each session that are localized")
     parser.add_argument(
-        "--most-steps", type=int, default=8000, help="networks that learn for longer are left out"
+        "--max-steps", type=int, default=8000, help="networks that learn for longer are left out"
     )
     parser.add_argument(
         "--kinds",
