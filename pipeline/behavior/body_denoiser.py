@@ -1,14 +1,17 @@
 """The denoiser of body motion along a path, relative to the current posture.
 
-`BodyDenoiser` wraps the UNet of the body. The current posture, rotated to the heading of the path, is
-subtracted from the noisy body before the UNet reads it. The residual is small for a resting animal, and free
-of heading for a walking one.
+`BodyDenoiser` wraps the UNet of the body. What a Gaussian prior expects given the current posture, rotated to
+the heading of the path, is subtracted from the noisy body before the UNet reads it. The residual is small for
+a resting animal, and free of heading for a walking one.
 """
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.fft import dct
 from torch import Tensor, nn
 
+from pipeline.behavior.denoisers import SequenceDenoiser
 from pipeline.behavior.diffusion import STANDARD, Schedule
 from pipeline.behavior.path_encoding import PATH_CHANNELS, expected_steps
 from pipeline.behavior.trajectories import RATE_HZ
@@ -26,12 +29,98 @@ MIN_DIRECTION = 0.01
 """length (metres, or of a unit vector) below which a vector has no direction"""
 
 
+class GaussianPrior(nn.Module):
+    """A Gaussian prior of body motion, which preconditions its denoiser.
+
+    White noise in all channels of all bones does not fit through the narrow layers of a small UNet. Most of
+    it is removed linearly instead: given the posture, motion has little variance in most principal components
+    of the bones, and little at high frequencies of a cosine transform. With one variance per component and
+    frequency, this is the preconditioning of Karras et al. 2022 (Table 1); for variance 1 it is v-prediction.
+    The UNet reads and corrects the leading components, whitened; the loss remains that of the noise in all
+    channels. The leading channels, before those of bones, are components themselves and keep variance 1, as
+    all do before `fit`.
+    """
+
+    basis: Tensor
+    weight: Tensor
+    std: Tensor
+    cosines: Tensor
+    signal: Tensor
+    sigma: Tensor
+
+    def __init__(self, leading: int, bones: int, components: int, frames: int, schedule: Schedule = STANDARD):
+        """``leading`` and ``bones``: channels; ``components``: those of bones that the UNet corrects."""
+        super().__init__()
+        self.leading, self.corrected = leading, leading + components
+        self.register_buffer("basis", torch.eye(leading + bones))
+        self.register_buffer("weight", torch.ones(leading + bones, frames))
+        self.register_buffer("std", torch.ones(leading + bones, frames))
+        cosines = torch.from_numpy(dct(np.eye(frames), norm="ortho", axis=1)).float()
+        alpha_bar = torch.from_numpy(schedule.alpha_bar).float()
+        self.register_buffer("cosines", cosines, persistent=False)
+        self.register_buffer("signal", alpha_bar.sqrt(), persistent=False)
+        self.register_buffer("sigma", (1 - alpha_bar).sqrt(), persistent=False)
+
+    @torch.no_grad()
+    def fit(
+        self, posture: Float[Tensor, "sequence channel frame"], clean: Float[Tensor, "sequence channel frame"]
+    ) -> None:
+        """Fit the bones to sequences and the postures that they begin with."""
+        bones = clean[:, self.leading :].transpose(0, 1).flatten(1)
+        _, vectors = torch.linalg.eigh(bones @ bones.transpose(0, 1))
+        self.basis[self.leading :, self.leading :] = vectors.flip(1)
+        start, sequence = self.project(posture)[:, self.leading :], self.project(clean)[:, self.leading :]
+        weight = (start * sequence).sum(0) / start.square().sum(0).clamp_min(1e-6)
+        self.weight[self.leading :] = weight
+        self.std[self.leading :] = ((sequence - weight * start) @ self.cosines).square().mean(0).sqrt()
+
+    def project(
+        self, sequence: Float[Tensor, "batch channel frame"]
+    ) -> Float[Tensor, "batch component frame"]:
+        """Return the components of sequences."""
+        return self.basis.transpose(0, 1) @ sequence
+
+    def mean(self, posture: Float[Tensor, "batch channel frame"]) -> Float[Tensor, "batch channel frame"]:
+        """Return the expected sequence given a posture."""
+        return self.basis @ (self.weight * self.project(posture))
+
+    def whitened(
+        self, residual: Float[Tensor, "batch channel frame"], t: Float[Tensor, "batch"]
+    ) -> Float[Tensor, "batch corrected frame"]:
+        """Return the leading components of noisy sequences less their mean given the posture, with unit
+        variance at every step, frame and frequency.
+        """
+        leading = (self.project(residual) @ self.cosines)[:, : self.corrected]
+        return (leading / self.noisy_std(t)[:, : self.corrected]) @ self.cosines.transpose(0, 1)
+
+    def noise(
+        self,
+        residual: Float[Tensor, "batch channel frame"],
+        velocity: Float[Tensor, "batch corrected frame"],
+        t: Float[Tensor, "batch"],
+    ) -> Float[Tensor, "batch channel frame"]:
+        """Return the noise in sequences: its best linear estimate, corrected by a predicted velocity in the
+        units of `whitened`.
+        """
+        noisy_std, coefficients = self.noisy_std(t), self.project(residual) @ self.cosines
+        correction = self.signal[t.long()][:, None, None] * (self.std / noisy_std)[:, : self.corrected]
+        correction = correction * (velocity.to(residual.dtype) @ self.cosines)
+        linear = self.sigma[t.long()][:, None, None] / noisy_std.square() * coefficients
+        corrected = torch.cat([linear[:, : self.corrected] + correction, linear[:, self.corrected :]], dim=1)
+        return self.basis @ (corrected @ self.cosines.transpose(0, 1))
+
+    def noisy_std(self, t: Float[Tensor, "batch"]) -> Float[Tensor, "batch component frequency"]:
+        """Return the standard deviation of the noisy coefficients."""
+        signal, sigma = self.signal[t.long()][:, None, None], self.sigma[t.long()][:, None, None]
+        return (signal.square() * self.std.square() + sigma.square()).sqrt()
+
+
 class BodyDenoiser(nn.Module):
-    """Denoise a body along a path as the residual from its current posture.
+    """Denoise a body along a path as the residual from what the prior expects given its current posture.
 
     The last channels of the condition are the posture, scaled as the body is except for the root rotation;
     zeros if the past is dropped. With x_t = sqrt(alpha_bar) clean + sqrt(1 - alpha_bar) noise, subtracting
-    sqrt(alpha_bar) posture leaves the noise unchanged.
+    sqrt(alpha_bar) times the expectation leaves the noise unchanged.
     """
 
     path_std: Tensor
@@ -43,14 +132,16 @@ class BodyDenoiser(nn.Module):
 
     def __init__(
         self,
-        unet: nn.Module,
+        unet: SequenceDenoiser,
+        prior: GaussianPrior,
         posture_channels: int,
         frames: int,
         schedule: Schedule = STANDARD,
         rate_hz: float = RATE_HZ,
     ):
         super().__init__()
-        self.unet, self.posture_channels, self.rate_hz = unet, posture_channels, rate_hz
+        self.unet, self.prior = unet, prior
+        self.posture_channels, self.rate_hz = posture_channels, rate_hz
         self.register_buffer("path_std", torch.ones(3, frames))
         self.register_buffer("root_mean", torch.zeros(ROOT_CHANNELS))
         self.register_buffer("root_std", torch.ones(ROOT_CHANNELS))
@@ -65,8 +156,40 @@ class BodyDenoiser(nn.Module):
         t: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
         control: Float[Tensor, "batch 3 frame"],
-        keep: Float[Tensor, "batch 1"] | None,
+        keep: Float[Tensor, "batch 1"],
     ) -> Float[Tensor, "batch channel frame"]:
+        posture, step, heading = self.posture(x, t, condition, control)
+        residual = x - self.sqrt_alpha_bar[t.long()][:, None, None] * self.prior.mean(posture)
+        unet_control = torch.cat([control, step * self.rate_hz, heading], dim=1)
+        whitened = self.prior.whitened(residual, t)
+        output = self.unet.velocity(whitened, t, condition, unet_control, keep)
+        return self.prior.noise(residual, self.gated(output, whitened), t)
+
+    def gated(
+        self, output: Float[Tensor, "batch output frame"], whitened: Float[Tensor, "batch corrected frame"]
+    ) -> Float[Tensor, "batch corrected frame"]:
+        """Return the velocity; outputs beyond it are gates, which multiply the noisy components of bones.
+
+        A resting animal moves its bones less than the prior expects, a walking one more. A gate says by how
+        much for each frame and component, which a narrow UNet cannot by outputs of its own.
+        """
+        velocity = output[:, : self.prior.corrected]
+        gate = output[:, self.prior.corrected :]
+        if not gate.shape[1]:
+            return velocity
+        bones = velocity[:, self.prior.leading :] + gate * whitened[:, self.prior.leading :]
+        return torch.cat([velocity[:, : self.prior.leading], bones], dim=1)
+
+    def posture(
+        self,
+        x: Float[Tensor, "batch channel frame"],
+        t: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+        control: Float[Tensor, "batch 3 frame"],
+    ) -> tuple[
+        Float[Tensor, "batch channel frame"], Float[Tensor, "batch 3 frame"], Float[Tensor, "batch 2 frame"]
+    ]:
+        """Return the current posture in every frame, rotated to the heading; displacements; headings."""
         posture = condition[:, -self.posture_channels :, None].expand(-1, -1, x.shape[-1])
         root = posture[:, :ROOT_CHANNELS] * self.root_std[:, None] + self.root_mean[:, None]
         step = self.steps(x, t, control)
@@ -74,9 +197,7 @@ class BodyDenoiser(nn.Module):
         root = (rotated_to_heading(root, heading) - self.root_mean[:, None]) / self.rotation_std[:, None]
         posture = torch.cat([root, posture[:, ROOT_CHANNELS:]], dim=1)
         posture = nn.functional.pad(posture, (0, 0, x.shape[1] - self.posture_channels, 0))
-        unet_control = torch.cat([control, step * self.rate_hz, heading], dim=1)
-        residual = x - self.sqrt_alpha_bar[t.long()][:, None, None] * posture
-        return self.unet(residual, t, condition, unet_control, keep)
+        return posture, step, heading
 
     def steps(
         self,
@@ -118,13 +239,14 @@ class OneStageDenoiser(BodyDenoiser):
 
     def __init__(
         self,
-        unet: nn.Module,
+        unet: SequenceDenoiser,
+        prior: GaussianPrior,
         posture_channels: int,
         frames: int,
         schedule: Schedule = STANDARD,
         rate_hz: float = RATE_HZ,
     ):
-        super().__init__(unet, posture_channels, frames, schedule, rate_hz)
+        super().__init__(unet, prior, posture_channels, frames, schedule, rate_hz)
         self.register_buffer("velocity_std", torch.ones(PATH_CHANNELS))
 
     def steps(

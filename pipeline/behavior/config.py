@@ -23,9 +23,9 @@ AblatedInput = Literal["nothing", "scene", "observer", "past"]
 """The part of perception that an ablation replaces by its learned null."""
 NoiseCourse = Literal["linear", "rectified"]
 """Variances that grow linearly (Ho et al. 2020), or rectified flow (Liu et al. 2023)."""
-SamplingMethod = Literal["ddpm", "ddpm_large", "ddim"]
+SamplingMethod = Literal["ddpm", "ddpm_large", "dpm_solver"]
 """DDPM with the posterior variance or the larger forward variance (both Ho et al. 2020, Sec. 3.2), which
-keeps the spread of samples with few steps; DDIM adds no noise."""
+keeps the spread of samples with few steps; DPM-Solver++ (Lu et al. 2022) adds no noise."""
 MAX_GUIDANCE = 2.0
 """Largest guidance scale that sliders offer; beyond it, goal errors grow."""
 
@@ -35,12 +35,13 @@ class PlanSamplingConfig:
     """How plans are sampled."""
 
     method: SamplingMethod | None = None
-    """Sampler of goals (none: the schedule's default). DDPM adds fresh noise at every step, which corrects
-    earlier errors; DDIM, always used for paths and bodies, is deterministic given the initial noise."""
-    goal_steps: int = 50
-    """Denoising steps of the goal."""
+    """Sampler of goals (none: the schedule's). DDPM adds fresh noise at every step; DPM-Solver++, always used
+    for paths and bodies, is deterministic given the initial noise."""
+    goal_steps: int = 0
+    """Denoising steps of the goal; 0: the schedule's own number, 10 of DPM-Solver++, 50 of DDPM."""
     sequence_steps: int = 10
-    """Denoising steps of path and body."""
+    """Denoising steps of path and body. Evenly spaced in log-SNR, some coincide: 9 are left of 10, 33 of
+    50."""
     guidance: float = 1.25
     """Scale s of classifier-free guidance, for bodies at most 1. Of 1, 1.25, 1.5, 2 it has the least energy
     score of goals and the right share of flights in left-out sessions of the built-in cat."""
@@ -59,9 +60,10 @@ class PlanSamplingConfig:
     avoid_solid: bool = True
     """Project goals and paths out of solid voxels during denoising, and onto the supporting surface; needs a
     map, and the scene as a condition."""
-    body_noise_std: float = 0.3
-    """Standard deviation of the initial noise of bodies. At 1 a body trembles three times as much as the
-    animal; at 0.3 bones rotate from frame to frame as much as recorded ones (held-out session)."""
+    body_noise_std: float = 0.4
+    """Standard deviation of the initial noise of bodies. At 0.4 the bones of a resting animal rotate from
+    frame to frame as much as recorded ones, those of a walking one half as much (held-out session); with more
+    noise, resting bodies tremble."""
     path_noise_std: float = 1.0
     """Standard deviation of the initial noise of paths. At 0, in one step, a path is the mean of all paths to
     its goal."""

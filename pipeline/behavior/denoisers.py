@@ -129,28 +129,12 @@ class UNet1d(nn.Module):
         return outputs
 
 
-class ControlUNet(nn.Module):
-    """Denoise a sequence given a control sequence or vector; ``keep`` 0 drops the control."""
+class SequenceDenoiser(nn.Module):
+    """Predict the noise in a sequence, from a network that predicts its velocity."""
 
-    def __init__(
-        self,
-        channels: int,
-        control: int,
-        condition: int,
-        width: int = 32,
-        multipliers: tuple[int, ...] = (1, 2, 4),
-        schedule: Schedule = STANDARD,
-    ):
+    def __init__(self, schedule: Schedule):
         super().__init__()
         self.noise = NoiseFromVelocity(schedule)
-        widths = tuple(width * m for m in multipliers)
-        self.embedding = Embedding(TrailingLinear(condition, EMBEDDING))
-        self.main = UNet1d(channels, widths, EMBEDDING)
-        self.side = UNet1d(control, widths, EMBEDDING)
-        self.inject = nn.ModuleList(nn.Conv1d(w, w, 1) for w in self.main.block_widths)
-        self.out = nn.Conv1d(widths[0], channels, 1)
-        for parameter in self.inject.parameters():
-            nn.init.zeros_(parameter)
 
     def forward(
         self,
@@ -160,11 +144,59 @@ class ControlUNet(nn.Module):
         control: Float[Tensor, "batch control"] | Float[Tensor, "batch control frame"],
         keep: Float[Tensor, "batch 1"],
     ) -> Float[Tensor, "batch channel frame"]:
+        return self.noise(x, self.velocity(x, t, condition, control, keep), t)
+
+    def velocity(
+        self,
+        x: Float[Tensor, "batch channel frame"],
+        t: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+        control: Float[Tensor, "batch control"] | Float[Tensor, "batch control frame"],
+        keep: Float[Tensor, "batch 1"],
+    ) -> Float[Tensor, "batch output frame"]:
+        """Return the velocity (v-prediction) in x, then further outputs, if there are any; ``keep`` 0 drops
+        the control.
+        """
+        raise NotImplementedError
+
+
+class ControlUNet(SequenceDenoiser):
+    """Denoise a sequence given a control sequence or vector."""
+
+    def __init__(
+        self,
+        channels: int,
+        control: int,
+        condition: int,
+        width: int = 32,
+        multipliers: tuple[int, ...] = (1, 2, 4),
+        schedule: Schedule = STANDARD,
+        outputs: int | None = None,
+    ):
+        """``outputs``: if not ``channels``, those of the velocity and further ones (`BodyDenoiser.gated`)."""
+        super().__init__(schedule)
+        widths = tuple(width * m for m in multipliers)
+        self.embedding = Embedding(TrailingLinear(condition, EMBEDDING))
+        self.main = UNet1d(channels, widths, EMBEDDING)
+        self.side = UNet1d(control, widths, EMBEDDING)
+        self.inject = nn.ModuleList(nn.Conv1d(w, w, 1) for w in self.main.block_widths)
+        self.out = nn.Conv1d(widths[0], outputs or channels, 1)
+        for parameter in self.inject.parameters():
+            nn.init.zeros_(parameter)
+
+    def velocity(
+        self,
+        x: Float[Tensor, "batch channel frame"],
+        t: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+        control: Float[Tensor, "batch control"] | Float[Tensor, "batch control frame"],
+        keep: Float[Tensor, "batch 1"],
+    ) -> Float[Tensor, "batch output frame"]:
         embedding = self.embedding(t, condition)
         control = control if control.ndim == 3 else control[..., None].expand(-1, -1, x.shape[-1])
         side = self.side(control, embedding)
         added = [inject(h) * keep[..., None] for inject, h in zip(self.inject, side, strict=True)]
-        return self.noise(x, self.out(self.main(self.unet_input(x, t, condition), embedding, added)[-1]), t)
+        return self.out(self.main(self.unet_input(x, t, condition), embedding, added)[-1])
 
     def unet_input(
         self,
@@ -177,7 +209,7 @@ class ControlUNet(nn.Module):
         return x
 
 
-class UncontrolledUNet(nn.Module):
+class UncontrolledUNet(SequenceDenoiser):
     """Denoise a sequence without control; same signature as `ControlUNet`."""
 
     def __init__(
@@ -187,24 +219,25 @@ class UncontrolledUNet(nn.Module):
         width: int = 32,
         multipliers: tuple[int, ...] = (1, 2, 4),
         schedule: Schedule = STANDARD,
+        outputs: int | None = None,
     ):
-        """``read`` projects a condition to `EMBEDDING` channels."""
-        super().__init__()
-        self.noise, widths = NoiseFromVelocity(schedule), tuple(width * m for m in multipliers)
+        """``read`` projects a condition to `EMBEDDING` channels; ``outputs`` as in `ControlUNet`."""
+        super().__init__(schedule)
+        widths = tuple(width * m for m in multipliers)
         self.embedding = Embedding(read)
         self.main = UNet1d(channels, widths, EMBEDDING)
-        self.out = nn.Conv1d(widths[0], channels, 1)
+        self.out = nn.Conv1d(widths[0], outputs or channels, 1)
 
-    def forward(
+    def velocity(
         self,
         x: Float[Tensor, "batch channel frame"],
         t: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
-        control: Float[Tensor, "batch ..."],
-        keep: Float[Tensor, "batch 1"] | None,
-    ) -> Float[Tensor, "batch channel frame"]:
+        control: Float[Tensor, "batch control"] | Float[Tensor, "batch control frame"],
+        keep: Float[Tensor, "batch 1"],
+    ) -> Float[Tensor, "batch output frame"]:
         del control, keep
-        return self.noise(x, self.out(self.main(x, self.embedding(t, condition))[-1]), t)
+        return self.out(self.main(x, self.embedding(t, condition))[-1])
 
 
 class ConcatenationUNet(UncontrolledUNet):
@@ -218,21 +251,22 @@ class ConcatenationUNet(UncontrolledUNet):
         width: int = 32,
         multipliers: tuple[int, ...] = (1, 2, 4),
         schedule: Schedule = STANDARD,
+        outputs: int | None = None,
     ):
         """``control``: channels of the flattened control, 3 for a goal, 8 per frame for a path."""
         read = nn.Sequential(
             nn.Linear(condition + control + 1, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING)
         )
-        super().__init__(channels, read, width, multipliers, schedule)
+        super().__init__(channels, read, width, multipliers, schedule, outputs)
         self.condition = condition
 
-    def forward(
+    def velocity(
         self,
         x: Float[Tensor, "batch channel frame"],
         t: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
         control: Float[Tensor, "batch control"] | Float[Tensor, "batch control frame"],
         keep: Float[Tensor, "batch 1"],
-    ) -> Float[Tensor, "batch channel frame"]:
+    ) -> Float[Tensor, "batch output frame"]:
         code = torch.cat([condition[:, -self.condition :], control.flatten(1) * keep, keep], dim=-1)
-        return super().forward(x, t, code, control, keep)
+        return super().velocity(x, t, code, control, keep)

@@ -14,7 +14,13 @@ from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import nn
 
-from pipeline.behavior.body_denoiser import CONTROL_CHANNELS, ROOT_CHANNELS, BodyDenoiser, OneStageDenoiser
+from pipeline.behavior.body_denoiser import (
+    CONTROL_CHANNELS,
+    ROOT_CHANNELS,
+    BodyDenoiser,
+    GaussianPrior,
+    OneStageDenoiser,
+)
 from pipeline.behavior.config import (
     AblatedInput,
     Control,
@@ -76,6 +82,9 @@ class Architecture:
     code: int = 64
     observer_radius_m: float = 4.0
     ablated_input: AblatedInput = "nothing"
+    body_components: int = 0
+    """principal components of bones that the UNet of bodies corrects (`GaussianPrior`); 0: it
+    denoises all channels, without a fitted prior"""
     unet_width: int = 16
     unet_multipliers: tuple[int, ...] = (1, 2, 4)
     goal_hidden: int = 128
@@ -188,6 +197,10 @@ class BehaviorNets(nn.Module):
             map_cells=a.map_cells,
             map_lookup=a.map_lookup,
         )
+        bones = 6 * a.bones
+        gates = min(a.body_components, bones)
+        components = gates or bones
+        corrected = ROOT_CHANNELS + components
         sizes = (a.code_length, a.unet_width, a.unet_multipliers, schedule)
         match a.control:
             case "unet":
@@ -196,18 +209,22 @@ class BehaviorNets(nn.Module):
                     self.path = WaypointUNet(*maps, 3, *sizes, rate_hz=a.rate_hz)
                 else:
                     self.path = ControlUNet(PATH_CHANNELS, 3, *sizes)
-                body = ControlUNet(a.body_channels, CONTROL_CHANNELS, *sizes)
+                body = ControlUNet(corrected, CONTROL_CHANNELS, *sizes, outputs=corrected + gates)
             case "concatenation":
                 self.path = ConcatenationUNet(PATH_CHANNELS, 3, *sizes)
-                body = ConcatenationUNet(a.body_channels, CONTROL_CHANNELS * a.future, *sizes)
+                along = CONTROL_CHANNELS * a.future
+                body = ConcatenationUNet(corrected, along, *sizes, outputs=corrected + gates)
             case _:
                 assert_never(a.control)
         if a.family == "one_stage":  # one network for path and body, without control
             read = TrailingLinear(a.code_length, EMBEDDING)
-            body = UncontrolledUNet(PATH_CHANNELS + a.body_channels, read, *sizes[1:])
-            self.body = OneStageDenoiser(body, a.body_channels, a.future, schedule, a.rate_hz)
+            corrected += PATH_CHANNELS
+            body = UncontrolledUNet(corrected, read, *sizes[1:], outputs=corrected + gates)
+            denoiser, leading = OneStageDenoiser, PATH_CHANNELS + ROOT_CHANNELS
         else:
-            self.body = BodyDenoiser(body, a.body_channels, a.future, schedule, a.rate_hz)
+            denoiser, leading = BodyDenoiser, ROOT_CHANNELS
+        prior = GaussianPrior(leading, bones, components, a.future, schedule)
+        self.body = denoiser(body, prior, a.body_channels, a.future, schedule, a.rate_hz)
 
 
 def channels_from_bones(
@@ -306,7 +323,7 @@ def contract(
         },
         "scaling": {name: np.asarray(value, float).tolist() for name, value in vars(scaling).items()},
         "schedule": {**asdict(schedule), "alpha_bar": schedule.alpha_bar.tolist()},
-        "sampling": asdict(PlanSamplingConfig(method=schedule.method)),
+        "sampling": asdict(PlanSamplingConfig(method=schedule.method, goal_steps=schedule.goal_steps)),
     }
 
 

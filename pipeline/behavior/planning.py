@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import nn
 
-from pipeline.behavior.config import Ego, PlanSamplingConfig
+from pipeline.behavior.config import Ego, PlanSamplingConfig, SamplingMethod
 from pipeline.behavior.diffusion import Schedule, guided, sample
 from pipeline.behavior.model import (
     ROOT_CHANNELS,
@@ -33,6 +33,8 @@ from pipeline.geometry import rigid
 Array = np.ndarray
 Denoise = Callable[[Array, float], Array]
 """maps noisy samples and a step to the predicted noise"""
+SEQUENCE_METHOD: SamplingMethod = "dpm_solver"
+"""Sampler of paths and bodies; in few steps DDIM loses their variance, most of it at high frequencies."""
 
 
 class Networks(Protocol):
@@ -258,7 +260,8 @@ class Sampler:
             return lambda x, t: self.networks.goal(x, _filled(len(x), t), code)
 
         denoisers = [denoise(code[:: codes.count]) for code in (codes.full, *codes.references)]
-        x = self._denoised(denoisers, (len(codes.full), 3), sampling, sampling.goal_steps, rng)
+        steps = sampling.goal_steps or self.schedule.goal_steps
+        x = self._denoised(denoisers, (len(codes.full), 3), sampling, steps, rng)
         return codes.on_support(self.scaling.goal(x))
 
     def paths(
@@ -298,8 +301,8 @@ class Sampler:
         denoisers = [denoise(codes.full, float(sampling.goal)), *map(denoise, codes.references)]
         correct, spread = partial(self.paths_out_of_solid, codes), sampling.path_noise_std
         shape = (len(goal), PATH_CHANNELS, self.scaling.path_std.shape[1])
-        ddim = replace(sampling, method="ddim")
-        path = self._denoised(denoisers, shape, ddim, sampling.sequence_steps, rng, correct, spread)
+        solver = replace(sampling, method=SEQUENCE_METHOD)
+        path = self._denoised(denoisers, shape, solver, sampling.sequence_steps, rng, correct, spread)
         return self.decode_paths(codes, path, goal, sampling)
 
     def bodies(
@@ -319,9 +322,9 @@ class Sampler:
 
         shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
         denoisers = [denoise(codes.full, 1.0), *map(denoise, codes.references)]
-        ddim = replace(sampling, method="ddim", guidance=min(sampling.guidance, 1.0))
+        solver = replace(sampling, method=SEQUENCE_METHOD, guidance=min(sampling.guidance, 1.0))
         steps, spread = sampling.sequence_steps, sampling.body_noise_std
-        body = self._denoised(denoisers, shape, ddim, steps, rng, spread=spread)
+        body = self._denoised(denoisers, shape, solver, steps, rng, spread=spread)
         return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
 
     def paths_out_of_solid(

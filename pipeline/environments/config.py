@@ -33,7 +33,7 @@ class EnvironmentConfig:
     """Nearest and furthest distance from the animal at which an episode begins, metres."""
     goal_steps: int = 4
     """Denoising steps of the animal's goals; 50 for the full sampler."""
-    sequence_steps: int = 4
+    sequence_steps: int = 6
     """Denoising steps of its paths and bodies; 10 for the full sampler."""
     guidance: float = PlanSamplingConfig.guidance
     """Scale of classifier-free guidance: the interactivity."""

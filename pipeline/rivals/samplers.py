@@ -5,7 +5,7 @@
 as one sequence without a goal (Tevet et al. 2022). `sampler_of` chooses by the architecture.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import assert_never
 
 import numpy as np
@@ -15,7 +15,7 @@ from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import Architecture, Scaling
 from pipeline.behavior.path_encoding import PATH_CHANNELS
-from pipeline.behavior.planning import Array, Networks, PlanCondition, SampledPlan, Sampler
+from pipeline.behavior.planning import SEQUENCE_METHOD, Array, Networks, PlanCondition, SampledPlan, Sampler
 
 MEAN_STEP, LOG_STD_STEP = 0.0, 1.0
 """Steps at which the networks, given a zero sample, predict mean and log standard deviation."""
@@ -173,7 +173,8 @@ class OneStageSampler(Sampler):
         stds = sampling.path_noise_std, sampling.body_noise_std
         spread = np.repeat(stds, (PATH_CHANNELS, body))[:, None]
         denoisers = [denoise(code) for code in (codes.full, *codes.references)]
-        return self._denoised(denoisers, shape, sampling, steps, rng, correct, spread)
+        solver = replace(sampling, method=SEQUENCE_METHOD)
+        return self._denoised(denoisers, shape, solver, steps, rng, correct, spread)
 
 
 def _step(x: Array, t: float) -> Array:

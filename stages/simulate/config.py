@@ -25,8 +25,8 @@ class Config:
     """Scale of classifier-free guidance: the interactivity."""
     without: tuple[Literal["scene", "observer", "past", "goal"], ...] = ()
     """Conditions that plans are drawn without."""
-    goal_steps: int = 50
-    """Denoising steps of goals."""
+    goal_steps: int = 0
+    """Denoising steps of the goal; 0: as the model is best sampled."""
     sequence_steps: int = 10
     """Denoising steps of paths and bodies."""
     places: SubgoalSource = "none"

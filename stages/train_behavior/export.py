@@ -133,9 +133,9 @@ def golden_observation(a: Architecture, *, accompanied: bool = False) -> Observa
 
 
 def golden_plan(sampler: Sampler, architecture: Architecture, *, accompanied: bool = False) -> dict:
-    """Sample plans by DDIM; return input, noise and results."""
+    """Sample plans by DPM-Solver++; return input, noise and results."""
     observation = golden_observation(architecture, accompanied=accompanied)
-    sampling = PlanSamplingConfig(method="ddim", goal_steps=10, sequence_steps=10, max_path_draws=1)
+    sampling = PlanSamplingConfig(method="dpm_solver", goal_steps=10, sequence_steps=10, max_path_draws=1)
     noise = np.random.default_rng(0)
     shapes = {
         "goal": (1, 3),

@@ -12,10 +12,17 @@ from pipeline.core import devices, distributed, progress
 from pipeline.core.errors import InputError
 from pipeline.environments.other_home import ReconstructedHome
 from stages.train_behavior import outcome
-from stages.train_behavior.config import Config
+from stages.train_behavior.config import Config, Weighting
 from stages.train_behavior.homes import with_other_homes
 from stages.train_behavior.refusals import check_settings
 from stages.train_behavior.training import train
+
+SCHEDULES: dict[Weighting, Schedule] = {
+    "noise": Schedule(method="ddpm"),
+    "velocity": Schedule(),
+    "flow": Schedule(course="rectified"),
+}
+"""Noise levels and sampler of goals by weighting; the paper samples by DDPM."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +52,7 @@ def run(
     scenes = Scenes.load(inputs.behavior_data, data.videos)
     scenes = scenes.without_features() if config.scene == "none" else scenes
     architecture = outcome.architecture_for(config, data, scenes)
-    weighting = config.training.objective.weighting
-    schedule = Schedule(course="rectified" if weighting == "flow" else "linear")
+    schedule = SCHEDULES[config.training.objective.weighting]
     check_settings(config, data, architecture, str(inputs.behavior_data))
     homes = with_other_homes(data, scenes, *_homes(inputs, config))
     progress.log(

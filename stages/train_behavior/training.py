@@ -15,13 +15,14 @@ from pipeline.behavior.pointwise import WaypointUNet
 from pipeline.core import distributed
 from pipeline.core.training import FitRecord, fit
 from stages.train_behavior.batches import (
+    TrainingWindows,
     WindowStatistics,
     draw_batch,
     largest_turn_rad,
     statistics_from_windows,
     windows_from_data,
 )
-from stages.train_behavior.config import BehaviorOptimizerConfig, BehaviorTrainingConfig
+from stages.train_behavior.config import AugmentationConfig, BehaviorOptimizerConfig, BehaviorTrainingConfig
 from stages.train_behavior.homes import TrainingHomes
 from stages.train_behavior.objective import TrainingPhase, losses
 from stages.train_behavior.rival_losses import gaussian_losses, one_stage_losses
@@ -37,6 +38,8 @@ AVERAGE_WARMUP_STEPS = 10
 """Warm-up of the moving average, so that it forgets the initial weights."""
 MANTISSA_STEPS = 2.0**12
 """Quantization of mantissas of weights: 12 significant bits."""
+PRIOR_WINDOWS, PRIOR_BATCH = 512, 64
+"""Windows that the Gaussian prior of bodies is fitted to, and how many are drawn at once to bound memory."""
 WARMUP_SHARE, FINAL_RATE_SHARE = 0.02, 0.02
 """Share of a phase with rising learning rate, and final learning rate relative to its peak."""
 
@@ -70,11 +73,14 @@ def train(
     windows = windows_from_data(homes, architecture)
     statistics = statistics_from_windows(windows, largest_turn_rad(settings.augmentation))
     nets = initial_nets(architecture, schedule, statistics, seed).to(device)
-    average = copy.deepcopy(nets).requires_grad_(False)
     scene = SceneSampler(homes.scenes, architecture.scene_stride, device)
     optimization, augmentation = settings.optimization, settings.augmentation
     of_paths = replace(augmentation, approached=augmentation.approached_paths)
     goal_steps = 0 if architecture.family == "one_stage" else optimization.goal_steps
+    if architecture.body_components and windows.bones_known.any():
+        of_bodies = of_paths if goal_steps else augmentation
+        fit_body_prior(nets, windows, scene, statistics, of_bodies, seed)
+    average = copy.deepcopy(nets).requires_grad_(False)
     accelerate(nets, optimization, device)
     optimizer = torch.optim.AdamW(
         nets.parameters(), lr=optimization.rate, weight_decay=WEIGHT_DECAY, fused=True
@@ -122,9 +128,9 @@ def _average(average: BehaviorNets, nets: BehaviorNets, step: int, goal_steps: i
 def accelerate(nets: BehaviorNets, optimization: BehaviorOptimizerConfig, device: str) -> None:
     """Set precision and compilation of path and body as configured; weights stay float32."""
     kind = torch.device(device).type
-    for net in (nets.path, nets.body):
+    for net, unet in ((nets.path, nets.path), (nets.body, nets.body.unet)):
         if optimization.precision == "bfloat16":
-            net.forward = torch.autocast(kind, torch.bfloat16)(net.forward)
+            unet.velocity = torch.autocast(kind, torch.bfloat16)(unet.velocity)
         if optimization.compile:
             net.compile(mode="reduce-overhead" if kind == "cuda" else "default")
 
@@ -158,6 +164,32 @@ def initial_nets(
         if isinstance(net, WaypointUNet | OneStageDenoiser):
             net.velocity_std[:] = torch.from_numpy(scaling.velocity_std)
     return nets
+
+
+def fit_body_prior(
+    nets: BehaviorNets,
+    windows: TrainingWindows,
+    scene: SceneSampler,
+    statistics: WindowStatistics,
+    augmentation: AugmentationConfig,
+    seed: int,
+) -> None:
+    """Fit the Gaussian prior of bodies to windows augmented as in training, but not mirrored, which hides
+    bones. All processes fit the same.
+    """
+    generator, rows, count = torch.Generator().manual_seed(seed), [], 0
+    augmentation = replace(augmentation, mirror=0.0)
+    while count < PRIOR_WINDOWS:
+        batch = draw_batch(windows, scene, statistics, augmentation, PRIOR_BATCH, generator)
+        body, along = batch.body[batch.bones_known], batch.places[batch.bones_known]
+        now = torch.zeros_like(along[:, 0, 0])
+        held = nets.perception.now(batch.held[batch.bones_known], now + 1)
+        lead = batch.path[batch.bones_known] if isinstance(nets.body, OneStageDenoiser) else body[:, :0]
+        clean = torch.cat([lead, body], dim=1)
+        rows.append((nets.body.posture(clean, now, held, along)[0], clean))
+        count += len(clean)
+    posture, clean = (torch.cat(part) for part in zip(*rows, strict=True))
+    nets.body.prior.fit(posture, clean)
 
 
 def two_cosines(progress: float, turn: float) -> float:

@@ -1,12 +1,18 @@
 import numpy as np
 import torch
 
-from pipeline.behavior.body_denoiser import BodyDenoiser, OneStageDenoiser, rotated_to_heading
+from pipeline.behavior.body_denoiser import BodyDenoiser, GaussianPrior, OneStageDenoiser, rotated_to_heading
+from pipeline.behavior.denoisers import SequenceDenoiser
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.path_encoding import velocity_channels_from_path
 from pipeline.geometry import rigid_torch
 
 FRAMES = 40
+
+
+def plain(channels: int) -> GaussianPrior:
+    """A prior without bones, which leaves its input as it is."""
+    return GaussianPrior(channels, 0, 0, FRAMES)
 
 
 def walk(turns: torch.Tensor, speed_m_s: float) -> torch.Tensor:
@@ -22,7 +28,7 @@ def columns(yaw: torch.Tensor) -> torch.Tensor:
 
 
 def test_a_body_is_held_to_look_where_it_goes_and_to_stay_as_it_is():
-    net = BodyDenoiser(torch.nn.Identity(), 6, FRAMES)
+    net = BodyDenoiser(SequenceDenoiser(Schedule()), plain(6), 6, FRAMES)
     for first, speed in ((0.4, 0.8), (0.4, 0.0)):
         path, yaw = walk(torch.full((FRAMES,), 0.03), speed)
         held = columns(torch.full((FRAMES,), first))
@@ -37,10 +43,13 @@ def test_a_body_is_held_to_look_where_it_goes_and_to_stay_as_it_is():
 
 def test_a_one_stage_body_has_the_heading_of_its_own_path():
     """The same steps, whether the path is given or denoised along with the body; none where noise hides it."""
-    net, std = OneStageDenoiser(torch.nn.Identity(), 6, FRAMES), torch.tensor([0.4, 0.1, 0.4, 1.0])
+    net, std = (
+        OneStageDenoiser(SequenceDenoiser(Schedule()), plain(10), 6, FRAMES),
+        torch.tensor([0.4, 0.1, 0.4, 1.0]),
+    )
     net.velocity_std[:] = std
     path, _ = walk(torch.full((FRAMES,), 0.03), 0.8)
-    given = BodyDenoiser(torch.nn.Identity(), 6, FRAMES).steps(path, torch.zeros(1), path)
+    given = BodyDenoiser(SequenceDenoiser(Schedule()), plain(6), 6, FRAMES).steps(path, torch.zeros(1), path)
     strides = velocity_channels_from_path(path.mT, path[..., 0] - given[..., 0]) / std
     whole = torch.cat([strides.mT, torch.randn(1, 6, FRAMES)], dim=1)
     clean, noisy = (
@@ -52,12 +61,12 @@ def test_a_one_stage_body_has_the_heading_of_its_own_path():
 
 
 def test_what_is_denoised_is_the_departure_from_the_posture():
-    class Noted(torch.nn.Module):
-        def forward(self, x, t, condition, control, keep):
+    class Noted(SequenceDenoiser):
+        def velocity(self, x, t, condition, control, keep):
             self.x = x
             return x
 
-    net = BodyDenoiser(Noted(), 9, FRAMES)
+    net = BodyDenoiser(Noted(Schedule()), plain(9), 9, FRAMES)
     posture = torch.cat([columns(torch.zeros(1))[0, :, 0], torch.tensor([0.3, -0.2, 0.1])])[None]
     clean, noise, t = (
         posture[..., None].expand(-1, -1, FRAMES),
@@ -70,8 +79,18 @@ def test_what_is_denoised_is_the_departure_from_the_posture():
         t,
         torch.cat([torch.ones(1, 4), posture], dim=1),
         torch.zeros(1, 3, FRAMES),
-        None,
+        torch.ones(1, 1),
     )
     torch.testing.assert_close(
         net.unet.x, np.sqrt(1 - share).astype(np.float32) * noise, atol=6e-3, rtol=0
     )  # a heading is told by vectors a little shorter than 1
+
+
+def test_gates_multiply_the_noisy_bones_and_nothing_else():
+    net = BodyDenoiser(SequenceDenoiser(Schedule()), GaussianPrior(6, 12, 5, FRAMES), 18, FRAMES)
+    velocity, whitened = torch.randn(2, 1, 11, FRAMES)
+    gate = torch.randn(1, 5, FRAMES)
+    given = net.gated(torch.cat([velocity, gate], dim=1), whitened)
+    torch.testing.assert_close(given[:, :6], velocity[:, :6])
+    torch.testing.assert_close(given[:, 6:], velocity[:, 6:] + gate * whitened[:, 6:])
+    torch.testing.assert_close(net.gated(velocity, whitened), velocity)

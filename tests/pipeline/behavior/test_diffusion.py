@@ -20,7 +20,7 @@ def perfect(mean: float, std: float):
 
 
 @pytest.mark.parametrize(
-    ("method", "count", "tolerance"), [("ddpm", 50, 0.06), ("ddim", 50, 0.05), ("ddim", 10, 0.12)]
+    ("method", "count", "tolerance"), [("ddpm", 50, 0.06), ("dpm_solver", 50, 0.03), ("dpm_solver", 10, 0.03)]
 )
 def test_samplers_reproduce_a_gaussian(method, count, tolerance):
     rng = np.random.default_rng(0)
@@ -54,6 +54,12 @@ def test_the_forward_variance_keeps_the_spread_of_unit_data_in_few_steps():
     assert spread["ddpm"] < 0.95
 
 
+@pytest.mark.parametrize(("std", "tolerance"), [(1.5, 0.02), (1.0, 0.02), (0.5, 0.02), (0.3, 0.04)])
+def test_in_ten_steps_the_solver_keeps_the_spread(std, tolerance):
+    x = sample(perfect(0.0, std), np.ones(1), SCHEDULE, method="dpm_solver", count=10)
+    assert x[0] == pytest.approx(std, rel=tolerance)
+
+
 def test_noising_keeps_unit_variance():
     rng = np.random.default_rng(0)
     clean, noise = rng.standard_normal((2, 100000))
@@ -64,28 +70,11 @@ def test_schedule_ends_in_noise_and_every_sampler_visits_both_ends():
     assert SCHEDULE.alpha_bar[0] > 0.999
     assert SCHEDULE.alpha_bar[-1] < 0.01
     for count in (4, 10, 50):
-        steps = SCHEDULE.visited(count)
+        steps = SCHEDULE.visited(count, "ddpm")
         assert (steps[0], steps[-1], len(set(steps))) == (49, 0, count)
-
-
-def test_ddim_follows_rectified_flow_in_eulers_steps():
-    schedule = Schedule(course="rectified")
-    moment = np.arange(1, schedule.steps + 1) / (schedule.steps + 1)  # share of noise on the straight way
-    unit = np.sqrt((1 - moment) ** 2 + moment**2)
-
-    def noise_in(way, t):
-        return np.sin(3 * way) + 0.1 * t  # any prediction
-
-    first = np.random.default_rng(0).standard_normal(100)
-    sampled = sample(lambda x, t: noise_in(x * unit[int(t)], t), first, schedule, method="ddim", count=10)
-    steps = schedule.visited(10)
-    way = first * unit[steps[0]]
-    for now, later in zip(steps, [*steps[1:], None], strict=True):
-        noise = noise_in(way, now)
-        clean = ((way - moment[now] * noise) / (1 - moment[now])).clip(-schedule.clip, schedule.clip)
-        noise = (way - (1 - moment[now]) * clean) / moment[now]
-        way = way + ((0.0 if later is None else moment[later]) - moment[now]) * (noise - clean)
-    np.testing.assert_allclose(sampled, way, atol=1e-6)
+        steps = SCHEDULE.visited(count, "dpm_solver")
+        assert (steps[0], steps[-1]) == (49, 0) and len(steps) <= count
+        assert np.diff(steps).max() < 0
 
 
 def test_guidance_is_linear_in_its_scale():
@@ -130,5 +119,18 @@ def test_nothing_steers_a_free_network_which_is_a_controlled_one_without_control
     torch.testing.assert_close(free(x, t, code, control, dropped + 1), steered(x, t, code, control, dropped))
 
 
-def test_straight_ways_are_followed_without_fresh_noise():
-    assert Schedule().method == "ddpm" and Schedule(course="rectified").method == "ddim"
+@pytest.mark.parametrize("course", ["linear", "rectified"])
+def test_the_solver_needs_no_fresh_noise_and_ends_corrected(course):
+    """For any number of steps; corrected estimates are extrapolated, and the last one is returned."""
+    schedule = Schedule(course=course)
+    for count in (1, 2, 3, 10):
+        assert schedule.visited(count, "dpm_solver")[0] == 49
+        x = sample(
+            lambda x, t: x,
+            np.random.default_rng(0).standard_normal(100),
+            schedule,
+            method="dpm_solver",
+            count=count,
+            correct=lambda clean: np.abs(clean),
+        )
+        assert np.isfinite(x).all() and (count == 1 or (x >= 0).all())

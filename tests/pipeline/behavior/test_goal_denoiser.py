@@ -31,7 +31,7 @@ def goals(net: GoalMLP, perceived: torch.Tensor, count: int) -> torch.Tensor:
     with torch.inference_mode():
         x = sample(
             lambda x, t: net.per_member(x, torch.full(shape[:1], t), perceived, torch.ones(shape[0])).mean(0),
-            torch.randn(shape), STANDARD, method="ddim", count=10,
+            torch.randn(shape), STANDARD, method="dpm_solver", count=10,
         )  # fmt: skip
     return x.unflatten(0, (-1, count))
 

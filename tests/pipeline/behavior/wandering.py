@@ -17,6 +17,7 @@ REST = rigid.make(
 )
 ARCHITECTURE = Architecture(
     bones=BONES,
+    body_components=5,
     scene_width=8,
     hidden=16,
     code=8,

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from pipeline.behavior import model
+from pipeline.behavior.body_denoiser import OneStageDenoiser
 from pipeline.behavior.config import PlanSamplingConfig
-from pipeline.behavior.diffusion import Schedule
+from pipeline.behavior.diffusion import Schedule, noised
 from pipeline.behavior.perception import GRID_SHAPE
 from pipeline.behavior.planning import Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
@@ -91,6 +92,57 @@ def test_no_heading_is_clipped(windows, turn_rad):
         scaled = (entry - scaling.body_mean[:3]) / scaling.body_std[:3]
         assert np.abs(scaled).max() <= Schedule().clip + 1e-9
     assert scaling.body_std[0] < 0.45
+
+
+@pytest.mark.parametrize("family", ["diffusion", "one_stage"])
+def test_the_prior_of_bodies_is_that_of_the_training_windows(windows, family):
+    """Alone it removes most of the noise from bones; paths of one-stage models and roots keep theirs."""
+    architecture = replace(ARCHITECTURE, family=family, body_components=5)
+    statistics = statistics_from_windows(windows, 0.0)
+    body = initial_nets(architecture, Schedule(), statistics, 0).body
+    posture, clean = body_sequences(body, windows, statistics)
+    unfitted = linear_error(body.prior, posture, clean)
+    nets = initial_nets(architecture, Schedule(), statistics, 0)
+    scene = SceneSampler(Scenes.of(room()), 4, "cpu")
+    training.fit_body_prior(nets, windows, scene, statistics, PLAIN, seed=0)
+    bones = nets.body.prior.leading
+    fitted = linear_error(nets.body.prior, posture, clean)
+    torch.testing.assert_close(fitted[:bones], unfitted[:bones], atol=1e-4, rtol=0)
+    assert fitted[bones:].mean() < 0.3 * unfitted[bones:].mean()
+
+
+def body_sequences(body, windows, statistics):
+    """The sequences of one batch, and the postures that they begin with."""
+    scene = SceneSampler(Scenes.of(room()), 4, "cpu")
+    batch = draw_batch(windows, scene, statistics, PLAIN, 64, torch.Generator().manual_seed(1))
+    nothing = torch.zeros(64)
+    held = (batch.held.mean(1) - statistics.past_mean) / statistics.past_std
+    one_stage = isinstance(body, OneStageDenoiser)
+    clean = torch.cat([batch.path, batch.body], dim=1) if one_stage else batch.body
+    return body.posture(clean, nothing, held, batch.places)[0], clean
+
+
+def linear_error(prior, posture, clean, t=20):
+    """Mean squared error of the noise of each channel, if the UNet corrects nothing."""
+    noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(2))
+    share = torch.tensor(Schedule().alpha_bar[t]).float()
+    residual = noised(clean, noise, share) - share.sqrt() * prior.mean(posture)
+    zero = torch.zeros(len(clean), prior.corrected, clean.shape[-1])
+    return (prior.noise(residual, zero, torch.full((len(clean),), float(t))) - noise).square().mean((0, 2))
+
+
+def test_bodies_have_a_prior_unless_they_are_regressed_or_trained_as_in_the_paper(data):
+    scenes = Scenes.of(room())
+    components = {
+        "ours": outcome.architecture_for(Config(), data, scenes).body_components,
+        "gaussian": outcome.architecture_for(Config(family="gaussian"), data, scenes).body_components,
+        "paper": outcome.architecture_for(
+            Config(training=BehaviorTrainingConfig(objective=ObjectiveConfig(weighting="noise"))),
+            data,
+            scenes,
+        ).body_components,
+    }
+    assert components["ours"] > 0 == components["gaussian"] == components["paper"]
 
 
 def test_windows_begin_at_the_origin_facing_forward(windows):
@@ -276,9 +328,10 @@ def test_half_precision_learns_nearly_the_same_and_keeps_its_weights(data):
     "shape",
     [
         replace(ARCHITECTURE, map_lookup="pointwise"),
-        replace(ARCHITECTURE, scene="volume", observed_past="poses"),
+        replace(ARCHITECTURE, control="concatenation"),
+        replace(ARCHITECTURE, scene="volume", observed_past="poses", body_components=0),
     ],
-    ids=["pointwise", "paper"],
+    ids=["pointwise", "concatenation", "paper"],
 )
 def test_models_of_other_architectures_are_written_and_read(data, tmp_path, shape):
     settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=2, goal_steps=1, batch=8))
@@ -289,7 +342,7 @@ def test_models_of_other_architectures_are_written_and_read(data, tmp_path, shap
     architecture, nets, scaling, schedule, _ = model.load(tmp_path)
     assert (architecture, schedule) == (shape, Schedule(course="rectified"))
     np.testing.assert_allclose(scaling.velocity_std, fitted.scaling.velocity_std)
-    assert write_networks(tmp_path, nets.eval(), shape) < 1e-4
+    assert write_networks(tmp_path, nets.eval(), shape) < 5e-4
 
 
 @pytest.mark.slow
@@ -344,7 +397,8 @@ def test_goals_and_paths_ask_for_approaches_each_in_its_own_share(data, monkeypa
         AugmentationConfig(approached=0.2, approached_paths=0.5),
     )
     train(TrainingHomes.of_one(data, Scenes.of(room())), ARCHITECTURE, Schedule(), settings, seed=0)
-    assert asked == [0.2, 0.2, 0.5]
+    prior = len(asked) - 3
+    assert asked == [0.5] * prior + [0.2, 0.2, 0.5] and prior > 0
 
 
 def test_contract_is_whole_and_loads_back(windows, tmp_path):
@@ -393,7 +447,7 @@ def test_golden_plan_uses_the_noise_it_names(windows):
             assert self.queue[0].shape == tuple(shape)
             return self.queue.pop(0)
 
-    plan = sampler.plan(golden_observation(ARCHITECTURE), PlanSamplingConfig("ddim", 10, 10), Noted())
+    plan = sampler.plan(golden_observation(ARCHITECTURE), PlanSamplingConfig("dpm_solver", 10, 10), Noted())
     np.testing.assert_allclose(plan.path[0], golden["plans"]["guidance_1.25"]["path"], atol=1e-4)
 
 

@@ -1,10 +1,18 @@
-// Denoising: DDPM and DDIM over a linear schedule, and classifier-free guidance. Counterpart of
+// Denoising: DDPM and DPM-Solver++ over a schedule, and classifier-free guidance. Counterpart of
 // pipeline/behavior/diffusion.py.
 
-export function visited(schedule, count) {
+// Half the logarithm of the signal-to-noise ratio of a step.
+const logSnr = (schedule, t) => Math.log(schedule.alpha_bar[t] / (1 - schedule.alpha_bar[t])) / 2;
+
+export function visited(schedule, count, method) {
   const last = schedule.steps - 1;
-  if (count === 1) return [last];
-  return Array.from({ length: count }, (_, i) => Math.floor(last - (last * i) / (count - 1) + 0.5));
+  const evenly = (from, to) =>
+    Array.from({ length: count }, (_, i) => (count === 1 ? from : from + ((to - from) * i) / (count - 1)));
+  if (method !== 'dpm_solver') return evenly(last, 0).map((t) => Math.floor(t + 0.5));
+  const ratios = Array.from({ length: schedule.steps }, (_, t) => logSnr(schedule, t));
+  const nearest = (wanted) =>
+    ratios.reduce((best, it, t) => (Math.abs(it - wanted) < Math.abs(ratios[best] - wanted) ? t : best), 0);
+  return [...new Set(evenly(ratios[last], ratios[0]).map(nearest))];
 }
 
 // e = e_without + scale (e_with - e_without); one call where the scale is 0 or 1.
@@ -21,8 +29,9 @@ export function guided(withCondition, without, scale) {
 // denoise(x, t) predicts the noise in x; draw(count) gives fresh noise, for DDPM alone; correct(clean) is
 // applied to the clean estimates of the steps at which most of the variance is clean.
 export async function sample(denoise, noise, schedule, { method, count, draw, correct }) {
-  const steps = visited(schedule, count);
-  let x = Float32Array.from(noise);
+  const steps = visited(schedule, count, method);
+  const strides = steps.slice(1).map((t, i) => logSnr(schedule, t) - logSnr(schedule, steps[i]));
+  let [x, earlier] = [Float32Array.from(noise), null];
   for (const [position, t] of steps.entries()) {
     const now = schedule.alpha_bar[t];
     const epsilon = await denoise(x, t);
@@ -35,12 +44,18 @@ export async function sample(denoise, noise, schedule, { method, count, draw, co
     const variance = method === 'ddpm' ? ((1 - later) / (1 - now)) * (1 - now / later) : 0;
     const [signal, drift] = [Math.sqrt(later), Math.sqrt(Math.max(1 - later - variance, 0) / (1 - now))];
     const fresh = method === 'ddpm' ? draw(x.length) : null;
+    const share =
+      method === 'dpm_solver' && earlier && position < steps.length - 2
+        ? strides[position] / strides[position - 1] / 2
+        : 0;
+    const ahead = (i) => (share ? share * (clean[i] - earlier[i]) : 0);
     x = x.map(
       (value, i) =>
-        signal * clean[i] +
-        drift * (value - Math.sqrt(now) * estimate[i]) +
+        signal * (clean[i] + ahead(i)) +
+        drift * (value - Math.sqrt(now) * (estimate[i] + ahead(i))) +
         (fresh ? Math.sqrt(variance) * fresh[i] : 0),
     );
+    earlier = clean;
   }
   return x;
 }

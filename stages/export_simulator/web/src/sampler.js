@@ -123,7 +123,7 @@ export class Sampler {
       denoise(codes.full, keepGoal),
       denoise(codes.withoutObserver, commanded ? 1 : 0),
       noise,
-      { method: 'ddim', count: steps, interactivity, correct },
+      { method: 'dpm_solver', count: steps, interactivity, correct },
     );
     const pull = commanded ? 1 : keepGoal * Math.min(interactivity, 1);
     return this.snappedPaths(drawn, goals, codes.start, pull);
@@ -204,7 +204,7 @@ export class Sampler {
       });
     const faint = noise.map((value) => value * this.contract.sampling.body_noise_std);
     return this.run(denoise(codes.full), denoise(codes.withoutObserver), faint, {
-      method: 'ddim',
+      method: 'dpm_solver',
       count: steps,
       interactivity: Math.min(interactivity, 1),
     });
