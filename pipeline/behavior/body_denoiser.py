@@ -84,27 +84,31 @@ class GaussianPrior(nn.Module):
         """Return the expected sequence given a posture."""
         return self.basis @ (self.weight * self.project(posture))
 
+    def coefficients(
+        self, residual: Float[Tensor, "batch channel frame"]
+    ) -> Float[Tensor, "batch component frequency"]:
+        """Return the coefficients of noisy sequences less their mean given the posture."""
+        return self.project(residual) @ self.cosines
+
     def whitened(
-        self, residual: Float[Tensor, "batch channel frame"], t: Float[Tensor, "batch"]
+        self, coefficients: Float[Tensor, "batch component frequency"], t: Float[Tensor, "batch"]
     ) -> Float[Tensor, "batch corrected frame"]:
-        """Return the leading components of noisy sequences less their mean given the posture, with unit
-        variance at every step, frame and frequency.
-        """
-        leading = (self.project(residual) @ self.cosines)[:, : self.corrected]
-        return (leading / self.noisy_std(t)[:, : self.corrected]) @ self.cosines.transpose(0, 1)
+        """Return the leading components with unit variance at every step, frame and frequency."""
+        leading = coefficients[:, : self.corrected] / self.noisy_std(t)[:, : self.corrected]
+        return leading @ self.cosines.transpose(0, 1)
 
     def noise(
         self,
-        residual: Float[Tensor, "batch channel frame"],
+        coefficients: Float[Tensor, "batch component frequency"],
         velocity: Float[Tensor, "batch corrected frame"],
         t: Float[Tensor, "batch"],
     ) -> Float[Tensor, "batch channel frame"]:
         """Return the noise in sequences: its best linear estimate, corrected by a predicted velocity in the
         units of `whitened`.
         """
-        noisy_std, coefficients = self.noisy_std(t), self.project(residual) @ self.cosines
+        noisy_std = self.noisy_std(t)
         correction = self.signal[t.long()][:, None, None] * (self.std / noisy_std)[:, : self.corrected]
-        correction = correction * (velocity.to(residual.dtype) @ self.cosines)
+        correction = correction * (velocity.to(coefficients.dtype) @ self.cosines)
         linear = self.sigma[t.long()][:, None, None] / noisy_std.square() * coefficients
         corrected = torch.cat([linear[:, : self.corrected] + correction, linear[:, self.corrected :]], dim=1)
         return self.basis @ (corrected @ self.cosines.transpose(0, 1))
@@ -159,11 +163,12 @@ class BodyDenoiser(nn.Module):
         keep: Float[Tensor, "batch 1"],
     ) -> Float[Tensor, "batch channel frame"]:
         posture, step, heading = self.posture(x, t, condition, control)
-        residual = x - self.sqrt_alpha_bar[t.long()][:, None, None] * self.prior.mean(posture)
+        expected = self.sqrt_alpha_bar[t.long()][:, None, None] * self.prior.mean(posture)
+        coefficients = self.prior.coefficients(x - expected)
         unet_control = torch.cat([control, step * self.rate_hz, heading], dim=1)
-        whitened = self.prior.whitened(residual, t)
+        whitened = self.prior.whitened(coefficients, t)
         output = self.unet.velocity(whitened, t, condition, unet_control, keep)
-        return self.prior.noise(residual, self.gated(output, whitened), t)
+        return self.prior.noise(coefficients, self.gated(output, whitened), t)
 
     def gated(
         self, output: Float[Tensor, "batch output frame"], whitened: Float[Tensor, "batch corrected frame"]

@@ -43,16 +43,16 @@ def test_a_prior_that_is_not_fitted_is_v_prediction_of_the_residual():
     x, velocity = torch.randn(2, 3, ROOT + BONES, FRAMES)
     t = torch.tensor([0.0, 20.0, 49.0])
     torch.testing.assert_close(prior.mean(x), x, atol=1e-5, rtol=0)
-    torch.testing.assert_close(prior.whitened(x, t), x, atol=1e-5, rtol=0)
+    torch.testing.assert_close(prior.whitened(prior.coefficients(x), t), x, atol=1e-5, rtol=0)
     expected = NoiseFromVelocity(Schedule())(x, velocity, t)
-    torch.testing.assert_close(prior.noise(x, velocity, t), expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(prior.noise(prior.coefficients(x), velocity, t), expected, atol=1e-5, rtol=0)
 
 
 def test_the_unet_reads_leading_components_of_unit_variance():
     prior = fitted()
     for t in (0, 20, 49):
         residual, _, step = noisy_residual(prior, t)
-        whitened = prior.whitened(residual, step)
+        whitened = prior.whitened(prior.coefficients(residual), step)
         assert whitened.shape == (2048, ROOT + 4, FRAMES)
         assert (whitened[:, ROOT:].var((0, 2)) - 1).abs().max() < 0.15
 
@@ -63,9 +63,9 @@ def test_without_a_correction_the_noise_is_the_best_linear_estimate():
     for t in (5, 15, 30):
         residual, noise, step = noisy_residual(prior, t)
         zero = torch.zeros(len(residual), prior.corrected, FRAMES)
-        error = (prior.noise(residual, zero, step) - noise)[:, ROOT:].square().mean()
+        error = (prior.noise(prior.coefficients(residual), zero, step) - noise)[:, ROOT:].square().mean()
         zero = torch.zeros(len(residual), plain.corrected, FRAMES)
-        alone = (plain.noise(residual, zero, step) - noise)[:, ROOT:].square().mean()
+        alone = (plain.noise(plain.coefficients(residual), zero, step) - noise)[:, ROOT:].square().mean()
         assert error < 0.4 * alone
 
 
@@ -79,7 +79,7 @@ def test_samples_have_the_covariance_of_the_data():
 
     def denoise(x, t):
         share = schedule.alpha_bar[int(t)] ** 0.5
-        return prior.noise(x - share * mean, zero, torch.full((1024,), t))
+        return prior.noise(prior.coefficients(x - share * mean), zero, torch.full((1024,), t))
 
     noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(4))
     drawn = sample(denoise, noise, schedule, method="dpm_solver", count=100)

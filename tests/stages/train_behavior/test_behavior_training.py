@@ -128,7 +128,8 @@ def linear_error(prior, posture, clean, t=20):
     share = torch.tensor(Schedule().alpha_bar[t]).float()
     residual = noised(clean, noise, share) - share.sqrt() * prior.mean(posture)
     zero = torch.zeros(len(clean), prior.corrected, clean.shape[-1])
-    return (prior.noise(residual, zero, torch.full((len(clean),), float(t))) - noise).square().mean((0, 2))
+    step = torch.full((len(clean),), float(t))
+    return (prior.noise(prior.coefficients(residual), zero, step) - noise).square().mean((0, 2))
 
 
 def test_bodies_have_a_prior_unless_they_are_regressed_or_trained_as_in_the_paper(data):
