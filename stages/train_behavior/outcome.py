@@ -21,7 +21,7 @@ from stages.train_behavior.training import TrainedBehavior
 SCENE_CHANNELS: dict[SceneEncoder, int] = {"pillars": 32, "volume": 128, "none": 0}
 """Width of the scene encoder: 32 suffices for minutes of video, 128 is the paper's (appendix A.2)."""
 BODY_COMPONENTS = 24
-"""Principal components of bones that the UNet of bodies corrects: 99 % of the variance of a cat's bones."""
+"""Principal components of bones that the UNet of bodies corrects: 93 % of the variance of a cat's bones."""
 
 
 def preconditioned(config: Config) -> bool:
