@@ -13,6 +13,7 @@ import av
 import av.container
 import av.error
 import numpy as np
+from av.video.reformatter import ColorPrimaries, ColorTrc, VideoReformatter
 from jaxtyping import Float, UInt8
 
 from pipeline.data.images import MAX_PIXELS
@@ -33,6 +34,8 @@ MIN_SLOWDOWN = 3.0
 halves the rate of an ordinary video"""
 MAX_ASPECT = 2.0
 """maximum pixel aspect ratio; a larger one is a broken header"""
+HDR = (ColorTrc.ARIB_STD_B67, ColorTrc.SMPTE2084)
+"""transfer curves of video with a high dynamic range: HLG (iPhone, also Dolby Vision), PQ (HDR10, HDR10+)"""
 
 
 class Movie:
@@ -52,6 +55,7 @@ class Movie:
             aspect = float(stream.sample_aspect_ratio or 1) if square_pixels else 1.0
         self._decoder: Iterator[av.VideoFrame] | None = None
         self._position = 0
+        self._tone_mapper = VideoReformatter()
         first = self._first()
         stretch = aspect if 1 / MAX_ASPECT <= aspect <= MAX_ASPECT else 1.0
         self.size = (first.height, round(first.width * stretch))
@@ -72,10 +76,21 @@ class Movie:
             if frame.pts > wanted:  # the wanted frame is lost; keep this one for the next call
                 self._decoder = itertools.chain([frame], self._decoder)
                 return None
-            height, width = self.size
-            return None if frame.is_corrupt else frame.to_ndarray(format="rgb24", width=width, height=height)
+            return None if frame.is_corrupt else self._rgb(frame)
         self._decoder = iter(())
         return None
+
+    def _rgb(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "height width 3"]:
+        """Convert to 8 bits; HDR to sRGB, clipped above diffuse white (203 cd/m2, ITU-R BT.2408)."""
+        (height, width), hdr = self.size, frame.color_trc in HDR
+        kind = "gbrp16le" if hdr else "rgb24"  # FFmpeg 8 mixes the channels of rgb48le where widths are odd
+        rgb = frame.to_ndarray(format=kind, width=width, height=height)
+        if not hdr:
+            return rgb
+        plain = av.VideoFrame.from_ndarray(rgb, format=kind)  # without its peak, which would become white
+        plain.color_trc, plain.color_primaries = frame.color_trc, frame.color_primaries
+        target = {"dst_color_trc": ColorTrc.IEC61966_2_1, "dst_color_primaries": ColorPrimaries.BT709}
+        return self._tone_mapper.reformat(plain, format="rgb24", **target).to_ndarray()
 
     def _first(self) -> av.VideoFrame:
         frame = next((frame for frame in self._decoded_from(0)), None)

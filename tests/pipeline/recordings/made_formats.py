@@ -42,6 +42,7 @@ def write_movie(
     options: dict[str, str] | None = None,
     tags: dict[str, str] | None = None,
     aspect: Fraction = Fraction(1),
+    pixels: str = "yuv444p",
 ) -> None:
     """Write a video; `tags` are the file's, `aspect` is a pixel's width over its height."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -50,7 +51,7 @@ def write_movie(
         encoder = {"crf": "4", "preset": "ultrafast", "g": str(key_every)} if options is None else options
         stream = container.add_stream(codec, rate=rate, options=encoder)
         stream.codec_context.sample_aspect_ratio = aspect
-        stream.height, stream.width, stream.pix_fmt = *pictures[0].shape[:2], "yuv444p"
+        stream.height, stream.width, stream.pix_fmt = *pictures[0].shape[:2], pixels
         stream.time_base = Fraction(1, rate)
         for number, picture in enumerate(pictures):
             frame = av.VideoFrame.from_ndarray(picture, format="rgb24")

@@ -345,6 +345,38 @@ def test_pictures_stored_behind_a_later_key_frame_are_found(tmp_path):
         assert found is not None and abs(float(found.mean()) - 5 * number) < 3, number
 
 
+BT2020_FROM_BT709 = np.array([[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]])
+MASTERED = "G(8500,39850)B(6550,2300)R(35400,14600)WP(15635,16450)L(10000000,1)"
+"""on a display of 1000 cd/m2, as Samsung writes"""
+
+
+def _hdr(srgb, curve):
+    """Encode a picture whose white is 203 cd/m2 (ITU-R BT.2408) by the curves of ITU-R BT.2100, 0..1."""
+    shown = 0.203 * images.linear_from_srgb(srgb / 255) @ BT2020_FROM_BT709.T  # of 1000 cd/m2
+    if curve == "smpte2084":
+        power = (shown / 10) ** 0.1593017578125
+        return ((0.8359375 + 18.8515625 * power) / (1 + 18.6875 * power)) ** 78.84375
+    light = shown * (shown @ [0.2627, 0.6780, 0.0593])[..., None] ** (1 / 1.2 - 1)
+    dark, bright = np.sqrt(3 * light), np.log(np.maximum(12 * light - 0.28466892, 0.1))
+    return np.where(light < 1 / 12, dark, 0.17883277 * bright + 0.55991073)
+
+
+@pytest.mark.slow  # tables of colours, once per video
+@pytest.mark.parametrize("curve", ["arib-std-b67", "smpte2084"])
+def test_hdr_has_the_colours_of_an_ordinary_video(tmp_path, curve):
+    """iPhone writes HLG, Samsung PQ: as they are they look washed out. 8 bits of HDR tell 8 levels apart."""
+    color = np.array([[40, 40, 40], [128, 128, 128], [235, 235, 235], [200, 40, 40], [224, 172, 140]])
+    picture = np.repeat(np.repeat(color[None], 32, axis=0), 32, axis=1)
+    stored = np.rint(255 * _hdr(picture, curve)).astype(np.uint8)
+    tags = f"colorprim=bt2020:transfer={curve}:colormatrix=smpte170m:hdr10=1:master-display={MASTERED}"
+    encoder = {"codec": "libx265", "options": {"x265-params": f"log-level=none:crf=4:{tags}"}}
+    shape = {"aspect": Fraction(161, 160), "pixels": "yuv420p"}  # of odd width
+    made_formats.write_movie(tmp_path / "a.mov", [stored] * 3, **encoder, **shape)
+    found = Movie(tmp_path / "a.mov", square_pixels=True).read(1)
+    assert found.shape == (32, 161, 3)
+    np.testing.assert_allclose(found[16, 16::32], color, atol=8)
+
+
 @pytest.mark.parametrize(("captured", "times_slower"), [("240.0", 8), ("60.0", 1), ("1", 1 / 30), ("?", 1)])
 def test_slow_motion_of_android_has_the_times_of_life(tmp_path, captured, times_slower):
     """An ordinary video of 60 pictures a second falls to 30 in dim light, and keeps its times."""
