@@ -13,6 +13,7 @@ import av
 import av.container
 import av.error
 import numpy as np
+from av.stream import Disposition
 from av.video.reformatter import ColorPrimaries, ColorTrc, VideoReformatter
 from jaxtyping import Float, UInt8
 
@@ -44,8 +45,7 @@ class Movie:
     def __init__(self, path: Path, *, square_pixels: bool = False) -> None:
         self.where = str(path)
         self._path = path
-        with self._opened() as container:
-            stream = container.streams.video[0]
+        with self._opened() as (container, stream):
             times = sorted(set(_packet_times(container, stream)))
             if not times or stream.time_base is None:
                 raise no_frames(self.where, "the video is empty")
@@ -114,8 +114,7 @@ class Movie:
 
     def _decoded_from_key_frame(self, number: int) -> Iterator[av.VideoFrame]:
         """Yield decoded frames from the key frame at or before ``number``, skipping damaged packets."""
-        with self._opened() as container:
-            stream = container.streams.video[0]
+        with self._opened() as (container, stream):
             if number:
                 container.seek(int(self._pts[number]), stream=stream, backward=True)
             packets = container.demux(stream)
@@ -131,7 +130,8 @@ class Movie:
                     continue
 
     @contextlib.contextmanager
-    def _opened(self) -> Iterator[av.container.InputContainer]:
+    def _opened(self) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
+        """Open the file and its main video."""
         try:
             container = av.open(str(self._path), options=_GUARDS, metadata_errors="replace")
         except (av.error.FFmpegError, OSError) as error:
@@ -139,13 +139,20 @@ class Movie:
         with container:
             if not container.streams.video:
                 raise no_frames(self.where, "the file holds no pictures")
-            codec = container.streams.video[0].codec_context
+            stream = max(container.streams.video, key=_rank)
+            codec = stream.codec_context
             if codec is None:
                 raise damaged(self.where, "the video is of an unknown codec")
             if codec.width * codec.height > MAX_PIXELS:
                 why = f"pictures of {codec.width} x {codec.height}, larger than any phone's"
                 raise damaged(self.where, why)
-            yield container
+            yield container, stream
+
+
+def _rank(stream: av.VideoStream) -> tuple[bool, int]:
+    """Order a file's videos: covers and stills of live photos, previews and other smaller ones, the main."""
+    codec, cover = stream.codec_context, stream.disposition & Disposition.attached_pic
+    return stream.frames != 1 and not cover, 0 if codec is None else codec.width * codec.height
 
 
 def _slowdown(shown_s: Float[np.ndarray, "frame"], capture_rate: str) -> float:

@@ -8,6 +8,7 @@ import json
 import struct
 from fractions import Fraction
 
+import av
 import numpy as np
 import pytest
 import trimesh
@@ -375,6 +376,30 @@ def test_hdr_has_the_colours_of_an_ordinary_video(tmp_path, curve):
     found = Movie(tmp_path / "a.mov", square_pixels=True).read(1)
     assert found.shape == (32, 161, 3)
     np.testing.assert_allclose(found[16, 16::32], color, atol=8)
+
+
+def _remux(path, source, *, still=False, **options):
+    """Copy a video to another file, behind a track of one still picture, like the one of a live photo."""
+    with av.open(str(source)) as read, av.open(str(path), "w", options=options) as written:
+        first = written.add_stream("mjpeg", rate=1) if still else None
+        track = written.add_stream_from_template(read.streams.video[0])
+        if first is not None:
+            first.width, first.height, first.pix_fmt = 128, 96, "yuvj420p"
+            written.mux(first.encode(av.VideoFrame(128, 96, "yuvj420p")))
+            written.mux(first.encode())
+        for packet in read.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = track
+                written.mux(packet)
+
+
+def test_a_still_picture_before_the_video_is_none(tmp_path):
+    made = walk(12)
+    made_formats.write_movie(tmp_path / "a.mp4", [made.color(i) for i in range(12)])
+    _remux(tmp_path / "live.mov", tmp_path / "a.mp4", still=True)
+    movie = Movie(tmp_path / "live.mov")
+    assert len(movie) == 12
+    assert np.abs(movie.read(5).astype(int) - made.color(5)).mean() < 0.6
 
 
 @pytest.mark.parametrize(("captured", "times_slower"), [("240.0", 8), ("60.0", 1), ("1", 1 / 30), ("?", 1)])
