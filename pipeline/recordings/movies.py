@@ -59,7 +59,7 @@ class Movie:
         first = self._first()
         stretch = aspect if 1 / MAX_ASPECT <= aspect <= MAX_ASPECT else 1.0
         self.size = (first.height, round(first.width * stretch))
-        self.quarter_turns = round(-first.rotation / 90) % 4
+        self.quarter_turns = _quarter_turns(first)
 
     def __len__(self) -> int:
         return len(self._pts)
@@ -153,6 +153,13 @@ def _rank(stream: av.VideoStream) -> tuple[bool, int]:
     """Order a file's videos: covers and stills of live photos, previews and other smaller ones, the main."""
     codec, cover = stream.codec_context, stream.disposition & Disposition.attached_pic
     return stream.frames != 1 and not cover, 0 if codec is None else codec.width * codec.height
+
+
+def _quarter_turns(frame: av.VideoFrame) -> int:
+    """Return the clockwise quarter turns to upright; a picture mirrored for display is left as it is."""
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    down_x, down_y = (0, 1) if matrix is None else np.frombuffer(bytes(matrix), np.int32)[3:5].tolist()
+    return round(np.arctan2(-down_x, down_y) / (np.pi / 2)) % 4
 
 
 def _slowdown(shown_s: Float[np.ndarray, "frame"], capture_rate: str) -> float:

@@ -402,6 +402,14 @@ def test_a_still_picture_before_the_video_is_none(tmp_path):
     assert np.abs(movie.read(5).astype(int) - made.color(5)).mean() < 0.6
 
 
+@pytest.mark.parametrize("turns", range(4))
+def test_a_mirrored_display_is_turned_alone(tmp_path, turns):
+    """A selfie app may have players mirror what the camera saw."""
+    made_formats.write_movie(tmp_path / "a.mp4", [walk(3).color(i) for i in range(3)])
+    _turn_track(tmp_path / "a.mp4", turns, mirrored=True)
+    assert Movie(tmp_path / "a.mp4").quarter_turns == turns
+
+
 @pytest.mark.parametrize(("captured", "times_slower"), [("240.0", 8), ("60.0", 1), ("1", 1 / 30), ("?", 1)])
 def test_slow_motion_of_android_has_the_times_of_life(tmp_path, captured, times_slower):
     """An ordinary video of 60 pictures a second falls to 30 in dim light, and keeps its times."""
@@ -565,12 +573,13 @@ def test_the_rotation_tag_of_a_video_makes_it_upright(tmp_path, turns):
     assert np.abs(frame.color.astype(int) - upright.color(plan.chosen[2])).mean() < 4
 
 
-def _turn_track(path, turns):
+def _turn_track(path, turns, *, mirrored=False):
     """Write clockwise quarter turns into the display matrix (16.16 fixed point) of the track header."""
     cosine, sine = [(1, 0), (0, 1), (-1, 0), (0, -1)][turns]
+    right = -1 if mirrored else 1
     data = bytearray(path.read_bytes())
     at = data.find(b"tkhd") + 4 + 40
-    for place, value in ((0, cosine), (1, sine), (3, -sine), (4, cosine)):
+    for place, value in ((0, right * cosine), (1, right * sine), (3, -sine), (4, cosine)):
         struct.pack_into(">i", data, at + 4 * place, value << 16)
     path.write_bytes(data)
 
