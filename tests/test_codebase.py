@@ -7,7 +7,7 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 58_010,
+    "lines": 58_020,
     "lines over 110 columns": 0,
     "recipe keys": 326,
     "packages over 16 modules": 0,

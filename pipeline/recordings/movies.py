@@ -46,7 +46,7 @@ class Movie:
         self.where = str(path)
         self._path = path
         with self._opened() as (container, stream):
-            times = sorted(set(_packet_times(container, stream)))
+            times = sorted(_cut_off(stream, path.stat().st_size).union(_packet_times(container, stream)))
             if not times or stream.time_base is None:
                 raise no_frames(self.where, "the video is empty")
             self._pts = np.array(times)
@@ -160,6 +160,12 @@ def _quarter_turns(frame: av.VideoFrame) -> int:
     matrix = frame.side_data.get("DISPLAYMATRIX")
     down_x, down_y = (0, 1) if matrix is None else np.frombuffer(bytes(matrix), np.int32)[3:5].tolist()
     return round(np.arctan2(-down_x, down_y) / (np.pi / 2)) % 4
+
+
+def _cut_off(stream: av.VideoStream, size_bytes: int) -> set[int]:
+    """Return the times of frames that are listed beyond the end of a file which was not copied completely."""
+    listed = stream.index_entries
+    return {entry.timestamp for entry in listed if entry.pos + entry.size > size_bytes}
 
 
 def _slowdown(shown_s: Float[np.ndarray, "frame"], capture_rate: str) -> float:

@@ -402,6 +402,18 @@ def test_a_still_picture_before_the_video_is_none(tmp_path):
     assert np.abs(movie.read(5).astype(int) - made.color(5)).mean() < 0.6
 
 
+def test_a_copy_that_was_cut_off_lacks_its_last_pictures(tmp_path):
+    made = walk(40)
+    made_formats.write_movie(tmp_path / "a.mp4", [made.color(i) for i in range(40)])
+    _remux(tmp_path / "b.mp4", tmp_path / "a.mp4", movflags="faststart")
+    data = (tmp_path / "b.mp4").read_bytes()
+    (tmp_path / "b.mp4").write_bytes(data[: len(data) * 2 // 3])
+    movie = Movie(tmp_path / "b.mp4")
+    assert len(movie) == 40
+    lost = [movie.read(i) is None for i in range(40)]
+    assert lost == sorted(lost) and 5 < sum(lost) < 35
+
+
 @pytest.mark.parametrize("turns", range(4))
 def test_a_mirrored_display_is_turned_alone(tmp_path, turns):
     """A selfie app may have players mirror what the camera saw."""
