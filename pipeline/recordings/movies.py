@@ -17,6 +17,7 @@ from av.stream import Disposition
 from av.video.reformatter import ColorPrimaries, ColorTrc, VideoReformatter
 from jaxtyping import Float, UInt8
 
+from pipeline.core.errors import InputError
 from pipeline.data.images import MAX_PIXELS
 from pipeline.recordings.recording import damaged, no_frames
 
@@ -144,8 +145,8 @@ class Movie:
             if codec is None:
                 raise damaged(self.where, "the video is of an unknown codec")
             if codec.width * codec.height > MAX_PIXELS:
-                why = f"pictures of {codec.width} x {codec.height}, larger than any phone's"
-                raise damaged(self.where, why)
+                what = f"pictures of {codec.width} x {codec.height}, larger than any phone's"
+                raise InputError("CAP-001", what, self.where, "export it in 4K")
             yield container, stream
 
 

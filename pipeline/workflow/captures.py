@@ -35,6 +35,8 @@ _ANIMAL = re.compile(r"[a-z][a-z0-9-]{0,30}\Z")
 _NAMED = re.compile(r"turnaround_([a-z][a-z0-9-]*)")
 TABLES = (".csv", ".npz")
 """Suffixes of tables of motion."""
+ICLOUD = ".icloud"
+"""Suffix of the hidden placeholder of a file that macOS has moved to iCloud."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +62,9 @@ def find(folder: Path, flow: Flow = "recordings") -> list[str]:
 
 
 def _visible(folder: Path) -> list[Path]:
-    """Return the entries of a folder except hidden ones, sorted by name."""
+    """Return the entries of a folder except hidden ones, but with those in iCloud, sorted by name."""
     found = sorted(folder.iterdir()) if folder.is_dir() else []
-    return [path for path in found if not path.name.startswith(".")]
+    return [path for path in found if not path.name.startswith(".") or path.suffix == ICLOUD]
 
 
 def unknown_files(folder: Path, flow: Flow = "recordings") -> list[str]:
@@ -77,6 +79,8 @@ def named(path: Path, flow: Flow = "recordings") -> str:
     """Return an unknown file's name for a message, with the reason why it is unusable if known."""
     if not path.exists():
         return f"{path.name!r} (a link that leads nowhere)"
+    if path.suffix == ICLOUD:
+        return f"{path.name!r} (only in iCloud: download it in Finder)"
     inner = find(path, flow)
     return f"{path.name!r} (move {inner[0]!r} out of it: that is one)" if inner else repr(path.name)
 

@@ -39,7 +39,8 @@ def main(arguments: list[str]) -> int:
         print(f"{printable(verdict.text)}\n", flush=True)
     for name in captures.unknown_files(given.folder):
         named = printable(captures.named(given.folder / name))
-        print(f"{named}  left alone: not a recording of a known format (CAP-003)\n")
+        known = "not a recording of a known format (CAP-003); convert other videos to .mp4"
+        print(f"{named}  left alone: {known}\n")
     missing = captures.missing_roles([role for _, role in files])
     for role, what in missing:
         print(f"CAP-040 there is no {role} among the recordings\n    -> add {what}")

@@ -201,6 +201,7 @@ def test_what_is_amiss_with_a_stranger_is_told(house):
         (["plan", "toy"], {**RECORDED, "captures/toy/b\udcff.r3d": "x"}, "CAP-041"),
         (["new", "clean", "test", "clean"], {}, "REC-004"),
         (["plan", "toy"], {"captures/toy/session.heic": "x"}, "CAP-003"),
+        (["plan", "toy"], {"captures/toy/.walkthrough.r3d.icloud": "x"}, "CAP-003"),
         (["plan", "toy"], {"captures/toy/walkthrough.r3d": "x", "captures/toy/a.r3d": "x"}, "CAP-040"),
     ],
 )

@@ -241,6 +241,7 @@ def test_the_program_tells_all_and_fails_where_a_build_would(tmp_path, capsys):
     (tmp_path / "exported").mkdir()
     (tmp_path / "exported/metadata.json").write_text("{")
     (tmp_path / "notes.txt").write_text("x")
+    (tmp_path / ".monday.mov.icloud").write_text("x")
     (tmp_path / "b\udcff.r3d").write_bytes(b"PK")
     assert front.main([str(tmp_path)]) == 2
     describe_capture = capsys.readouterr().out
@@ -251,7 +252,8 @@ def test_the_program_tells_all_and_fails_where_a_build_would(tmp_path, capsys):
         "CAP-001",
         "CAP-004 metadata.json: ",
         "notes.txt",
-        "CAP-003",
+        "'.monday.mov.icloud' (only in iCloud: download it in Finder)",
+        "CAP-003); convert other videos to .mp4",
         "CAP-040",
         "turnaround",
     ):
