@@ -10,7 +10,7 @@ from itertools import product
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipeline.geometry import cameras, rigid
 from pipeline.geometry.subsampling import evenly
@@ -112,7 +112,7 @@ def check_poses(
     broken = "the recording has no device poses" if pose is None else _invalid_reason(pose)
     if pose is None or broken:
         return PoseCheck("unusable", documented, 0, np.nan, np.nan, TOLERANCE_M, broken)
-    chosen = _moving_pairs(odometry_from_pose(pose, documented), timestamp_s, pairs)
+    chosen = moving_pairs(odometry_from_pose(pose, documented), timestamp_s, pairs)
     if len(chosen) == 0:
         reason = "the phone moved too little to test its poses"
         return PoseCheck("untested", documented, 0, np.nan, np.nan, TOLERANCE_M, reason)
@@ -148,11 +148,14 @@ def _invalid_reason(pose: Float[np.ndarray, "frame 7"]) -> str:
     return ""
 
 
-def _moving_pairs(
-    odometry_from_camera: Float[np.ndarray, "frame 4 4"], timestamp_s: Float[np.ndarray, "frame"], pairs: int
-) -> np.ndarray:
+def moving_pairs(
+    odometry_from_camera: Float[np.ndarray, "frame 4 4"],
+    timestamp_s: Float[np.ndarray, "frame"],
+    pairs: int,
+    gap_s: float = GAP_S[0],
+) -> Int[np.ndarray, "pair 2"]:
     """Pick up to ``pairs`` frame pairs with time and motion between them, spread over the recording."""
-    second = np.searchsorted(timestamp_s, timestamp_s + GAP_S[0])
+    second = np.searchsorted(timestamp_s, timestamp_s + gap_s)
     first = np.flatnonzero(second < len(timestamp_s))
     second = second[first]
     relative = rigid.inverse(odometry_from_camera[first]) @ odometry_from_camera[second]
@@ -161,7 +164,7 @@ def _moving_pairs(
     )
     if len(first) == 0:
         return np.zeros((0, 2), int)
-    longest_s = max(GAP_S[1], GAP_FRAMES * float(np.median(np.diff(timestamp_s))))
+    longest_s = max(gap_s - GAP_S[0] + GAP_S[1], GAP_FRAMES * float(np.median(np.diff(timestamp_s))))
     close = timestamp_s[second] - timestamp_s[first] <= longest_s
     usable = np.stack([first, second], axis=1)[moved & close]
     return usable[evenly(len(usable), pairs, rounded=True)]

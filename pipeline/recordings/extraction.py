@@ -15,6 +15,8 @@ from pipeline.core.errors import InputError
 from pipeline.data import images
 from pipeline.geometry import cameras, rigid
 from pipeline.geometry.subsampling import evenly
+from pipeline.mapping import picture_agreement
+from pipeline.mapping.picture_agreement import Agreement, PosedPicture
 from pipeline.recordings import conventions
 from pipeline.recordings.conventions import PoseCheck
 from pipeline.recordings.depth_camera import grid_size, reproject
@@ -39,6 +41,8 @@ NEAREST_TYPICAL_M, FARTHEST_TYPICAL = 0.1, 2.0
 """limits of the median depth: metres, and multiples of the maximum depth that is used"""
 MAX_STRETCHED = 0.03
 """maximum relative difference in aspect ratio between pictures and depth"""
+AGREEMENT_PAIRS, AGREEMENT_GAP_S, CLOCK_FRAMES = 40, 1.2, 2
+"""pairs of pictures whose agreement is checked, seconds between the two, and frames of `Clock`"""
 SHARPNESS_WIDTH_PX = 240
 DARK = 0.15
 """mean brightness (0..1) below which a picture loses quality"""
@@ -245,6 +249,42 @@ def frames(
             jpeg = images.encode_jpeg(color, jpeg_quality)
         sharpness, brightness = picture_statistics(color)
         yield ExtractedFrame(color, jpeg, depth, confidence, sharpness, brightness, float((depth > 0).mean()))
+
+
+def picture_agreement_of(recording: Recording, plan: ExtractionPlan, *, max_depth_m: float) -> Agreement:
+    """Check a recording's pictures against its depth, intrinsics and poses; without poses it is untested."""
+    if plan.odometry_from_camera is None:
+        return picture_agreement.check([])
+    pairs = conventions.moving_pairs(
+        plan.odometry_from_camera, plan.timestamp_s, AGREEMENT_PAIRS, AGREEMENT_GAP_S
+    )
+    around = (pairs >= CLOCK_FRAMES) & (pairs < len(plan.chosen) - CLOCK_FRAMES)
+    views = {
+        row: _posed_picture(recording, plan, row, max_depth_m) for row in np.unique(pairs[around.all(1)])
+    }
+    shown = [(views[first], views[second]) for first, second in pairs[around.all(1)].tolist()]
+    return picture_agreement.check([(a, b) for a, b in shown if a is not None and b is not None])
+
+
+def _posed_picture(
+    recording: Recording, plan: ExtractionPlan, row: int, max_depth_m: float
+) -> PosedPicture | None:
+    """Read one of the plan's frames and the depth around it, upright; None if its picture is damaged."""
+    color = picture(recording, int(plan.chosen[row]), plan.stored_size)
+    if color is None or plan.odometry_from_camera is None:
+        return None
+    rows = {"": row, "earlier": row - CLOCK_FRAMES, "later": row + CLOCK_FRAMES}
+    depth = {
+        clock: stored_depth(recording, int(recording.index[plan.chosen[other]]), max_depth_m)
+        for clock, other in rows.items()
+    }
+    return PosedPicture(
+        cv2.cvtColor(cameras.turn_image(color, plan.quarter_turns), cv2.COLOR_RGB2GRAY),
+        plan.intrinsics[row],
+        {clock: cameras.turn_image(each, plan.quarter_turns) for clock, each in depth.items()},
+        plan.depth_intrinsics[row],
+        {clock: plan.odometry_from_camera[other] for clock, other in rows.items()},
+    )
 
 
 def stored_depth(recording: Recording, number: int, max_depth_m: float) -> Float[np.ndarray, "height width"]:

@@ -62,6 +62,8 @@ REMEDIES = {
     "CAP-054": "keep the animal in view; if it rests all the time, point at it with a prompt",
     "CAP-055": "keep other animals and people out, or point at the animal with a prompt",
     "CAP-056": "walk sideways instead of turning on the spot, slowly, along things with a pattern",
+    "CAP-057": "copy the file unedited; check the unit of its depth, its intrinsics and what mirrored it",
+    "CAP-058": "leave poses out that are not its own; else move slowly, along things with a pattern",
 }
 
 
@@ -121,6 +123,11 @@ def _of_poses(seen: CaptureMeasurements) -> dict[str, str]:
         return {"CAP-050": f"device poses are not used: {plan.pose_check.reason}"}
     if plan.pose_check.verdict == "other":
         found["CAP-051"] = plan.pose_check.reason
+    agreement = seen.sample.agreement
+    if agreement is not None and agreement.verdict == "contradict":
+        found["CAP-057"] = f"its parts contradict each other: {agreement.reason} than as stored"
+    elif agreement is not None and agreement.verdict == "unconfirmed":
+        found["CAP-058"] = agreement.reason
     if seen.drift_m > MAX_DRIFT_M:
         found["CAP-052"] = f"device poses drift: {100 * seen.drift_m:.0f} cm between visits of one place"
     return found

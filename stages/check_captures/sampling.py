@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 
 from pipeline.geometry import rigid
 from pipeline.geometry.subsampling import evenly
+from pipeline.mapping.picture_agreement import Agreement
 from pipeline.recordings import extraction
 from pipeline.recordings.extraction import ExtractionPlan
 from pipeline.recordings.recording import Recording, damaged
@@ -56,6 +57,8 @@ class RecordingSample:
     shots: Sequence[SampledFrame]
     damaged: float
     """share of the sample (0..1) that cannot be decoded"""
+    agreement: Agreement | None = None
+    """of pictures with depth, intrinsics and device poses"""
 
     @property
     def duration_s(self) -> float:
@@ -124,7 +127,8 @@ def sample(recording: Recording, count: int, *, max_depth_m: float) -> Recording
             beyond = float((np.isfinite(raw) & (raw >= max_depth_m)).mean())
             shots.append(_shot(sample, position, frame, beyond))
     _refuse_empty(recording, shots)
-    return RecordingSample(recording, plan, shots, 1 - len(shots) / len(rows))
+    agreement = extraction.picture_agreement_of(recording, plan, max_depth_m=max_depth_m)
+    return RecordingSample(recording, plan, shots, 1 - len(shots) / len(rows), agreement)
 
 
 def _shot(plan: ExtractionPlan, row: int, frame: extraction.ExtractedFrame, beyond: float) -> SampledFrame:

@@ -38,7 +38,7 @@ def run(
         sources = _scale_sources(inputs.captures, video, videos)
         with tempfile.TemporaryDirectory() as workspace:
             mapped = photogrammetry.map_pictures(recording, sources, config, Path(workspace))
-        plan, frames, summary = mapped.plan, mapped.frames, mapped.summary
+        plan, frames, summary, agreement = mapped.plan, mapped.frames, mapped.summary, None
     else:
         reach = {"max_depth_m": config.max_depth_m}
         plan = extraction.understand(
@@ -46,7 +46,10 @@ def run(
         )
         frames = extraction.frames(recording, plan, jpeg_quality=config.jpeg_quality, **reach)
         summary = extraction.summary(recording, plan)
+        agreement = extraction.picture_agreement_of(recording, plan, **reach)
     progress.log(summary)
+    if agreement is not None:
+        progress.log(f"{agreement.reason}; correlation {agreement.correlation:.2f}")
     total = len(plan.chosen)
     tracked = progress.track(frames, "frames", total=total)
     written = writing.write_frames(
@@ -54,7 +57,7 @@ def run(
     )
     writing.write_table(out, recording, plan, written)
     writing.write_mesh(out, recording, plan)
-    writing.report_quality(out, plan, written, rate_hz=config.rate_hz)
+    writing.report_quality(out, plan, written, agreement, rate_hz=config.rate_hz)
 
 
 def _scale_sources(

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 from pipeline.core.errors import InputError
 from pipeline.data import images, ply, qa
 from pipeline.data.clips import FRAMES
+from pipeline.mapping.picture_agreement import Agreement
 from pipeline.recordings import extraction
 from pipeline.recordings.extraction import DARK, MEASURED, RELATIVE, ExtractedFrame, ExtractionPlan
 from pipeline.recordings.recording import Recording, damaged
@@ -104,7 +105,9 @@ def write_mesh(folder: Path, recording: Recording, plan: ExtractionPlan) -> None
         ply.write_ply(folder / "mesh.ply", recording.read_mesh())
 
 
-def report_quality(folder: Path, plan: ExtractionPlan, written: WrittenFrames, *, rate_hz: float) -> None:
+def report_quality(
+    folder: Path, plan: ExtractionPlan, written: WrittenFrames, agreement: Agreement | None, *, rate_hz: float
+) -> None:
     """Write the quality checks, the share of usable frames and a contact sheet."""
     timestamp_s = plan.timestamp_s[written.usable]
     duration_s = float(timestamp_s[-1] - timestamp_s[0])
@@ -125,6 +128,7 @@ def report_quality(folder: Path, plan: ExtractionPlan, written: WrittenFrames, *
         qa.Check("clockwise quarter turns applied", float(plan.quarter_turns)),
         qa.Check("device poses usable", with_poses, "", warn=0.5, better="higher"),
         _check_of_poses(plan),
+        *_check_of_pictures(agreement),
     ]
     pictures = [
         qa.Picture("contact_sheet", written.color_strip, "frames spread over the recording, as understood"),
@@ -150,6 +154,15 @@ def _check_of_poses(plan: ExtractionPlan) -> qa.Check:
     residual_mm = 1000 * check.residual_m if check.verdict in ("documented", "other") else None
     name = f"device poses against depth ({check.reason})"
     return qa.Check(name, residual_mm, "mm", warn=1000 * check.tolerance_m)
+
+
+def _check_of_pictures(agreement: Agreement | None) -> list[qa.Check]:
+    """Return the check of pictures against depth, intrinsics and poses, if they could be compared."""
+    if agreement is None or agreement.verdict == "untested":
+        return []
+    agreeing = {"agree": 1.0, "unconfirmed": 0.5, "contradict": 0.0}[agreement.verdict]
+    name = f"pictures against depth, intrinsics and poses ({agreement.reason})"
+    return [qa.Check(name, agreeing, "", warn=0.75, fail=0.25, better="higher")]
 
 
 def _thumbnail(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "_ _ 3"]:

@@ -19,18 +19,19 @@ from tests.stages.extract_frames.made_recordings import COLOR_SIZE, Made, walk
 
 
 class Textured(Made):
-    """A recording whose pictures have enough edges to be sharp."""
+    """A recording of walls with enough edges to be sharp."""
 
     brightness, sharp_until = 1.0, 10**6
 
     def color(self, frame: int) -> np.ndarray:
-        rng = np.random.default_rng(frame)
-        picture = (
-            rng.integers(30, 220, (*COLOR_SIZE, 3))
-            if frame < self.sharp_until
-            else np.full((*COLOR_SIZE, 3), 120)
-        )
-        return cameras.turn_image((self.brightness * picture).astype(np.uint8), self.quarter_turns)
+        size = self._size(COLOR_SIZE)
+        rays = cameras.ray_directions(self.intrinsics, *size)
+        camera = self.stored_from_upright(self.world_from_camera[frame])
+        walls = rigid.apply(camera, (rays * self._wall_m(rays, camera)[..., None]).reshape(-1, 3))
+        picture = textured_room.noise_color(walls, seed=0).reshape(*size, 3)
+        if frame >= self.sharp_until:
+            picture = np.full_like(picture, 120)
+        return (self.brightness * picture).astype(np.uint8)
 
 
 def _made(seconds: float = 10.0, turns: int = 0, rate_hz: float = 6.0) -> Textured:
@@ -96,9 +97,23 @@ def _drift(made):
     made.metadata["poses"] = inner.tolist()
 
 
+def _near(made):
+    inner = made.depth
+    made.depth = lambda frame: (inner(frame) / 2).astype("<f4")
+
+
+def _turning(made):
+    """Poses that turn away from the true ones by 4 deg a second."""
+    angle = 0.07 * made.timestamp_s
+    turned = rigid.make(rigid.rotation_from_yaw(angle), np.zeros((len(angle), 3)))
+    made.metadata["poses"] = (
+        dataclasses.replace(made, world_from_camera=turned @ made.world_from_camera).poses().tolist()
+    )
+
+
 FAULTS = {
     "CAP-032": _dark, "CAP-033": _blurred, "CAP-034": _gap, "CAP-037": _hollow, "CAP-038": _far, "CAP-050": _identity,
-    "CAP-051": _other_axes, "CAP-052": _drift,
+    "CAP-051": _other_axes, "CAP-052": _drift, "CAP-057": _near, "CAP-058": _turning,
 }  # fmt: skip
 
 

@@ -43,14 +43,12 @@ class Made:
         """Stored z-depth, metres: distance to the nearest wall of the room along each ray."""
         size, color_size = self._size(DEPTH_SIZE), self._size(COLOR_SIZE)
         rays = cameras.ray_directions(cameras.scale_intrinsics(self.intrinsics, color_size, size), *size)
-        camera = self.stored_from_upright(self.world_from_camera[frame])
-        direction, origin = rays @ camera[:3, :3].T, camera[:3, 3]
+        return self._wall_m(rays, self.stored_from_upright(self.world_from_camera[frame])).astype("<f4")
+
+    def _wall_m(self, rays: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
+        direction, origin = rays @ world_from_camera[:3, :3].T, world_from_camera[:3, 3]
         with np.errstate(divide="ignore"):
-            return (
-                np.where(direction > 0, (ROOM - origin) / direction, -origin / direction)
-                .min(-1)
-                .astype("<f4")
-            )
+            return np.where(direction > 0, (ROOM - origin) / direction, -origin / direction).min(-1)
 
     def stored_from_upright(self, world_from_camera: np.ndarray) -> np.ndarray:
         """Camera pose of the stored picture."""
