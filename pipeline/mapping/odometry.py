@@ -21,6 +21,10 @@ from pipeline.mapping.icp import DepthImage, IcpResult, align_views
 
 JUMP_M_S = 4.0
 """A step is a jump if faster than its neighbours by more than this, m/s: hands reach about 2 m/s."""
+SUSPECT_M_S = 0.8
+"""Likewise, where depth decides: a hand can do it, and so can a jump of 10 cm."""
+EXPLAINED_BETTER = 2.0
+"""A suspect step is a jump if its mean square depth error is this many times that of the motion around it."""
 MEDIAN_WINDOW = 5
 """Window of the median filter of speeds, steps."""
 MIN_STEP_S = 0.05
@@ -82,7 +86,7 @@ def correct_drift(
     Each keyframe is aligned to its predecessor and to at most ``loops`` earlier loop candidates.
     """
     view = functools.lru_cache(maxsize=CACHED_VIEWS)(view)
-    jumps = find_jumps(timestamp_s, odometry_from_camera)
+    jumps = find_jumps(timestamp_s, odometry_from_camera, view)
     odometry_from_camera = repair(timestamp_s, odometry_from_camera, jumps)
     inflation = np.where(jumps, JUMP_INFLATION, 1.0)[1:]
     sigma = np.repeat([SIGMA_RAD, SIGMA_M], 3)
@@ -222,18 +226,39 @@ def _solve(count, first, second, relative, residual, information) -> Float[np.nd
 
 
 def find_jumps(
-    timestamp_s: Float[np.ndarray, "frame"], odometry_from_camera: Float[np.ndarray, "frame 4 4"]
+    timestamp_s: Float[np.ndarray, "frame"],
+    odometry_from_camera: Float[np.ndarray, "frame 4 4"],
+    view: Callable[[int], DepthImage] | None = None,
 ) -> Bool[np.ndarray, "frame"]:
     """Return which frames follow a tracking jump; False for the first.
 
-    Only translation is tested: a phone can really turn as fast as a jump does.
+    Only fast translation is suspect: a phone can really turn as fast as a jump does. With ``view``, depth
+    decides on steps that a hand could do: a jump is refuted by it, and the motion around the step is not.
     """
     if len(timestamp_s) < 2:
         return np.zeros(len(timestamp_s), bool)
     step_m = np.linalg.norm(np.diff(odometry_from_camera[:, :3, 3], axis=0), axis=1)
     speed = step_m / np.maximum(np.diff(timestamp_s), MIN_STEP_S)
-    typical = scipy.ndimage.median_filter(speed, MEDIAN_WINDOW, mode="mirror")
-    return np.concatenate([[False], speed - typical > JUMP_M_S])
+    excess = np.r_[0.0, speed - scipy.ndimage.median_filter(speed, MEDIAN_WINDOW, mode="mirror")]
+    jumps = excess > JUMP_M_S
+    if view is None or len(timestamp_s) < MEDIAN_WINDOW:
+        return jumps
+    for frame in np.flatnonzero((excess > SUSPECT_M_S) & ~jumps).tolist():
+        suspect = jumps.copy()
+        suspect[frame] = True
+        repaired = repair(timestamp_s, odometry_from_camera, suspect)
+        error, otherwise = (_depth_error(view, frame, poses) for poses in (odometry_from_camera, repaired))
+        jumps[frame] = error > EXPLAINED_BETTER * otherwise
+    return jumps
+
+
+def _depth_error(
+    view: Callable[[int], DepthImage], frame: int, poses: Float[np.ndarray, "frame 4 4"]
+) -> float:
+    """Return the mean square depth difference of a frame and its predecessor, at most `REACH_M` squared."""
+    step = rigid.inverse(poses[frame - 1]) @ poses[frame]
+    found = align_views(view(frame - 1), view(frame), step, reach_m=REACH_M, iterations=1)
+    return found.overlap * found.residual_m**2 + (1 - found.overlap) * REACH_M**2
 
 
 def repair(

@@ -3,8 +3,10 @@
 import numpy as np
 
 from pipeline.geometry import rigid
+from pipeline.geometry.meshes import RayCaster, render_view
+from pipeline.mapping.icp import depth_image
 from pipeline.mapping.odometry import find_jumps, repair
-from tests.stages.textured_room import aligned_errors, drifting, walk
+from tests.stages.textured_room import INTRINSICS, SIZE, aligned_errors, drifting, textured_room, walk
 
 TIME_S = 0.1 * np.arange(60)
 
@@ -50,3 +52,19 @@ def test_what_hands_do_is_no_tear():
         jumps = find_jumps(time_s, odometry)
         assert not jumps.any()
         assert repair(time_s, odometry, jumps) is odometry
+
+
+def test_depth_decides_on_what_a_hand_could_do():
+    truth, caster = walk(60), RayCaster(textured_room(edge_m=0.5))
+
+    def view(frame):
+        depth, _ = render_view(caster, truth[frame], INTRINSICS, *SIZE)
+        return depth_image(depth, INTRINSICS, depth > 0, 2)
+
+    jumped = jumping(drifting(truth, 4, deg=0.03, m=0.001), 20, 0.25)
+    assert not find_jumps(TIME_S, jumped).any(), "2.5 m/s: without depth it may be a hand"
+    assert np.flatnonzero(find_jumps(TIME_S, jumped, view)).tolist() == [20]
+    dash = truth.copy()
+    dash[30:, :3, 3] += [0.0, 0.2, 0.0]
+    truth = dash
+    assert not find_jumps(TIME_S, dash, view).any(), "depth confirms that the phone moved"
