@@ -138,22 +138,27 @@ def check(pairs: Sequence[tuple[PosedPicture, PosedPicture]]) -> Agreement:
     found = []
     for reading in READINGS:
         values = np.array([correlation(*pair, reading) for pair in pairs])
-        if _beats(values, stored) and all(_beats(values, each) for each in decoys):
+        if beats(values, stored) and all(beats(values, each) for each in decoys):
             better = float(np.median(values[np.isfinite(values)])), int((values > stored).sum())
             found.append(Agreement("contradict", median, len(pairs), reading.what, *better))
     if found:
         return max(found, key=lambda each: each.better_correlation)
-    confirmed = all(_beats(stored, each) for each in decoys)
+    confirmed = all(beats(stored, each) for each in decoys)
     return Agreement("agree" if confirmed else "unconfirmed", median, len(pairs))
 
 
-def _beats(values: Float[np.ndarray, "pair"], others: Float[np.ndarray, "pair"]) -> bool:
-    """Return whether values are larger in significantly more than half of the pairs that both know."""
+def beats(
+    values: Float[np.ndarray, "sample"], others: Float[np.ndarray, "sample"], tests: int = len(READINGS)
+) -> bool:
+    """Return whether values are larger in significantly more than half of the samples that both know.
+
+    A sign test, corrected for as many ``tests`` (Bonferroni).
+    """
     known = np.isfinite(values) & np.isfinite(others)
     larger, count = int((values > others)[known].sum()), int(known.sum())
     if count < MIN_PAIRS:
         return False
-    limit = SIGNIFICANCE / len(READINGS)
+    limit = SIGNIFICANCE / tests
     return bool(binomtest(larger, count, 0.5, alternative="greater").pvalue < limit)
 
 

@@ -1,14 +1,15 @@
 """Recorded pictures and the template rendered from their poses, at half size, and their correlation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Num, UInt8
 
 from pipeline.data.clips import Clip, Masks
-from pipeline.geometry import cameras
-from pipeline.geometry.meshes import RayCaster, render_view
+from pipeline.geometry import cameras, rigid, subsampling
+from pipeline.geometry.meshes import Mesh, RayCaster, render_view
+from pipeline.mapping.picture_agreement import beats
 
 BLUR_PX = 9.0
 """Neighbourhood of the local contrast normalization, standard deviation in half-size pixels."""
@@ -23,6 +24,11 @@ FIT_M, MIN_SHARE = 0.05, 0.1
 of such pixels have no score."""
 SMOOTHING_PX, MIN_NORM = 1.5, 1e-9
 """Blur before correlation, half-size pixels, to match the template's smooth colours."""
+
+SIZES, SIZE_FRAMES = (0.8, 0.9, 1.1, 1.25), 40
+"""Other sizes of the animal's template that are compared with its own, and number of frames compared."""
+HIDDEN_M, MIN_ANIMAL = 0.05, 0.005
+"""Depth nearer than the animal by this hides it, metres; least share of a compared frame that it covers."""
 
 
 @dataclass(frozen=True)
@@ -87,3 +93,69 @@ def ncc(
     first, second = (cv2.GaussianBlur(each, (0, 0), SMOOTHING_PX)[comparable] for each in normalized)
     first, second = first - first.mean(), second - second.mean()
     return float(first @ second / max(np.linalg.norm(first) * np.linalg.norm(second), MIN_NORM))
+
+
+@dataclass(frozen=True)
+class AnimalSize:
+    """How well the template's silhouette fits the masks, in its own size and in the best other one."""
+
+    iou: float
+    """Median intersection over union in its own size; NaN if no frame shows enough."""
+    frames: int
+    better: float | None = None
+    """Factor on the size that fits significantly more frames better; None if there is none."""
+    better_iou: float = np.nan
+
+
+def compare_sizes(
+    clip: Clip,
+    masks: Masks,
+    agent: Mesh,
+    world_from_camera: Float[np.ndarray, "frame 4 4"],
+    world_from_agent: Float[np.ndarray, "frame 4 4"],
+) -> AnimalSize:
+    """Compare silhouettes of the placed template with the masks; other sizes stand on the same ground.
+
+    Legs and tail move, so even the right animal does not fill its mask. But no other size does it better,
+    unless the recording shows another animal than the turnaround, or lengths of the two differ.
+    """
+    placed = np.flatnonzero(np.isfinite(world_from_agent[:, 0, 0]))
+    frames = [int(placed[row]) for row in subsampling.evenly(len(placed), SIZE_FRAMES)] if len(placed) else []
+
+    def ious(factor: float) -> Float[np.ndarray, "compared"]:
+        vertices = factor * agent.vertices
+        vertices[:, 1] += agent.vertices[:, 1].min() - vertices[:, 1].min()
+        caster = RayCaster(replace(agent, vertices=vertices.astype(np.float32)))
+        return np.array(
+            [
+                _silhouette_iou(clip, masks, caster, frame, rigid.inverse(root) @ camera)
+                for frame, root, camera in zip(
+                    frames, world_from_agent[frames], world_from_camera[frames], strict=True
+                )
+            ]
+        )
+
+    own = ious(1.0)
+    known = int(np.isfinite(own).sum())
+    size = AnimalSize(float(np.nanmedian(own)) if known else np.nan, known)
+    for factor in SIZES:
+        other = ious(factor)
+        if beats(other, own, len(SIZES)):
+            iou = float(np.nanmedian(other))
+            size = replace(size, better=factor, better_iou=iou) if not iou <= size.better_iou else size
+    return size
+
+
+def _silhouette_iou(
+    clip: Clip, masks: Masks, caster: RayCaster, frame: int, agent_from_camera: Float[np.ndarray, "4 4"]
+) -> float:
+    """Return the silhouette's IoU with the mask where it is not hidden; NaN where the animal is too small."""
+    depth = clip.depth(frame)
+    labels = cv2.resize(masks[frame], depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    rendered, _ = render_view(caster, agent_from_camera, clip.depth_intrinsics[frame], *depth.shape)
+    animal, known = labels == 255, (labels != 128) & (depth > 0)
+    if animal.mean() < MIN_ANIMAL:
+        return np.nan
+    hidden = ~animal & (depth < rendered - HIDDEN_M)
+    silhouette, animal = (rendered > 0) & ~hidden & known, animal & known
+    return float((silhouette & animal).sum() / max((silhouette | animal).sum(), 1))

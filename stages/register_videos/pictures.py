@@ -9,6 +9,8 @@ from pipeline.data.clips import Clip
 from pipeline.data.qa import Check, Picture, captioned
 from pipeline.geometry import rigid, views
 from pipeline.geometry.meshes import RayCaster, render_view
+from pipeline.mapping.picture_agreement import MIN_PAIRS
+from stages.register_videos.comparison import AnimalSize
 from stages.register_videos.registration import Maps, Registered, Rejected
 
 EDGE_RGB, PHONE_RGB, ANIMAL_RGB, HEAD_RGB = (255, 60, 200), (40, 90, 220), (230, 120, 20), (250, 210, 60)
@@ -79,7 +81,20 @@ def checks(result: Registered | Rejected) -> list[Check]:
         Check("camera confidence", float(result.confidence.mean()), "mean probability", 0.6, 0.2, "higher"),
         Check("animal placed", float(result.roots.visible.mean()), "share of frames", 0.4, None, "higher"),
         Check("way walked head first", head_first(roots), "share", 0.5, None, "higher"),
+        *_size_checks(result.size),
     ]
+
+
+def _size_checks(size: AnimalSize | None) -> list[Check]:
+    """Return the check of the animal's size, if enough frames show it."""
+    if size is None or size.frames < MIN_PAIRS:
+        return []
+    iou = f"silhouette's IoU {size.iou:.2f}"
+    name = f"animal of the template's size ({iou})"
+    if size.better is not None:
+        better = f"{size.better:g} times the size gives {size.better_iou:.2f}"
+        name = f"animal of the template's size ({iou}, {better}: another animal, or other lengths?)"
+    return [Check(name, float(size.better is None), "", 0.5, None, "higher")]
 
 
 def head_first(world_from_agent: Float[np.ndarray, "frame 4 4"]) -> float | None:

@@ -18,6 +18,7 @@ from stages.register_videos import votes as voting
 from stages.register_videos.agent_fit import StandingSurface
 from stages.register_videos.agent_roots import Roots, find_roots
 from stages.register_videos.alignment import AlignedCameras
+from stages.register_videos.comparison import AnimalSize, compare_sizes
 from stages.register_videos.confidence import (
     agent_confidence,
     appearance_probability,
@@ -72,6 +73,8 @@ class Registered:
     inliers: Bool[np.ndarray, "vote"]
     appearance: float
     """Share of the frames that match their rendering better than renderings from wrong poses."""
+    size: AnimalSize | None = None
+    """The template's silhouette against the masks; None if the animal is not placed."""
 
     def poses(self, timestamp_s: Float[np.ndarray, "frame"]) -> RegisteredPoses:
         """Return what `poses.npz` holds, at the recording's times in seconds."""
@@ -138,15 +141,16 @@ def register(
         if reason is not None:
             return Rejected(reason, votes)
     confidence = camera_confidence(aligned.pose_covariance, appearance, start.anchored, rng)
-    roots = Roots.unseen(len(clip))
+    roots, size = Roots.unseen(len(clip)), None
     if config.animal:
         standing = StandingSurface(caster, maps.floor_m)
         cameras = aligned.world_from_camera
         roots = find_roots(clip, masks, maps.agent, standing, maps.agent_localizer, cameras, config.root, rng)
         log(f"the animal was placed in {int(roots.visible.sum())} of {len(clip)} frames")
-    return Registered(
-        aligned, confidence, roots, agent_confidence(roots), votes, start.inliers, float(appearance.mean())
-    )
+        size = compare_sizes(clip, masks, maps.agent, cameras, roots.world_from_agent)
+    share = float(appearance.mean())
+    certain = agent_confidence(roots)
+    return Registered(aligned, confidence, roots, certain, votes, start.inliers, share, size)
 
 
 @dataclass(frozen=True)
