@@ -25,6 +25,7 @@ from pipeline.recordings.upright import (
     quarter_turns_from_gravity,
     quarter_turns_from_room,
     quarter_turns_from_surfaces,
+    up_from_room,
 )
 
 JPEG = b"\xff\xd8"
@@ -35,6 +36,8 @@ MIN_TRACKED = 0.8
 MEASURED, RELATIVE = "measured", "relative"
 UPRIGHT_VIEWS = 12
 """number of frames whose depth is used to find the up direction if no sensor measured it"""
+MAX_TILT_DEG = 45.0
+"""angle between a device's up and the room's beyond which another axis points up"""
 UNIT_VIEWS = 5
 """number of frames for checking the unit of depth"""
 NEAREST_TYPICAL_M, FARTHEST_TYPICAL = 0.1, 2.0
@@ -121,7 +124,10 @@ def understand(
     selected = choose_frames(recording.timestamp_s[used], rate_hz)
     chosen = used[selected]
     pose = None if pose is None else pose[selected]
-    odometry_from_camera, turns = _upright(recording, pose, check, chosen, view)
+    odometry_from_camera, turns, gravity_known = _upright(recording, pose, check, chosen, view)
+    if odometry_from_camera is not None and recording.up is not None and not gravity_known:
+        contradicted = f"{check.reason}; but the floor is not level in their world: gravity is not used"
+        check = dataclasses.replace(check, reason=contradicted)
     size = reduced_size(recording.color_size, max_side_px)
     intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, size)
     return ExtractionPlan(
@@ -131,7 +137,7 @@ def understand(
         intrinsics=cameras.turn_intrinsics(intrinsics, size, turns)[chosen],
         depth_intrinsics=cameras.turn_intrinsics(depth_intrinsics, depth_size, turns)[chosen],
         odometry_from_camera=odometry_from_camera,
-        gravity_known=odometry_from_camera is not None and recording.up is not None,
+        gravity_known=gravity_known,
         quarter_turns=turns,
         pose_check=check,
     )
@@ -143,8 +149,10 @@ def _upright(
     check: PoseCheck,
     chosen: Int[np.ndarray, "frame"],
     view: Callable[[int], conventions.DepthPicture],
-) -> tuple[Float[np.ndarray, "frame 4 4"] | None, int]:
-    """Return the upright cameras of the chosen frames (None without usable poses) and the quarter turns."""
+) -> tuple[Float[np.ndarray, "frame 4 4"] | None, int, bool]:
+    """Return the upright cameras of the chosen frames (None without usable poses), the quarter turns, and
+    whether gravity is known: an up direction that the room's floor contradicts is not used.
+    """
 
     def room() -> list[tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "3 3"]]]:
         shown = chosen[evenly(len(chosen), UPRIGHT_VIEWS, rounded=True)]
@@ -152,14 +160,18 @@ def _upright(
 
     turns = recording.quarter_turns
     if pose is None:
-        return None, turns or quarter_turns_from_surfaces(room())
+        return None, turns or quarter_turns_from_surfaces(room()), False
     odometry_from_camera = conventions.odometry_from_pose(pose, check.convention)
     if recording.up is not None:
         odometry_from_camera = _y_up_from(recording.up) @ odometry_from_camera
+        up = up_from_room(odometry_from_camera, room())
+        if up is not None and up[1] < np.cos(np.radians(MAX_TILT_DEG)):
+            turns = quarter_turns_from_gravity(odometry_from_camera, up_odometry=up)
+            return cameras.turn_camera(odometry_from_camera, turns), turns, False
         turns = quarter_turns_from_gravity(odometry_from_camera)
     elif not turns:
         turns = quarter_turns_from_room(odometry_from_camera, room())
-    return cameras.turn_camera(odometry_from_camera, turns), turns
+    return cameras.turn_camera(odometry_from_camera, turns), turns, recording.up is not None
 
 
 def _refuse_other_pictures(

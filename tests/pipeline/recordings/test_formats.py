@@ -624,3 +624,13 @@ def test_polycams_own_mesh_stands_where_its_cameras_do(tmp_path):
     (folder / "mesh_info.json").write_text("{}")
     with pytest.raises(InputError, match="CAP-004"):
         open_recording(folder).read_mesh()
+
+
+@pytest.mark.parametrize(("up_deg", "known"), [(0, True), (10, True), (90, False), (180, False)])
+def test_an_up_direction_that_the_floor_contradicts_is_not_used(tmp_path, monkeypatch, up_deg, known):
+    """An app may export z up under the name of a format with y up."""
+    up = np.array([0, np.cos(np.radians(up_deg)), np.sin(np.radians(up_deg))])
+    monkeypatch.setattr(extraction, "up_from_room", lambda *_: up)
+    recording, plan = _understand(walk(60).write(tmp_path / "a.r3d"))
+    assert plan.gravity_known == known
+    assert ("gravity is not used" in extraction.summary(recording, plan)) == (not known)
