@@ -1,6 +1,6 @@
 """Build a template from a walk-through: structure from motion, refinement, fusion, alignment."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +9,12 @@ from jaxtyping import Bool, Float
 
 from pipeline.core.errors import InputError
 from pipeline.core.progress import log
-from pipeline.data.clips import Clip
+from pipeline.data.clips import Clip, usable_depth
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
 from pipeline.mapping.colmap import SparseModel
+from pipeline.mapping.icp import DepthImage, depth_image
+from pipeline.mapping.odometry import find_jumps, repair
 from stages.build_scene_template import anchor, fuse, refine, sfm
 from stages.build_scene_template.config import Config
 
@@ -20,6 +22,8 @@ MIN_POINTS = 100
 """Least number of depth points with a normal, and of faces of the fused mesh."""
 REGISTERED_WITHIN_M = 0.1
 """Largest median depth residual of a registered frame, metres."""
+JUMP_STRIDE_PX = 2
+"""Grid spacing of the depth that decides on tracking jumps."""
 UP_COSINE, FLOOR_SHARE = 0.9, 0.05
 """Least upward normal component of level surface, and quantile of its heights that is the floor's."""
 
@@ -51,6 +55,7 @@ def build(
     clip: Clip, features: Float[np.ndarray, "frame height width channel"], config: Config, workspace: Path
 ) -> tuple[SceneTemplate, SparseModel | None]:
     """Build the template; also return the SfM model. Raises InputError MAP-001, MAP-002, MAP-003, MAP-005."""
+    clip = without_jumps(clip)
     sparse = sfm.reconstruct(clip, config.sfm, workspace, config.seed)
     frames = sfm.choose_keyframes(clip, config.sfm)
     keyframes = [refine.load_keyframe(clip, int(frame)) for frame in frames]
@@ -89,6 +94,22 @@ def build(
         scale=clip.scale,
     )
     return built, sparse
+
+
+def without_jumps(clip: Clip) -> Clip:
+    """Return the walk-through with its odometry repaired at tracking jumps."""
+    if clip.odometry_from_camera is None:
+        return clip
+
+    def view(frame: int) -> DepthImage:
+        depth = usable_depth(clip, frame)
+        return depth_image(depth, clip.depth_intrinsics[frame], depth > 0, JUMP_STRIDE_PX)
+
+    jumps = find_jumps(clip.timestamp_s, clip.odometry_from_camera, view)
+    if not jumps.any():
+        return clip
+    log(f"tracking jumps before {int(jumps.sum())} of {len(clip)} frames: odometry is repaired there")
+    return replace(clip, odometry_from_camera=repair(clip.timestamp_s, clip.odometry_from_camera, jumps))
 
 
 def _oriented_points(keyframes, world_from_camera):
