@@ -9,9 +9,10 @@ from jaxtyping import Float
 from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip, Masks
 from pipeline.data.features import STRIDE_PX
+from pipeline.data.silhouettes import silhouette_iou
 from pipeline.fields.skinning import skinning_weights
 from pipeline.geometry import rigid, subsampling
-from pipeline.geometry.meshes import Mesh
+from pipeline.geometry.meshes import Mesh, RayCaster
 from stages.build_agent_template import appearance
 from stages.build_agent_template.canonical import Bones, find_heading, fit_bones
 from stages.build_agent_template.config import Config
@@ -37,6 +38,8 @@ class CanonicalTemplate:
     residual_m: float
     coverage_deg: float
     """angle around the animal that the cameras cover"""
+    silhouette_iou: Float[np.ndarray, "view"]
+    """of the surface with the masks of some frames; NaN where the animal is small"""
 
 
 def build(
@@ -71,6 +74,8 @@ def build(
     vertex_features = appearance.average_views(mesh.vertices, weight, pixel, list(features[views]), STRIDE_PX)
     vertex_features /= np.maximum(np.linalg.norm(vertex_features, axis=1, keepdims=True), 1e-9)
     mesh = Mesh(mesh.vertices, mesh.faces, np.round(color).astype(np.uint8))
+    caster = RayCaster(mesh)
+    silhouettes = [silhouette_iou(clip, masks, caster, view, cameras[view]) for view in views.tolist()]
     cameras[~masks.visible] = np.nan
     return CanonicalTemplate(
         mesh,
@@ -82,6 +87,7 @@ def build(
         heading.elongation,
         turnaround.odometry_fit.residual_m,
         coverage_deg(cameras[seen]),
+        np.array(silhouettes),
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Num, UInt8
 
 from pipeline.data.clips import Clip, Masks
+from pipeline.data.silhouettes import silhouette_iou
 from pipeline.geometry import cameras, rigid, subsampling
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 from pipeline.mapping.picture_agreement import beats
@@ -27,8 +28,6 @@ SMOOTHING_PX, MIN_NORM = 1.5, 1e-9
 
 SIZES, SIZE_FRAMES = (0.8, 0.9, 1.1, 1.25), 40
 """Other sizes of the animal's template that are compared with its own, and number of frames compared."""
-HIDDEN_M, MIN_ANIMAL = 0.05, 0.005
-"""Depth nearer than the animal by this hides it, metres; least share of a compared frame that it covers."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +127,7 @@ def compare_sizes(
         caster = RayCaster(replace(agent, vertices=vertices.astype(np.float32)))
         return np.array(
             [
-                _silhouette_iou(clip, masks, caster, frame, rigid.inverse(root) @ camera)
+                silhouette_iou(clip, masks, caster, frame, rigid.inverse(root) @ camera)
                 for frame, root, camera in zip(
                     frames, world_from_agent[frames], world_from_camera[frames], strict=True
                 )
@@ -144,18 +143,3 @@ def compare_sizes(
             iou = float(np.nanmedian(other))
             size = replace(size, better=factor, better_iou=iou) if not iou <= size.better_iou else size
     return size
-
-
-def _silhouette_iou(
-    clip: Clip, masks: Masks, caster: RayCaster, frame: int, agent_from_camera: Float[np.ndarray, "4 4"]
-) -> float:
-    """Return the silhouette's IoU with the mask where it is not hidden; NaN where the animal is too small."""
-    depth = clip.depth(frame)
-    labels = cv2.resize(masks[frame], depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    rendered, _ = render_view(caster, agent_from_camera, clip.depth_intrinsics[frame], *depth.shape)
-    animal, known = labels == 255, (labels != 128) & (depth > 0)
-    if animal.mean() < MIN_ANIMAL:
-        return np.nan
-    hidden = ~animal & (depth < rendered - HIDDEN_M)
-    silhouette, animal = (rendered > 0) & ~hidden & known, animal & known
-    return float((silhouette & animal).sum() / max((silhouette | animal).sum(), 1))

@@ -11,7 +11,9 @@ from scipy.spatial import cKDTree
 
 from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip
+from pipeline.data.silhouettes import silhouette_iou
 from pipeline.geometry import rigid
+from pipeline.geometry.meshes import RayCaster
 from stages.build_agent_template.canonical import fit_bones
 from stages.build_agent_template.config import Config
 from stages.build_agent_template.fuse import Silhouettes
@@ -93,6 +95,19 @@ def test_cameras_stand_where_they_stood(template, turnaround):
     error = np.linalg.norm(placed[:, :3, 3] - turnaround[3][:, :3, 3], axis=1)
     assert np.median(error) < 0.015, "metres; odometry drifts by some centimetres on the circle"
     assert template.coverage_deg > 340
+
+
+def test_an_animal_that_turns_in_the_middle_does_not_fit_its_masks(turnaround, template):
+    """Seen from cameras that do not know of the turn, half of its silhouettes are those of another pose."""
+    assert np.nanquantile(template.silhouette_iou, 0.1) > 0.7
+    clip, masks, *_ = turnaround
+    turned = template.agent_from_camera.copy()
+    half = len(turned) // 2
+    turn = rigid.make(rigid.rotation_from_yaw(np.array(np.pi / 2)), np.zeros(3))
+    turned[half:] = turn @ turned[half:]
+    caster, frames = RayCaster(template.mesh), range(0, len(turned), 4)
+    seen = [silhouette_iou(clip, masks, caster, frame, turned[frame]) for frame in frames]
+    assert np.nanquantile(seen, 0.1) < 0.6
 
 
 def test_skin_and_features_are_normalised(template):
