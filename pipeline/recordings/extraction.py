@@ -16,7 +16,7 @@ from pipeline.data import images
 from pipeline.geometry import cameras, rigid
 from pipeline.geometry.subsampling import evenly
 from pipeline.mapping import picture_agreement
-from pipeline.mapping.picture_agreement import Agreement, PosedPicture
+from pipeline.mapping.picture_agreement import Agreement, Clock, PosedPicture
 from pipeline.recordings import conventions
 from pipeline.recordings.conventions import PoseCheck
 from pipeline.recordings.depth_camera import grid_size, reproject
@@ -285,15 +285,17 @@ def _posed_picture(
     color = picture(recording, int(plan.chosen[row]), plan.stored_size)
     if color is None or plan.odometry_from_camera is None:
         return None
-    rows = {"": row, "earlier": row - CLOCK_FRAMES, "later": row + CLOCK_FRAMES}
-    depth = {
-        clock: stored_depth(recording, int(recording.index[plan.chosen[other]]), max_depth_m)
+    rows: dict[Clock, int] = {"": row, "earlier": row - CLOCK_FRAMES, "later": row + CLOCK_FRAMES}
+    depth: dict[Clock, np.ndarray] = {
+        clock: cameras.turn_image(
+            stored_depth(recording, int(recording.index[plan.chosen[other]]), max_depth_m), plan.quarter_turns
+        )
         for clock, other in rows.items()
     }
     return PosedPicture(
         cv2.cvtColor(cameras.turn_image(color, plan.quarter_turns), cv2.COLOR_RGB2GRAY),
         plan.intrinsics[row],
-        {clock: cameras.turn_image(each, plan.quarter_turns) for clock, each in depth.items()},
+        depth,
         plan.depth_intrinsics[row],
         {clock: plan.odometry_from_camera[other] for clock, other in rows.items()},
     )
