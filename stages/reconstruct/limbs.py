@@ -1,6 +1,6 @@
 """The kinematic tree of the bones, so that the rotation of a thigh moves the whole leg.
 
-Gaussian bones have no parents; the maximum spanning tree over shared skinning weights defines them.
+Gaussian bones have no parents; the tree of shortest paths from the middle of the body defines them.
 """
 
 from dataclasses import dataclass
@@ -8,15 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.sparse.csgraph import dijkstra
 from torch import Tensor, nn
 
 from pipeline.geometry import rigid_torch
 
 MIN_SHARE = 1e-9
-"""lower bound of shared skinning weight; keeps logarithms finite"""
-MAX_SHARE = 0.999
-"""upper bound: a sparse graph drops edges of length 0"""
+"""added to shared skinning weight, so that averages over it are finite"""
+MIN_SKIN = 0.02
+"""shared skin from which two bones are neighbours"""
+DETOUR = 1.5
+"""cost of a path from the middle to a bone with none between, relative to its squared length"""
 LOW, GROUND = 0.45, 0.15
 """legs lie below the first share of the animal's height and reach below the second"""
 
@@ -26,6 +28,14 @@ def shared_skin(weights: Float[Tensor, "point bone"]) -> Float[Tensor, "bone bon
     share = weights.T @ weights
     size = share.diagonal().sqrt().clamp_min(1e-6)
     return (share / size[:, None] / size).fill_diagonal_(0)
+
+
+def joined(share: Float[Tensor, "bone bone"], most: int | None = None) -> Bool[Tensor, "bone bone"]:
+    """Return which bones share skin: each with one neighbour at least and ``most`` of its own choice."""
+    ranked = share.argsort(dim=1, descending=True)
+    chosen = torch.zeros_like(share, dtype=torch.bool).scatter_(1, ranked[:, :most], True)
+    chosen = (chosen & (share > MIN_SKIN)).scatter_(1, ranked[:, :1], True)
+    return chosen | chosen.T
 
 
 @dataclass(frozen=True)
@@ -46,14 +56,21 @@ class KinematicTree:
         weights: Float[Tensor, "point bone"],
         agent_from_bone_rest: Float[Tensor, "bone 4 4"],
     ) -> "KinematicTree":
-        """Build the maximum spanning tree of shared skin from the bone nearest to the agent's origin."""
-        cost = -np.log(shared_skin(weights).double().numpy().clip(MIN_SHARE, MAX_SHARE))
-        tree = minimum_spanning_tree(cost)
-        centre = agent_from_bone_rest[:, :3, 3]
-        order, parent = breadth_first_order(tree + tree.T, int(centre.norm(dim=-1).argmin()), directed=False)
-        order = torch.from_numpy(order).long()
-        parent = torch.from_numpy(parent).long()[order]
-        parent[0] = order[0]
+        """Build the tree of shortest paths from the agent's origin over bones that share skin.
+
+        Lengths are squared, so that a leg hangs on the near side of the body. By shared skin alone, or by
+        plain length, it may hang on the other leg of its pair, and move with it.
+        """
+        centre = agent_from_bone_rest[:, :3, 3].double().numpy()
+        neighbours = joined(shared_skin(weights)).numpy()
+        cost = np.zeros((len(centre) + 1,) * 2)
+        cost[:-1, :-1] = np.where(neighbours, np.square(centre[:, None] - centre).sum(-1), 0)
+        cost[-1, :-1] = DETOUR * np.square(centre).sum(-1)
+        length, parents = dijkstra(cost, directed=False, indices=-1, return_predecessors=True)
+        root = int(cost[-1, :-1].argmin())
+        length[root], parents[parents == len(centre)], parents[root] = 0, root, root
+        order = torch.from_numpy(length[:-1].argsort(kind="stable"))
+        parent = torch.from_numpy(parents[:-1]).long()[order]
         both = weights[:, order] * weights[:, parent] + MIN_SHARE
         return cls(order, order.argsort()[parent], both.T @ points / both.sum(0)[:, None])
 

@@ -13,7 +13,7 @@ from pipeline.core.errors import InputError
 from pipeline.data.motion import MotionTable
 from pipeline.fields.fields import ArticulatedBody, Field
 from pipeline.geometry.meshes import Mesh
-from stages.reconstruct.limbs import KinematicTree, shared_skin
+from stages.reconstruct.limbs import KinematicTree, joined, shared_skin
 from stages.reconstruct.rays import RayStore
 
 TRUSTED = 0.1
@@ -21,8 +21,8 @@ TRUSTED = 0.1
 MAX_PRECISE = 100.0
 """prior precision of a camera registered with certainty, relative to one at even odds; losses alone err by a
 millimetre and 0.05 degrees"""
-MAX_JOINTS, MIN_SKIN = 4, 0.02
-"""maximum number of joints per bone; shared skin from which two bones are joined"""
+MAX_JOINTS = 4
+"""maximum number of joints per bone"""
 SOLE, SOLES = 0.07, 32
 """soles lie below this share of the animal's height; number of sole points"""
 ON_SURFACE, AROUND = 4000, 40000
@@ -137,10 +137,7 @@ class Joints:
     def of(cls, points: Float[Tensor, "point 3"], weights: Float[Tensor, "point bone"]) -> "Joints":
         """Join each bone with at least one and at most `MAX_JOINTS` bones with which it shares most skin."""
         share = shared_skin(weights)
-        ranked = share.argsort(dim=1, descending=True)
-        joined = torch.zeros_like(share, dtype=torch.bool).scatter_(1, ranked[:, :MAX_JOINTS], True)
-        joined = (joined & (share > MIN_SKIN)).scatter_(1, ranked[:, :1], True)
-        first, second = torch.nonzero((joined | joined.T).triu(1), as_tuple=True)
+        first, second = torch.nonzero(joined(share, MAX_JOINTS).triu(1), as_tuple=True)
         both = weights[:, first] * weights[:, second]
         return cls(first, second, both.T @ points / both.sum(0).clamp_min(1e-9)[:, None])
 

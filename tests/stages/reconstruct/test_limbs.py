@@ -51,6 +51,25 @@ def test_a_turn_at_the_root_of_a_tail_lifts_the_whole_tail():
     torch.testing.assert_close(relative, rigid_torch.inverse(bones[4]) @ bones[2], msg="straight as before")
 
 
+def test_a_leg_hangs_on_the_body_and_not_on_the_other_leg_of_its_pair():
+    """Two legs that share more skin with each other than with the halves of the body above them."""
+    place = torch.tensor(
+        [[0.02, 0, 0], [-0.04, 0.02, 0.08], [0.04, 0.02, 0.08], [-0.04, -0.08, 0.1], [0.04, -0.08, 0.1]]
+    )
+    bones = torch.eye(4).repeat(5, 1, 1)
+    bones[:, :3, 3] = place
+    middle = (place[:, None] + place) / 2
+    weights = torch.zeros(5, 5, 5)
+    share = {(0, 1): 6, (0, 2): 6, (1, 2): 4, (1, 3): 3, (2, 4): 3, (3, 4): 5}
+    for (one, other), points in share.items():
+        weights[one, other, [one, other]] = points / 20
+    weights[range(5), range(5), range(5)] = 1.0
+    on_skin = weights.sum(-1) > 0
+    limbs = KinematicTree.of(middle[on_skin], weights[on_skin], bones)
+    parent = dict(zip(limbs.order.tolist(), limbs.order[limbs.parent].tolist(), strict=True))
+    assert parent == {0: 0, 1: 0, 2: 0, 3: 1, 4: 2}
+
+
 def test_waves_add_knots_of_each_scale():
     waves = MultiscaleRotations(frames=20, bones=1, knot_frames=(8,))
     assert waves().shape == (20, 1, 3) and not waves().any()
