@@ -78,6 +78,13 @@ def write(
     (folder / "qa.json").write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
 
 
+def failures(folder: Path) -> list[str]:
+    """Return the names of a finished artifact's failed checks; none without `qa.json`."""
+    path = folder / "qa.json"
+    checks = json.loads(path.read_text())["checks"] if path.exists() else []
+    return [check["name"] for check in checks if check["status"] == "fail"]
+
+
 def worst(statuses: Sequence[Status]) -> Status:
     """Return the most severe of several statuses; ok if there are none."""
     return max(("ok", *statuses), key=("ok", "warn", "fail").index)

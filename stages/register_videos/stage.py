@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +53,9 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") ->
     )
     rng = np.random.default_rng(config.seed)
     result = registration.register(clip, masks, maps, config, rng, features)
+    faults = [fault for folder in (inputs.frames, *inputs.walk.values()) for fault in qa.failures(folder)]
+    if isinstance(result, Rejected) and faults:
+        result = replace(result, reason=f"{result.reason}; a check of frames failed: {faults[0]}")
     if isinstance(result, Registered):
         result.poses(clip.timestamp_s).write(out)
     status = pictures.status(result, walk.timestamp_s, walk.world_from_camera)
