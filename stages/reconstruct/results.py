@@ -18,6 +18,7 @@ from pipeline.fields import fields, marching_cubes
 from pipeline.fields.fields import Reconstruction
 from pipeline.geometry import cameras, rigid
 from pipeline.geometry.meshes import Mesh
+from pipeline.geometry.pose_filter import wiener_filter
 from stages.reconstruct.assemble import RegisteredVideo, scene_first
 from stages.reconstruct.body import NEAREST_M
 from stages.reconstruct.problem import Problem
@@ -31,6 +32,8 @@ AGENT_STEP_M = 0.01
 """resolution of the extracted agent: at 0.02 a tail disappears"""
 SEEN_WITHIN_M = 0.045
 """the scene's surface is removed where no measured point is this near: backs of thin shells, rims"""
+SMOOTHING_S = 0.7
+"""window of the filter of motion, longer than a stride"""
 MAX_POINTS, MAX_FRAMES = 3_000_000, 300
 """approximate limits of measured points, and of frames tested for free space, after subsampling"""
 
@@ -48,11 +51,14 @@ class SceneFeatures:
 
 
 @torch.no_grad()
-def motions(problem: Problem, videos: Sequence[RegisteredVideo], certain_gap_s: float) -> dict[str, Motion]:
+def motions(
+    problem: Problem, videos: Sequence[RegisteredVideo], certain_gap_s: float, smoothing_s: float = 0.0
+) -> dict[str, Motion]:
     """Return each video's motion in world coordinates; the turnaround's world is the agent's rest frame.
 
     Poses of the agent are interpolated wherever no frame shows it. In gaps longer than ``certain_gap_s``
-    seconds the confidence is `INTERPOLATED` at most.
+    seconds the confidence is `INTERPOLATED` at most. Root and bones of sessions are filtered over windows of
+    ``smoothing_s`` seconds: optimization leaves noise that shakes a resting animal.
     """
     result, table = {}, problem.motion
     known = torch.zeros(len(problem.video), dtype=torch.bool)
@@ -63,6 +69,9 @@ def motions(problem: Problem, videos: Sequence[RegisteredVideo], certain_gap_s: 
         bones = table.agent_from_bone(frame).double().cpu().numpy()
         observed = known[frame.cpu()].numpy()
         root, bones = interpolate_gaps(video.timestamp_s, root, bones, observed)
+        window = round(smoothing_s / np.median(np.diff(video.timestamp_s))) if len(frame) > 1 else 0
+        if video.camera_free and window > 1 and observed.any():
+            root, bones = (wiener_filter(poses, observed, window) for poses in (root, bones))
         camera = table.world_from_camera(frame).double().cpu().numpy()
         camera[~np.isfinite(video.world_from_camera).all((1, 2))] = np.nan
         visible, confidence = video.agent_visible & observed, video.confidence

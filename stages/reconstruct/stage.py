@@ -51,7 +51,8 @@ def run(
         return
     ids = assemble.scene_ids(registered)
     reconstruction = Reconstruction(problem.scene, problem.agent, problem.body, ids)
-    motions = results.motions(problem, registered, config.certain_gap_s)
+    smoothing_s = 0.0 if rendered else results.SMOOTHING_S
+    motions = results.motions(problem, registered, config.certain_gap_s, smoothing_s)
     sessions = {video.id: motions[video.id] for video in registered if video.camera_free}
     results.write(out, problem, reconstruction, motions, sessions)
     pictures.report_quality(out, reconstruction, sessions, inputs.frames, inputs.masks, records)
