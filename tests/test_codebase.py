@@ -7,7 +7,7 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 58_020,
+    "lines": 58_600,
     "lines over 110 columns": 0,
     "recipe keys": 326,
     "packages over 16 modules": 0,
@@ -20,8 +20,8 @@ BARS = {
 }
 """Today's counts, rounded up. Lower a bar when a count has gone down.
 
-A new stage or backend raises `lines` and `recipe keys` by what it adds, in its own commit. 200 lines are the
-names of numbers that had none; nothing else goes up.
+A new stage, backend or check of recordings raises `lines` and `recipe keys` by what it adds, in its own
+commit. 200 lines are the names of numbers that had none; nothing else goes up.
 """
 
 

@@ -97,7 +97,7 @@ Verdict = Literal["agree", "contradict", "unconfirmed", "untested"]
 
 
 @dataclass(frozen=True)
-class Agreement:
+class PictureAgreement:
     """What pictures say about depth, intrinsics and poses."""
 
     verdict: Verdict
@@ -125,14 +125,14 @@ class Agreement:
                 return "too few pictures show the same things from another place"
 
 
-def check(pairs: Sequence[tuple[PosedPicture, PosedPicture]]) -> Agreement:
+def check(pairs: Sequence[tuple[PosedPicture, PosedPicture]]) -> PictureAgreement:
     """Compare the recording as stored with all readings and with deliberately wrong poses."""
     pairs = [(_normalized(first), _normalized(second)) for first, second in pairs]
     stored = np.array([correlation(*pair, STORED) for pair in pairs])
     pairs = [pair for pair, value in zip(pairs, stored, strict=True) if np.isfinite(value)]
     stored = stored[np.isfinite(stored)]
     if len(pairs) < MIN_PAIRS:
-        return Agreement("untested", np.nan, len(pairs))
+        return PictureAgreement("untested", np.nan, len(pairs))
     median = float(np.median(stored))
     decoys = [np.array([correlation(*pair, decoy) for pair in pairs]) for decoy in DECOYS]
     found = []
@@ -140,11 +140,11 @@ def check(pairs: Sequence[tuple[PosedPicture, PosedPicture]]) -> Agreement:
         values = np.array([correlation(*pair, reading) for pair in pairs])
         if beats(values, stored) and all(beats(values, each) for each in decoys):
             better = float(np.median(values[np.isfinite(values)])), int((values > stored).sum())
-            found.append(Agreement("contradict", median, len(pairs), reading.what, *better))
+            found.append(PictureAgreement("contradict", median, len(pairs), reading.what, *better))
     if found:
         return max(found, key=lambda each: each.better_correlation)
     confirmed = all(beats(stored, each) for each in decoys)
-    return Agreement("agree" if confirmed else "unconfirmed", median, len(pairs))
+    return PictureAgreement("agree" if confirmed else "unconfirmed", median, len(pairs))
 
 
 def beats(

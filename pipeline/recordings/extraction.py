@@ -16,7 +16,7 @@ from pipeline.data import images
 from pipeline.geometry import cameras, rigid
 from pipeline.geometry.subsampling import evenly
 from pipeline.mapping import picture_agreement
-from pipeline.mapping.picture_agreement import Agreement, Clock, PosedPicture
+from pipeline.mapping.picture_agreement import Clock, PictureAgreement, PosedPicture
 from pipeline.recordings import conventions
 from pipeline.recordings.conventions import PoseCheck
 from pipeline.recordings.depth_camera import grid_size, reproject
@@ -263,7 +263,9 @@ def frames(
         yield ExtractedFrame(color, jpeg, depth, confidence, sharpness, brightness, float((depth > 0).mean()))
 
 
-def picture_agreement_of(recording: Recording, plan: ExtractionPlan, *, max_depth_m: float) -> Agreement:
+def picture_agreement_of(
+    recording: Recording, plan: ExtractionPlan, *, max_depth_m: float
+) -> PictureAgreement:
     """Check a recording's pictures against its depth, intrinsics and poses; without poses it is untested."""
     if plan.odometry_from_camera is None:
         return picture_agreement.check([])

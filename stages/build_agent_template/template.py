@@ -9,10 +9,10 @@ from jaxtyping import Float
 from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip, Masks
 from pipeline.data.features import STRIDE_PX
-from pipeline.data.silhouettes import silhouette_iou
 from pipeline.fields.skinning import skinning_weights
 from pipeline.geometry import rigid, subsampling
 from pipeline.geometry.meshes import Mesh, RayCaster
+from pipeline.metrics.silhouettes import silhouette_iou
 from stages.build_agent_template import appearance
 from stages.build_agent_template.canonical import Bones, find_heading, fit_bones
 from stages.build_agent_template.config import Config

@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 
 from pipeline.geometry import rigid
 from pipeline.geometry.subsampling import evenly
-from pipeline.mapping.picture_agreement import Agreement
+from pipeline.mapping.picture_agreement import PictureAgreement
 from pipeline.recordings import extraction
 from pipeline.recordings.extraction import ExtractionPlan
 from pipeline.recordings.recording import Recording, damaged
@@ -57,7 +57,7 @@ class RecordingSample:
     shots: Sequence[SampledFrame]
     damaged: float
     """share of the sample (0..1) that cannot be decoded"""
-    agreement: Agreement | None = None
+    agreement: PictureAgreement | None = None
     """of pictures with depth, intrinsics and device poses"""
 
     @property

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 from pipeline.core.errors import InputError
 from pipeline.data import images, ply, qa
 from pipeline.data.clips import FRAMES
-from pipeline.mapping.picture_agreement import Agreement
+from pipeline.mapping.picture_agreement import PictureAgreement
 from pipeline.recordings import extraction
 from pipeline.recordings.extraction import DARK, MEASURED, RELATIVE, ExtractedFrame, ExtractionPlan
 from pipeline.recordings.recording import Recording, damaged
@@ -106,7 +106,12 @@ def write_mesh(folder: Path, recording: Recording, plan: ExtractionPlan) -> None
 
 
 def report_quality(
-    folder: Path, plan: ExtractionPlan, written: WrittenFrames, agreement: Agreement | None, *, rate_hz: float
+    folder: Path,
+    plan: ExtractionPlan,
+    written: WrittenFrames,
+    agreement: PictureAgreement | None,
+    *,
+    rate_hz: float,
 ) -> None:
     """Write the quality checks, the share of usable frames and a contact sheet."""
     timestamp_s = plan.timestamp_s[written.usable]
@@ -156,7 +161,7 @@ def _check_of_poses(plan: ExtractionPlan) -> qa.Check:
     return qa.Check(name, residual_mm, "mm", warn=1000 * check.tolerance_m)
 
 
-def _check_of_pictures(agreement: Agreement | None) -> list[qa.Check]:
+def _check_of_pictures(agreement: PictureAgreement | None) -> list[qa.Check]:
     """Return the check of pictures against depth, intrinsics and poses, if they could be compared."""
     if agreement is None or agreement.verdict == "untested":
         return []

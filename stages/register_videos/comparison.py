@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Num, UInt8
 
 from pipeline.data.clips import Clip, Masks
-from pipeline.data.silhouettes import silhouette_iou
 from pipeline.geometry import cameras, rigid, subsampling
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 from pipeline.mapping.picture_agreement import beats
+from pipeline.metrics.silhouettes import silhouette_iou
 
 BLUR_PX = 9.0
 """Neighbourhood of the local contrast normalization, standard deviation in half-size pixels."""

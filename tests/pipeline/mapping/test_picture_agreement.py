@@ -41,7 +41,7 @@ def _recording(seed: int = 0, frames: int = 40) -> list[PosedPicture]:
     ]
 
 
-def _check(pictures: list[PosedPicture]) -> picture_agreement.Agreement:
+def _check(pictures: list[PosedPicture]) -> picture_agreement.PictureAgreement:
     return picture_agreement.check(list(zip(pictures[:-APART], pictures[APART:], strict=True)))
 
 

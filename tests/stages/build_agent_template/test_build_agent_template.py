@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 
 from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip
-from pipeline.data.silhouettes import silhouette_iou
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import RayCaster
+from pipeline.metrics.silhouettes import silhouette_iou
 from stages.build_agent_template.canonical import fit_bones
 from stages.build_agent_template.config import Config
 from stages.build_agent_template.fuse import Silhouettes
