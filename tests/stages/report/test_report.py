@@ -288,3 +288,5 @@ def test_worries_come_with_a_remedy(tmp_path: Path) -> None:
     )
     assert "walk once more" in remedy("scene_template", "keyframes registered by COLMAP")
     assert remedy("scene_template", "unheard of") == ""
+    assert "unedited" in remedy("frames", "pictures against depth, intrinsics and poses (...)")
+    assert "turnaround" in remedy("video_poses", "animal of the template's size (...)")
