@@ -150,9 +150,7 @@ def _fit_rigid(
     covariance += (ROTATION_PRIOR * variance + 1e-12) * np.einsum(
         "v,fvij->fij", weight / weight.sum(), rotations
     )
-    left, _, right = np.linalg.svd(covariance)
-    left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
-    rotation = left @ right
+    rotation = rigid.nearest_rotation(covariance)
     return rigid.make(rotation, centroid - np.einsum("fij,j->fi", rotation, rest_centroid))
 
 

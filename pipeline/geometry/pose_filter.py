@@ -23,9 +23,7 @@ def wiener_filter(
     if known.sum() < window:
         return poses
     mean = uniform_filter1d(poses, window, axis=0, mode="nearest")
-    u, _, v = np.linalg.svd(mean[..., :3, :3])
-    u[..., 2] *= np.linalg.det(u @ v)[..., None]
-    mean[..., :3, :3] = u @ v
+    mean[..., :3, :3] = rigid.nearest_rotation(mean[..., :3, :3])
     turned = np.swapaxes(mean[..., :3, :3], -1, -2) @ poses[..., :3, :3]
     shift = poses[..., :3, 3] - mean[..., :3, 3]
     turn = _signal(rigid.log(rigid.make(turned, shift))[..., :3], known, window)

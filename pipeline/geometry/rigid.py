@@ -160,9 +160,14 @@ def smoothed(
     if sigma_frames <= 0:
         return a_from_b
     mean = gaussian_filter1d(a_from_b[:, :3], sigma_frames, axis=0, mode="nearest")
-    left, _, right = np.linalg.svd(mean[:, :, :3])
-    left[..., 2] *= np.sign(np.linalg.det(left @ right))[:, None]
-    return make(left @ right, mean[:, :, 3] if places else a_from_b[:, :3, 3])
+    return make(nearest_rotation(mean[:, :, :3]), mean[:, :, 3] if places else a_from_b[:, :3, 3])
+
+
+def nearest_rotation(matrix: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """Return the nearest rotation to each matrix, by its singular vectors."""
+    left, _, right = np.linalg.svd(matrix)
+    left[..., 2] *= np.sign(np.linalg.det(left @ right))[..., None]
+    return left @ right
 
 
 def mean_rotation(

@@ -4,6 +4,7 @@
 returns its information matrix. The robust weights reject moving objects as outliers.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numba
@@ -64,6 +65,20 @@ def depth_image(
     scaled[:2, 2] = (intrinsics[:2, 2] - stride // 2 - 0.5) / stride + 0.5
     scaled[:2, :2] /= stride
     return DepthImage(points, _normals(points), scaled)
+
+
+def depth_views(
+    depth_of: Callable[[int], Float[np.ndarray, "height width"]],
+    intrinsics: Float[np.ndarray, "frame 3 3"],
+    stride: int,
+) -> Callable[[int], DepthImage]:
+    """Return what computes the `depth_image` of a frame from its depth."""
+
+    def view(frame: int) -> DepthImage:
+        depth = depth_of(frame)
+        return depth_image(depth, intrinsics[frame], depth > 0, stride)
+
+    return view
 
 
 def align_views(

@@ -25,6 +25,8 @@ SUSPECT_M_S = 0.8
 """Likewise, where depth decides: a hand can do it, and so can a jump of 10 cm."""
 EXPLAINED_BETTER = 2.0
 """A suspect step is a jump if its mean square depth error is this many times that of the motion around it."""
+JUMP_STRIDE_PX = 2
+"""Grid spacing of the depth that decides."""
 MEDIAN_WINDOW = 5
 """Window of the median filter of speeds, steps."""
 MIN_STEP_S = 0.05

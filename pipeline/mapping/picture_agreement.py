@@ -14,7 +14,7 @@ from typing import Literal
 import cv2
 import numpy as np
 from jaxtyping import Float, Num
-from scipy.stats import binomtest
+from scipy.special import bdtrc
 
 from pipeline.geometry import cameras, rigid
 
@@ -25,6 +25,7 @@ CONTRAST_PX, MIN_VARIANCE = 6.0, 9.0
 OCCLUDED_M, OCCLUDED_SHARE = 0.05, 0.05
 """a point farther than the second picture's depth by this is hidden there"""
 NEAREST_M = 0.05
+MIN_NORM = 1e-9
 MIN_POINTS = 200
 """least number of common points of a pair"""
 MIN_PAIRS = 12
@@ -158,8 +159,8 @@ def beats(
     larger, count = int((values > others)[known].sum()), int(known.sum())
     if count < MIN_PAIRS:
         return False
-    limit = SIGNIFICANCE / tests
-    return bool(binomtest(larger, count, 0.5, alternative="greater").pvalue < limit)
+    as_many_by_chance = bdtrc(larger - 1, count, 0.5)
+    return bool(as_many_by_chance < SIGNIFICANCE / tests)
 
 
 def _normalized(picture: PosedPicture) -> PosedPicture:
@@ -196,7 +197,7 @@ def correlation(first: PosedPicture, second: PosedPicture, reading: Reading) -> 
         return np.nan
     own = centre[shown] * np.array(size[::-1]) / depth_size[::-1]
     values = [_sampled(gray, at) for gray, at in zip(grays, (own, pixel[shown]), strict=True)]
-    return _correlated(*values)
+    return correlated(*values)
 
 
 def _depth(picture: PosedPicture, reading: Reading) -> Float[np.ndarray, "height width"]:
@@ -230,6 +231,7 @@ def _sampled(
     return cv2.remap(np.ascontiguousarray(picture), x[:, None], y[:, None], cv2.INTER_LINEAR)[:, 0]
 
 
-def _correlated(first: Float[np.ndarray, "point"], second: Float[np.ndarray, "point"]) -> float:
+def correlated(first: Float[np.ndarray, "point"], second: Float[np.ndarray, "point"]) -> float:
+    """Return the correlation of two samples, in -1..1; 0 if one is constant."""
     first, second = first - first.mean(), second - second.mean()
-    return float(first @ second / max(np.linalg.norm(first) * np.linalg.norm(second), 1e-9))
+    return float(first @ second / max(np.linalg.norm(first) * np.linalg.norm(second), MIN_NORM))

@@ -273,10 +273,9 @@ def picture_agreement_of(
         plan.odometry_from_camera, plan.timestamp_s, AGREEMENT_PAIRS, AGREEMENT_GAP_S
     )
     around = (pairs >= CLOCK_FRAMES) & (pairs < len(plan.chosen) - CLOCK_FRAMES)
-    views = {
-        row: _posed_picture(recording, plan, row, max_depth_m) for row in np.unique(pairs[around.all(1)])
-    }
-    shown = [(views[first], views[second]) for first, second in pairs[around.all(1)].tolist()]
+    pairs = pairs[around.all(1)]
+    views = {row: _posed_picture(recording, plan, row, max_depth_m) for row in np.unique(pairs).tolist()}
+    shown = [(views[first], views[second]) for first, second in pairs.tolist()]
     return picture_agreement.check([(a, b) for a, b in shown if a is not None and b is not None])
 
 

@@ -1,6 +1,7 @@
 """Camera poses around the standing animal: drift-corrected odometry with loop closure."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -9,7 +10,7 @@ from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip, Masks, usable_depth
 from pipeline.geometry import rigid
 from pipeline.geometry.ground import GroundPlane, fit_ground
-from pipeline.mapping.icp import DepthImage, depth_image
+from pipeline.mapping.icp import depth_views
 from pipeline.mapping.odometry import CorrectedOdometry, align_gravity, chain_alignments, correct_drift
 
 STRIDE = 2
@@ -37,11 +38,7 @@ def register_turnaround(clip: Clip, masks: Masks) -> Turnaround:
 
     Raises InputError AGT-001 if hardly any depth was measured on the animal, or on a level surface.
     """
-
-    def view(frame: int) -> DepthImage:
-        depth = usable_depth(clip, frame)
-        return depth_image(depth, clip.depth_intrinsics[frame], depth > 0, STRIDE)
-
+    view = depth_views(partial(usable_depth, clip), clip.depth_intrinsics, STRIDE)
     odometry = clip.odometry_from_camera
     if odometry is None:
         odometry = chain_alignments(view, lambda _, last: last, len(clip))

@@ -1,6 +1,7 @@
 """Build a template from a walk-through: structure from motion, refinement, fusion, alignment."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,8 @@ from pipeline.data.clips import Clip, usable_depth
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
 from pipeline.mapping.colmap import SparseModel
-from pipeline.mapping.icp import DepthImage, depth_image
-from pipeline.mapping.odometry import find_jumps, repair
+from pipeline.mapping.icp import depth_views
+from pipeline.mapping.odometry import JUMP_STRIDE_PX, find_jumps, repair
 from stages.build_scene_template import anchor, fuse, refine, sfm
 from stages.build_scene_template.config import Config
 
@@ -22,8 +23,6 @@ MIN_POINTS = 100
 """Least number of depth points with a normal, and of faces of the fused mesh."""
 REGISTERED_WITHIN_M = 0.1
 """Largest median depth residual of a registered frame, metres."""
-JUMP_STRIDE_PX = 2
-"""Grid spacing of the depth that decides on tracking jumps."""
 UP_COSINE, FLOOR_SHARE = 0.9, 0.05
 """Least upward normal component of level surface, and quantile of its heights that is the floor's."""
 
@@ -100,11 +99,7 @@ def without_jumps(clip: Clip) -> Clip:
     """Return the walk-through with its odometry repaired at tracking jumps."""
     if clip.odometry_from_camera is None:
         return clip
-
-    def view(frame: int) -> DepthImage:
-        depth = usable_depth(clip, frame)
-        return depth_image(depth, clip.depth_intrinsics[frame], depth > 0, JUMP_STRIDE_PX)
-
+    view = depth_views(partial(usable_depth, clip), clip.depth_intrinsics, JUMP_STRIDE_PX)
     jumps = find_jumps(clip.timestamp_s, clip.odometry_from_camera, view)
     if not jumps.any():
         return clip

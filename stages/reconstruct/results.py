@@ -69,8 +69,8 @@ def motions(
         bones = table.agent_from_bone(frame).double().cpu().numpy()
         observed = known[frame.cpu()].numpy()
         root, bones = interpolate_gaps(video.timestamp_s, root, bones, observed)
-        window = round(smoothing_s / np.median(np.diff(video.timestamp_s))) if len(frame) > 1 else 0
-        if video.camera_free and window > 1 and observed.any():
+        if video.camera_free and smoothing_s and observed.sum() > 1:
+            window = round(smoothing_s / np.median(np.diff(video.timestamp_s)))
             root, bones = (wiener_filter(poses, observed, window) for poses in (root, bones))
         camera = table.world_from_camera(frame).double().cpu().numpy()
         camera[~np.isfinite(video.world_from_camera).all((1, 2))] = np.nan

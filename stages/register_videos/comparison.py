@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Num, UInt8
 from pipeline.data.clips import Clip, Masks
 from pipeline.geometry import cameras, rigid, subsampling
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
-from pipeline.mapping.picture_agreement import beats
+from pipeline.mapping.picture_agreement import beats, correlated
 from pipeline.metrics.silhouettes import silhouette_iou
 
 BLUR_PX = 9.0
@@ -23,7 +23,7 @@ SHARE_FLOOR = 1e-3
 FIT_M, MIN_SHARE = 0.05, 0.1
 """Pixels are compared where depth and rendering agree within the first, metres; frames with a smaller share
 of such pixels have no score."""
-SMOOTHING_PX, MIN_NORM = 1.5, 1e-9
+SMOOTHING_PX = 1.5
 """Blur before correlation, half-size pixels, to match the template's smooth colours."""
 
 SIZES, SIZE_FRAMES = (0.8, 0.9, 1.1, 1.25), 40
@@ -89,9 +89,7 @@ def ncc(
         local_contrast_normalization(picture, pair.known).astype(np.float64)
         for picture in (pair.rendered, pair.recorded)
     ]
-    first, second = (cv2.GaussianBlur(each, (0, 0), SMOOTHING_PX)[comparable] for each in normalized)
-    first, second = first - first.mean(), second - second.mean()
-    return float(first @ second / max(np.linalg.norm(first) * np.linalg.norm(second), MIN_NORM))
+    return correlated(*(cv2.GaussianBlur(each, (0, 0), SMOOTHING_PX)[comparable] for each in normalized))
 
 
 @dataclass(frozen=True)
@@ -119,7 +117,7 @@ def compare_sizes(
     unless the recording shows another animal than the turnaround, or lengths of the two differ.
     """
     placed = np.flatnonzero(np.isfinite(world_from_agent[:, 0, 0]))
-    frames = [int(placed[row]) for row in subsampling.evenly(len(placed), SIZE_FRAMES)] if len(placed) else []
+    frames = placed[subsampling.evenly(len(placed), SIZE_FRAMES)].tolist()
 
     def ious(factor: float) -> Float[np.ndarray, "compared"]:
         vertices = factor * agent.vertices

@@ -5,6 +5,7 @@ within a segment.
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -13,14 +14,12 @@ from pipeline.core.progress import track
 from pipeline.data.clips import Clip, Masks, usable_depth
 from pipeline.geometry import rigid
 from pipeline.mapping import pose_optimization, visual_odometry
-from pipeline.mapping.icp import DepthImage, depth_image
-from pipeline.mapping.odometry import JUMP_INFLATION, find_jumps, repair
+from pipeline.mapping.icp import depth_views
+from pipeline.mapping.odometry import JUMP_INFLATION, JUMP_STRIDE_PX, find_jumps, repair
 from pipeline.mapping.visual_odometry import Odometry
 from stages.register_videos.config import VoteConfig
 from stages.register_videos.votes import FrameVotes, are_close
 
-DEPTH_STRIDE_PX = 2
-"""Grid spacing of the depth that decides on tracking jumps."""
 DRIFT_RAD_S, DRIFT_M_S = np.deg2rad(0.15), 0.01
 """Drift of a phone's odometry, radians and metres per second."""
 NEAR_S = 6.0
@@ -48,11 +47,7 @@ def estimate_odometry(clip: Clip, masks: Masks, rng: np.random.Generator) -> Odo
 def device_odometry(clip: Clip) -> Odometry:
     """Return the device's odometry, repaired at tracking jumps and down-weighted there."""
     assert clip.odometry_from_camera is not None, "the recording has odometry"
-
-    def view(frame: int) -> DepthImage:
-        depth = usable_depth(clip, frame)
-        return depth_image(depth, clip.depth_intrinsics[frame], depth > 0, DEPTH_STRIDE_PX)
-
+    view = depth_views(partial(usable_depth, clip), clip.depth_intrinsics, JUMP_STRIDE_PX)
     jumps = find_jumps(clip.timestamp_s, clip.odometry_from_camera, view)
     poses = repair(clip.timestamp_s, clip.odometry_from_camera, jumps)
     factors = pose_optimization.odometry_factors(

@@ -53,11 +53,13 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") ->
     )
     rng = np.random.default_rng(config.seed)
     result = registration.register(clip, masks, maps, config, rng, features)
-    faults = [fault for folder in (inputs.frames, *inputs.walk.values()) for fault in qa.failures(folder)]
-    if isinstance(result, Rejected) and faults:
-        result = replace(result, reason=f"{result.reason}; a check of frames failed: {faults[0]}")
     if isinstance(result, Registered):
         result.poses(clip.timestamp_s).write(out)
+    else:
+        folders = inputs.frames, *inputs.walk.values()
+        faults = [fault for folder in folders for fault in qa.failures(folder)]
+        if faults:
+            result = replace(result, reason=f"{result.reason}; a check of frames failed: {faults[0]}")
     status = pictures.status(result, walk.timestamp_s, walk.world_from_camera)
     (out / "status.json").write_text(json.dumps(status, indent=1) + "\n")
     qa.write(

@@ -1,6 +1,7 @@
 """Camera trajectory: drift-corrected odometry, or motion from depth and flow without odometry."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from pipeline.data.clips import Clip
 from pipeline.data.flow import STRIDE_PX, open_flow
 from pipeline.geometry import cameras
 from pipeline.geometry.align import ransac_rigid
-from pipeline.mapping.icp import DepthImage, depth_image
+from pipeline.mapping.icp import depth_views
 from pipeline.mapping.odometry import align_gravity, chain_alignments, correct_drift
 from stages.segment_agent.free_space import clean_depth
 
@@ -30,11 +31,7 @@ class CameraPath:
 
 def estimate_trajectory(clip: Clip, flow: Path, rng: np.random.Generator) -> CameraPath:
     """Return drift-corrected poses; without odometry, frame-to-frame motion is chained first."""
-
-    def view(frame: int) -> DepthImage:
-        depth = clean_depth(clip, frame)
-        return depth_image(depth, clip.depth_intrinsics[frame], depth > 0, DEPTH_STRIDE)
-
+    view = depth_views(partial(clean_depth, clip), clip.depth_intrinsics, DEPTH_STRIDE)
     poses = clip.odometry_from_camera
     if poses is None:
         forward = open_flow(flow, 1)
