@@ -1,6 +1,6 @@
 """Options of the behaviour model and of plan sampling. Standard library only."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 Ego = Literal["yaw", "full", "world"]
@@ -35,18 +35,19 @@ class PlanSamplingConfig:
     """How plans are sampled."""
 
     method: SamplingMethod | None = None
-    """Sampler of goals (none: the schedule's). DDPM adds fresh noise at every step; DPM-Solver++, always used
-    for paths and bodies, is deterministic given the initial noise."""
+    """Sampler of goals (none: the schedule's, which is always used for paths and bodies). DDPM adds fresh
+    noise at every step; DPM-Solver++ is deterministic given the initial noise."""
     goal_steps: int = 0
     """Denoising steps of the goal; 0: the schedule's own number, 10 of DPM-Solver++, 50 of DDPM."""
-    sequence_steps: int = 10
-    """Denoising steps of path and body. Evenly spaced in log-SNR, some coincide: 9 are left of 10, 33 of
-    50."""
+    sequence_steps: int = 0
+    """Denoising steps of path and body, 0 as above. Evenly spaced in log-SNR, some coincide: 9 are left of
+    10, 33 of 50."""
     guidance: float = 1.25
     """Scale s of classifier-free guidance, for bodies at most 1. Of 1, 1.25, 1.5, 2 it has the least energy
     score of goals and the right share of flights in left-out sessions of the built-in cat."""
-    guided: Guided = "observer"
-    """Conditions that guidance amplifies."""
+    guided: Guided | None = None
+    """Conditions that guidance amplifies; none: all if the model was trained with `joint_dropout`, as in the
+    paper, otherwise the observer."""
     companions_guidance: float = 1.0
     """Guidance scale of companions, where the reference keeps all other conditions."""
     scene: bool = True
@@ -60,6 +61,8 @@ class PlanSamplingConfig:
     avoid_solid: bool = True
     """Project goals and paths out of solid voxels during denoising, and onto the supporting surface; needs a
     map, and the scene as a condition."""
+    snap_to_goal: bool = True
+    """Warp paths to end at the goals that condition them."""
     body_noise_std: float = 0.25
     """Standard deviation of the initial noise of bodies. At 0.4 the bones of a resting animal rotate from
     frame to frame as much as recorded ones, of which most is noise of the reconstruction; at 0.25 by 0.7 of
@@ -70,6 +73,12 @@ class PlanSamplingConfig:
     max_path_draws: int = 3
     """Maximum draws of a path until it reaches its goal. Paths drawn once rest too often: 67 % of the time,
     against 64 % with up to three draws and 63 % in truth (four held-out homes)."""
+
+    def networks_only(self) -> "PlanSamplingConfig":
+        """Return settings under which plans are what the networks predict, as in the paper: not projected out
+        of solid space, not snapped to their goals, drawn once.
+        """
+        return replace(self, avoid_solid=False, snap_to_goal=False, max_path_draws=1)
 
 
 @dataclass(frozen=True)

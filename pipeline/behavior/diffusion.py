@@ -33,11 +33,11 @@ class Schedule:
     """variances that grow linearly (Ho et al. 2020), or rectified flow (Liu et al. 2023): straight lines (1 -
     s) clean + s noise, scaled to unit variance; train it with `weighting` "flow\""""
     method: SamplingMethod = "dpm_solver"
-    """sampler of goals"""
+    """sampler"""
 
     @property
-    def goal_steps(self) -> int:
-        """Return the steps in which goals are sampled."""
+    def sampled_steps(self) -> int:
+        """Return the number of steps in which is sampled."""
         return 10 if self.method == "dpm_solver" else self.steps
 
     @property

@@ -26,6 +26,7 @@ from pipeline.behavior.config import (
     Control,
     Ego,
     Family,
+    Guided,
     MapLookup,
     ObservedPast,
     PlanSamplingConfig,
@@ -96,6 +97,8 @@ class Architecture:
     rate_hz: float = RATE_HZ
     ensemble_size: int = 3
     map_lookup: MapLookup = "attention"
+    guided: Guided = "observer"
+    """conditions that guidance amplifies unless a caller chooses"""
 
     @property
     def body_channels(self) -> int:
@@ -323,7 +326,7 @@ def contract(
         },
         "scaling": {name: np.asarray(value, float).tolist() for name, value in vars(scaling).items()},
         "schedule": {**asdict(schedule), "alpha_bar": schedule.alpha_bar.tolist()},
-        "sampling": asdict(PlanSamplingConfig(method=schedule.method, goal_steps=schedule.goal_steps)),
+        "sampling": asdict(PlanSamplingConfig(schedule.method, *2 * (schedule.sampled_steps,))),
     }
 
 

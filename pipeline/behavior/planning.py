@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import nn
 
-from pipeline.behavior.config import Ego, PlanSamplingConfig, SamplingMethod
+from pipeline.behavior.config import Ego, PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule, guided, sample
 from pipeline.behavior.model import (
     ROOT_CHANNELS,
@@ -33,8 +33,6 @@ from pipeline.geometry import rigid
 Array = np.ndarray
 Denoise = Callable[[Array, float], Array]
 """maps noisy samples and a step to the predicted noise"""
-SEQUENCE_METHOD: SamplingMethod = "dpm_solver"
-"""Sampler of paths and bodies; in few steps DDIM loses their variance, most of it at high frequencies."""
 
 
 class Networks(Protocol):
@@ -239,7 +237,7 @@ class Sampler:
         def code(seen: Observation) -> Array:
             return self.networks.perceive(seen.scene_grid, seen.others, seen.past, keep).repeat(count, axis=0)
 
-        full, references, by_observer = code(observation), [], sampling.guided == "observer"
+        full, references, by_observer = code(observation), [], sampling.guided != "all"
         accompanied = by_observer and observation.others.shape[1] > 1 and sampling.companions_guidance != 1
         if by_observer and (sampling.guidance != 1 or accompanied):
             references.append(code(observation.without_observer()))
@@ -260,7 +258,7 @@ class Sampler:
             return lambda x, t: self.networks.goal(x, _filled(len(x), t), code)
 
         denoisers = [denoise(code[:: codes.count]) for code in (codes.full, *codes.references)]
-        steps = sampling.goal_steps or self.schedule.goal_steps
+        steps = sampling.goal_steps or self.schedule.sampled_steps
         x = self._denoised(denoisers, (len(codes.full), 3), sampling, steps, rng)
         return codes.on_support(self.scaling.goal(x))
 
@@ -301,8 +299,8 @@ class Sampler:
         denoisers = [denoise(codes.full, float(sampling.goal)), *map(denoise, codes.references)]
         correct, spread = partial(self.paths_out_of_solid, codes), sampling.path_noise_std
         shape = (len(goal), PATH_CHANNELS, self.scaling.path_std.shape[1])
-        solver = replace(sampling, method=SEQUENCE_METHOD)
-        path = self._denoised(denoisers, shape, solver, sampling.sequence_steps, rng, correct, spread)
+        solver, steps = self.of_sequences(sampling)
+        path = self._denoised(denoisers, shape, solver, steps, rng, correct, spread)
         return self.decode_paths(codes, path, goal, sampling)
 
     def bodies(
@@ -315,17 +313,22 @@ class Sampler:
         """Draw bodies along paths; if all conditions are guided, the path is one of them."""
         control = self.scaling.scaled_path(path)
 
-        def denoise(code: Array, keep: float = float(sampling.guided == "observer")) -> Denoise:
+        def denoise(code: Array, keep: float = float(sampling.guided != "all")) -> Denoise:
             return lambda x, t: self.networks.body(
                 x, _filled(len(x), t), code, control, _filled((len(x), 1), keep)
             )
 
         shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
         denoisers = [denoise(codes.full, 1.0), *map(denoise, codes.references)]
-        solver = replace(sampling, method=SEQUENCE_METHOD, guidance=min(sampling.guidance, 1.0))
-        steps, spread = sampling.sequence_steps, sampling.body_noise_std
+        solver, steps = self.of_sequences(replace(sampling, guidance=min(sampling.guidance, 1.0)))
+        spread = sampling.body_noise_std if solver.method == "dpm_solver" else 1.0
         body = self._denoised(denoisers, shape, solver, steps, rng, spread=spread)
         return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
+
+    def of_sequences(self, sampling: PlanSamplingConfig) -> tuple[PlanSamplingConfig, int]:
+        """Return the sampler of paths and bodies, which is the schedule's, and its number of steps."""
+        steps = sampling.sequence_steps or self.schedule.sampled_steps
+        return replace(sampling, method=self.schedule.method), steps
 
     def paths_out_of_solid(
         self, codes: PlanCondition, scaled: Float[np.ndarray, "plan 4 frame"]
@@ -344,7 +347,7 @@ class Sampler:
         sampling: PlanSamplingConfig,
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Convert scaled paths to metres, snap them to the goals that condition them, and constrain them."""
-        pull = float(sampling.goal) * min(sampling.guidance, 1.0)
+        pull = float(sampling.goal and sampling.snap_to_goal) * min(sampling.guidance, 1.0)
         path = self.scaling.path(scaled, codes.start)
         return codes.constrained(snapped_to_goal(path, codes.start, goal, pull), self.scaling.rate_hz)
 

@@ -151,7 +151,10 @@ def pose_loss(
     log_error: Float[Tensor, "batch"],
     true_rotation: Float[Tensor, "batch 3 3"], true_position: Float[Tensor, "batch 3"],
 ) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch"]]:  # fmt: skip
-    """Return rotation plus translation error (radians + metres, Eq. 5) and its negative log likelihood."""
+    """Return the loss of Eq. 5, geodesic angle plus squared distance (radians, square metres), and the
+    negative log likelihood of angle plus distance.
+    """
     chord = (rotation - true_rotation).flatten(1).norm(dim=1) / 8**0.5
-    error = 2 * torch.asin(chord.clamp(max=1 - 1e-6)) + (position - true_position).norm(dim=-1)
-    return error, error.detach() * torch.exp(-log_error) + log_error
+    angle, distance = 2 * torch.asin(chord.clamp(max=1 - 1e-6)), (position - true_position).norm(dim=-1)
+    error = (angle + distance).detach()
+    return angle + distance.square(), error * torch.exp(-log_error) + log_error

@@ -1,11 +1,11 @@
 """Samplers of the baselines of Table 4, which share networks, training and perception with ours.
 
-`GaussianSampler`: the networks regress mean and standard deviation of goal, path and body (Kendall & Gal
-2017); each level is conditioned on the mean of the one above. `OneStageSampler`: path and body are denoised
-as one sequence without a goal (Tevet et al. 2022). `sampler_of` chooses by the architecture.
+`GaussianSampler`: the networks regress mean and standard deviation of goal, path (positions) and body
+(Kendall & Gal 2017); each level is conditioned on the mean of the one above. `OneStageSampler`: path and body
+are denoised as one sequence without a goal (Tevet et al. 2022). `sampler_of` chooses by the architecture.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import assert_never
 
 import numpy as np
@@ -15,7 +15,7 @@ from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import Architecture, Scaling
 from pipeline.behavior.path_encoding import PATH_CHANNELS
-from pipeline.behavior.planning import SEQUENCE_METHOD, Array, Networks, PlanCondition, SampledPlan, Sampler
+from pipeline.behavior.planning import Array, Networks, PlanCondition, SampledPlan, Sampler
 
 MEAN_STEP, LOG_STD_STEP = 0.0, 1.0
 """Steps at which the networks, given a zero sample, predict mean and log standard deviation."""
@@ -54,7 +54,7 @@ class GaussianSampler(Sampler):
         towards = self.scaling.goal(self._goal(codes)[0]) if goal is None else goal
         along = path
         if along is None:
-            along = self.scaling.path(self._path(codes, towards, sampling)[0], codes.start)
+            along = self._positions(self._path(codes, towards, sampling)[0])
         goal = self.goals(codes, sampling, rng) if goal is None else goal
         path = self.paths(codes, towards, sampling, rng) if path is None else path
         return SampledPlan(goal, path, self.bodies(codes, along, sampling, rng))
@@ -79,8 +79,8 @@ class GaussianSampler(Sampler):
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw a path towards each goal, metres, ego frame."""
-        scaled = self._sample_gaussian(self._path(codes, goal, sampling), rng, sampling.path_noise_std)
-        return self.decode_paths(codes, scaled, goal, sampling)
+        path = self._positions(self._sample_gaussian(self._path(codes, goal, sampling), rng))
+        return codes.constrained(path, self.scaling.rate_hz)
 
     def bodies(
         self,
@@ -96,7 +96,7 @@ class GaussianSampler(Sampler):
             self.networks.body(zeros, _step(zeros, t), codes.full, control, _keep_mask(zeros, 1.0))
             for t in (MEAN_STEP, LOG_STD_STEP)
         ]
-        scaled = np.swapaxes(self._sample_gaussian(outputs, rng, sampling.body_noise_std), 1, 2)
+        scaled = np.swapaxes(self._sample_gaussian(outputs, rng), 1, 2)
         return scaled * self.scaling.body_std + self.scaling.body_mean
 
     def _goal(self, codes: PlanCondition) -> list[Array]:
@@ -114,10 +114,13 @@ class GaussianSampler(Sampler):
             for t in (MEAN_STEP, LOG_STD_STEP)
         ]
 
-    def _sample_gaussian(self, outputs: list[Array], rng: np.random.Generator, spread: float = 1.0) -> Array:
+    def _positions(self, scaled: Array) -> Float[np.ndarray, "plan frame 3"]:
+        return np.swapaxes(scaled[:, :3] * self.scaling.path_std, 1, 2)
+
+    def _sample_gaussian(self, outputs: list[Array], rng: np.random.Generator) -> Array:
         mean, log_std = outputs
         noise = rng.standard_normal(mean.shape, dtype=np.float32)
-        return mean + spread * np.exp(np.clip(log_std, *LOG_STD_BOUNDS)) * noise
+        return mean + np.exp(np.clip(log_std, *LOG_STD_BOUNDS)) * noise
 
 
 @dataclass(frozen=True)
@@ -169,11 +172,11 @@ class OneStageSampler(Sampler):
             return np.concatenate([path, x[:, PATH_CHANNELS:]], axis=1)
 
         body = len(self.scaling.body_mean)
-        shape, steps = (len(codes.full), PATH_CHANNELS + body, frames), sampling.sequence_steps
+        shape = len(codes.full), PATH_CHANNELS + body, frames
         stds = sampling.path_noise_std, sampling.body_noise_std
         spread = np.repeat(stds, (PATH_CHANNELS, body))[:, None]
         denoisers = [denoise(code) for code in (codes.full, *codes.references)]
-        solver = replace(sampling, method=SEQUENCE_METHOD)
+        solver, steps = self.of_sequences(sampling)
         return self._denoised(denoisers, shape, solver, steps, rng, correct, spread)
 
 

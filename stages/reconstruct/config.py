@@ -107,7 +107,7 @@ class RayBatches:
     runs: int = 8
     """runs of consecutive frames a step in the second phase"""
     swap_first: float = 1.0
-    """probability that a ray takes another video's code as a phase begins (scene annealing)"""
+    """probability that a ray takes another video's code as optimization begins (scene annealing)"""
     swap_last: float = 0.05
     """and as it ends"""
 

@@ -42,17 +42,26 @@ class JointLoss:
     """All losses on random runs of frames."""
 
     def __init__(
-        self, problem: Problem, weights: LossWeights, batches: RayBatches, steps: int, rendered: bool = False
+        self,
+        problem: Problem,
+        weights: LossWeights,
+        batches: RayBatches,
+        steps: int,
+        rendered: bool = False,
+        begun: int = 0,
     ):
-        """``rendered``: uniform and importance samples, not samples around measured depth (001, A.1)."""
+        """``steps``: of both phases, of which ``begun`` are done; ``rendered``: uniform and importance
+        samples, not samples around measured depth (001, A.1).
+        """
         self.problem, self.weights, self.batches, self.steps = problem, weights, batches, steps
+        self.begun = begun
         self.scene_loss = SceneLoss(problem, weights, batches, steps, rendered)
         self.run_frames = RUN_FRAMES if len(problem.runs(RUN_FRAMES)) else 1
         self.first = problem.runs(self.run_frames).to(problem.device)
 
     def __call__(self, step: int, generator: Generator) -> dict[str, Tensor]:
         problem, batches, weights = self.problem, self.batches, self.weights
-        probability = swap_probability(step / self.steps, batches)
+        probability = swap_probability((self.begun + step) / self.steps, batches)
         start = self.first[pick(len(self.first), batches.runs, generator, problem.device)]
         frame = (start[:, None] + torch.arange(self.run_frames, device=problem.device)).flatten()
         pose = Pose.of(problem, frame)

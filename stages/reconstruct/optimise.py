@@ -83,7 +83,8 @@ def optimise(problem: Problem, plan: OptimizationPlan) -> dict[str, FitRecord]:
     records["template"] = _run(problem, plan, "template", TemplateLoss(problem), steps.template, agent)
     cameras = _motion_group([problem.motion.camera], rates.camera, momentum=BETA1)
     scene = [*field_groups(problem.scene, rates), cameras]
-    loss = SceneLoss(problem, plan.weights, plan.batches, steps.scene, plan.rendered)
+    annealed = steps.scene + (steps.joint if len(everything.agent_frames) else 0)
+    loss = SceneLoss(problem, plan.weights, plan.batches, annealed, plan.rendered)
     records["scene"] = _run(problem, plan, "scene", loss, steps.scene, scene)
     if len(everything.agent_frames):
         segments = list(split_segments(everything, SEGMENT_FRAMES))
@@ -98,7 +99,7 @@ def optimise(problem: Problem, plan: OptimizationPlan) -> dict[str, FitRecord]:
             corrections.data.copy_(distributed.total(corrections))
         if plan.known:
             plan.known.write(problem)
-        loss = JointLoss(problem, plan.weights, plan.batches, steps.joint, plan.rendered)
+        loss = JointLoss(problem, plan.weights, plan.batches, annealed, plan.rendered, steps.scene)
         records["joint"] = _run(problem, plan, "joint", loss, steps.joint, joint_groups(problem, rates))
     return records
 

@@ -226,7 +226,9 @@ class SceneLoss:
     def __init__(
         self, problem: Problem, weights: LossWeights, batches: RayBatches, steps: int, rendered: bool = False
     ):
-        """``rendered``: differentiable rendering alone, with uniform and importance samples (001, A.1)."""
+        """``steps``: of both phases, over which codes are annealed; ``rendered``: differentiable rendering
+        alone, with uniform and importance samples (001, A.1).
+        """
         self.problem, self.weights, self.batches, self.steps = problem, weights, batches, steps
         self.rendered = rendered
         self.measured = torch.nonzero(problem.store.scene.depth > 0)[:, 0].int()

@@ -27,8 +27,8 @@ class Config:
     """Conditions that plans are drawn without."""
     goal_steps: int = 0
     """Denoising steps of the goal; 0: as the model is best sampled."""
-    sequence_steps: int = 10
-    """Denoising steps of paths and bodies."""
+    sequence_steps: int = 0
+    """Denoising steps of paths and bodies; 0: as the model is best sampled."""
     places: SubgoalSource = "none"
     """Sub-goals that no file gives: sampled from where the animal has been, or the behaviour model's goals
     one after the other; none: a take of the behaviour model."""

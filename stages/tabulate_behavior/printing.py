@@ -12,6 +12,12 @@ END_TO_END = (
     ("goal_energy_score_m", "energy score [m]"),
     ("solid", "in solid"),
 )
+NETWORKS = (
+    ("networks_goal_minde_m", "goal [m]"),
+    ("networks_goal_energy_score_m", "energy score [m]"),
+    ("networks_path_minade_m", "path [m]"),
+    ("networks_solid", "in solid"),
+)
 TRUTH_FED = (
     ("truth_fed_path_minade_m", "path [m]"),
     ("truth_fed_orientation_minade_rad", "orientation [rad]"),
@@ -26,9 +32,11 @@ FLIGHT = (
 
 def tables(figures: Mapping[str, float | None], methods: tuple[str, ...]) -> str:
     """Return Tables 4 and 5 of the paper, and how often the animal flees, as text: mean [95 % interval]."""
+    projected = "plans projected out of solid space, snapped to goals, redrawn"
     parts = [
-        table("Table 4: end to end, best of 16 samples", END_TO_END, figures, methods),
-        table("Table 5: fed with the true goal, and the true path", TRUTH_FED, figures, methods),
+        table(f"Table 4: end to end, best of 16 samples; {projected}", END_TO_END, figures, methods),
+        table("Table 4 by the networks alone, as in the paper", NETWORKS, figures, methods),
+        table("Table 5: given the true goal, and the true path; networks alone", TRUTH_FED, figures, methods),
     ]
     if "behavior/ats/flees_true" in figures:
         walking, standing = (figures[f"behavior/ats/flees_true{end}"] for end in ("", "_standing"))

@@ -51,9 +51,9 @@ def _scores(
                     if name in GOAL_SCORES or drawn[0].path is not None
                 }
             )
-        found |= {
-            f"end_to_end/{name}": np.concatenate([part[name] for part in parts])[None] for name in parts[0]
-        }
+        for name in parts[0]:  # no plan is projected or snapped, so two protocols are the same
+            values = np.concatenate([part[name] for part in parts])[None]
+            found |= {f"{protocol}/{name}": values for protocol in ("end_to_end", "networks")}
     return MethodScores(like.goal_window, like.plan_window, found, like.past, like.future)
 
 

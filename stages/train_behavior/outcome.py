@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.behavior.config import Guided, SceneEncoder
+from pipeline.behavior.config import SceneEncoder
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import Architecture
 from pipeline.behavior.planning import TorchNetworks
@@ -53,6 +53,7 @@ def architecture_for(config: Config, data: BehaviorData, scenes: Scenes) -> Arch
         rate_hz=data.rate_hz,
         ensemble_size=config.ensemble_size,
         map_lookup=config.map_lookup,
+        guided="all" if config.training.objective.joint_dropout else "observer",
     )
 
 
@@ -80,7 +81,6 @@ def write_exported(
     schedule: Schedule,
     data: BehaviorData,
     scenes: Scenes,
-    guided: Guided,
     *,
     seed: int,
 ) -> None:
@@ -97,5 +97,5 @@ def write_exported(
         good="goals that spread over where the animal could go and shift away from a close observer",
         bad="goals inside furniture, goals that ignore an approach, or an animal that shies at a far person",
         checks=pictures.checks(fitted.record, reaction, difference),
-        pictures=pictures.pictures(sampler, moments, scenes, fitted.record, guided, seed=seed),
+        pictures=pictures.pictures(sampler, moments, scenes, fitted.record, architecture.guided, seed=seed),
     )

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.behavior.config import Guided
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import TRAIN, BehaviorData, frames_from_seconds
@@ -66,8 +65,7 @@ def run(
     rest = data.agent_from_bone_rest
     outcome.write_trained(out, fitted, architecture, schedule, rest, accompanied=data.accompanied)
     if config.export:
-        guided: Guided = "all" if config.training.objective.joint_dropout > 0 else "observer"
-        outcome.write_exported(out, fitted, architecture, schedule, data, scenes, guided, seed=config.seed)
+        outcome.write_exported(out, fitted, architecture, schedule, data, scenes, seed=config.seed)
 
 
 def _homes(inputs: Inputs, config: Config) -> tuple[ReconstructedHome | None, list[Path]]:

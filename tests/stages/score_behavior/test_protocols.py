@@ -11,7 +11,7 @@ from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.diffusion import STANDARD
 from pipeline.behavior.model import BehaviorNets, Scaling, channels_from_bones
 from pipeline.behavior.perception import world_from_ego
-from pipeline.behavior.planning import Observation, TorchNetworks
+from pipeline.behavior.planning import Observation, Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
 from pipeline.geometry import rigid
 from pipeline.rivals import samplers
@@ -85,8 +85,10 @@ def test_every_method_goes_through_the_protocols_it_knows(changes):
     data = wandering().with_horizon(architecture.future)
     found = protocols.scores(untrained(architecture), data, architecture.family, EFFORT)
     assert ("truth_fed/path_minade_m" in found) == (architecture.family != "one_stage")
-    assert len(found["goal_window"]) == len(found["end_to_end/goal_minde_m"]) > 1
-    assert len(found["plan_window"]) == len(found["end_to_end/path_minade_m"])
+    for protocol in ("end_to_end", "networks"):
+        assert len(found["goal_window"]) == len(found[f"{protocol}/goal_minde_m"]) > 1
+        assert len(found["plan_window"]) == len(found[f"{protocol}/path_minade_m"])
+    assert found["networks/solid"].shape == found["end_to_end/solid"].shape
     assert all(np.isfinite(value).all() for name, value in found.items() if "/" in name)
     assert (found["goal_window"][:, 0] == 2).all()
     again = protocols.scores(untrained(architecture), data, architecture.family, EFFORT)
@@ -136,11 +138,36 @@ def test_a_gaussian_draws_what_its_networks_tell():
     goals = sampler.goals(codes, PlanSamplingConfig(), np.random.default_rng(0))
     drawn = scaling.scaled_goal(goals)
     np.testing.assert_allclose([drawn.mean(), drawn.std()], [2, 0.5], rtol=0.03)
-    path = sampler.plan_paths(behavior_observation(), PlanSamplingConfig(), np.random.default_rng(0), count=8)
-    np.testing.assert_allclose(path[:, -1], scaling.goal(np.full((8, 3), 2.0)), atol=1e-5)
-    np.testing.assert_allclose(
-        np.diff(path, axis=1), np.broadcast_to(path[:, -1:] / 56, (8, 55, 3)), atol=0.01
+    path = sampler.plan_paths(
+        behavior_observation(), PlanSamplingConfig(), np.random.default_rng(0), count=99
     )
+    np.testing.assert_allclose(path.mean(0), np.ones((56, 3)), atol=0.005)
+    np.testing.assert_allclose(path.std(), np.exp(samplers.LOG_STD_BOUNDS[0]), rtol=0.03)
+
+
+@pytest.mark.parametrize(("method", "calls"), [("dpm_solver", 9), ("ddpm", 50)])
+def test_networks_alone_sample_by_the_schedule_and_do_not_snap_to_goals(method, calls):
+    class Counted:
+        def __init__(self):
+            self.calls = 0
+
+        def perceive(self, grid, others, past, keep):
+            return np.zeros((len(past), 1), np.float32)
+
+        def path(self, x, t, condition, control, keep):
+            self.calls += 1
+            return x
+
+    scaling, counted = Scaling(np.ones(3), np.ones(4), np.ones((3, 56)), np.zeros(6), np.ones(6)), Counted()
+    sampler, goal = Sampler(counted, replace(STANDARD, method=method), scaling), np.full((4, 3), 2.0)
+    snapped = PlanSamplingConfig(guidance=1.0, max_path_draws=1)
+    alone, ends = snapped.networks_only(), []
+    for sampling in (snapped, alone):
+        codes, rng = sampler.codes(behavior_observation(), sampling, 4), np.random.default_rng(0)
+        ends.append(np.abs(sampler.paths(codes, goal, sampling, rng)[:, -1] - goal).max())
+    assert counted.calls == 2 * calls
+    assert ends[0] < ends[1]
+    assert not alone.avoid_solid
 
 
 def behavior_observation():

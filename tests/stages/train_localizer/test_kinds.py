@@ -86,7 +86,7 @@ def test_the_likeliest_prediction_is_the_error_itself():
         turned,
         torch.tensor([0.0, 0.0, 0.1]).expand(400, 3),
     )
-    assert torch.allclose(error, torch.tensor(0.3), atol=1e-4), "0.2 rad + 0.1 m"
+    assert torch.allclose(error, torch.tensor(0.21), atol=1e-4), "0.2 rad + (0.1 m)^2"
     assert abs(float(told[surprise.argmin()]) - np.log(0.3)) < 0.02
 
 
