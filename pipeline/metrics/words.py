@@ -33,7 +33,7 @@ STEMS = {
     "depth_acc": "depth within 0.1 m",
     "depth_acc_agent_filmed": "depth within 0.1 m, animal, while the session films it",
     "epe": "end-point error of the flow",
-    "foot_slide": "foot skate",
+    "foot_slide": "foot skate, slowest foot near the scene",
     "goal_energy_score": "energy score of goals",
     "goal_minde": "goal error, best of 16",
     "heldout_cameras": "source of the held-out phone's cameras",

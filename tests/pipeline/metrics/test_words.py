@@ -24,7 +24,7 @@ from pipeline.metrics.words import describe
 "surface was compared"
 ), ""),
         ("flow/epe_px_agent_mean", "end-point error of the flow, animal, mean", "px"),
-        ("behavior/recorded/foot_slide_m_s", "recorded motion: foot skate", "m/s"),
+        ("behavior/recorded/foot_slide_m_s", "recorded motion: foot skate, slowest foot near the scene", "m/s"),
         ("masks/iou_mean", "overlap (IoU), mean", ""),
         ("else/never_heard_of", "never heard of", ""),
     ],
