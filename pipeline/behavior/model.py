@@ -282,6 +282,7 @@ def contract(
     """Return the content of `behavior.json`, for samplers in other languages."""
     bone = ["rotation_x", "rotation_y", "rotation_z", "shift_x", "shift_y", "shift_z"]
     root = ["right_x", "right_y", "right_z", "up_x", "up_y", "up_z"]
+    steps = schedule.sampled_steps
     return {
         "units": "metres, radians, seconds",
         "up": [0, 1, 0],
@@ -326,7 +327,7 @@ def contract(
         },
         "scaling": {name: np.asarray(value, float).tolist() for name, value in vars(scaling).items()},
         "schedule": {**asdict(schedule), "alpha_bar": schedule.alpha_bar.tolist()},
-        "sampling": asdict(PlanSamplingConfig(schedule.method, *2 * (schedule.sampled_steps,))),
+        "sampling": asdict(PlanSamplingConfig(schedule.method, goal_steps=steps, sequence_steps=steps)),
     }
 
 
