@@ -64,9 +64,8 @@ class PlanSamplingConfig:
     snap_to_goal: bool = True
     """Warp paths to end at the goals that condition them."""
     body_noise_std: float = 0.25
-    """Standard deviation of the initial noise of bodies. At 0.4 the bones of a resting animal rotate from
-    frame to frame as much as recorded ones, of which most is noise of the reconstruction; at 0.25 by 0.7 of
-    that, feet skate less, and the best of 16 bodies is nearer (held-out session)."""
+    """Standard deviation of the initial noise of bodies; the best of 16 are nearest at 0.25 in each of three
+    sessions left out of training (built-in cat; `docs/behavior.md`)."""
     path_noise_std: float = 1.0
     """Standard deviation of the initial noise of paths. At 0, in one step, a path is the mean of all paths to
     its goal."""

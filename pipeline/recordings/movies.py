@@ -14,7 +14,7 @@ import av.container
 import av.error
 import numpy as np
 from av.stream import Disposition
-from av.video.reformatter import ColorPrimaries, ColorTrc, VideoReformatter
+from av.video.reformatter import ColorPrimaries, Colorspace, ColorTrc, VideoReformatter
 from jaxtyping import Float, UInt8
 
 from pipeline.core.errors import InputError
@@ -38,6 +38,9 @@ MAX_ASPECT = 2.0
 """maximum pixel aspect ratio; a larger one is a broken header"""
 HDR = (ColorTrc.ARIB_STD_B67, ColorTrc.SMPTE2084)
 """transfer curves of video with a high dynamic range: HLG (iPhone, also Dolby Vision), PQ (HDR10, HDR10+)"""
+UNSPECIFIED, HD_ROWS = 2, 720
+"""code of an unnamed color matrix (ITU-T H.273), and the height from which such video is read by the matrix
+of BT.709, as players do; below it, and in MJPEG, by that of BT.601"""
 
 
 class Movie:
@@ -54,6 +57,7 @@ class Movie:
             shown_s = (self._pts - self._pts[0]) * float(stream.time_base)
             self.timestamp_s = shown_s / _slowdown(shown_s, container.metadata.get(CAPTURE_RATE, ""))
             aspect = float(stream.sample_aspect_ratio or 1) if square_pixels else 1.0
+            self._hd = min(stream.width, stream.height) >= HD_ROWS and stream.codec_context.name != "mjpeg"
         self._decoder: Iterator[av.VideoFrame] | None = None
         self._position = 0
         self._tone_mapper = VideoReformatter()
@@ -84,6 +88,8 @@ class Movie:
     def _rgb(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "height width 3"]:
         """Convert to 8 bits; HDR to sRGB, clipped above diffuse white (203 cd/m2, ITU-R BT.2408)."""
         (height, width), hdr = self.size, frame.color_trc in HDR
+        if self._hd and frame.colorspace == UNSPECIFIED:
+            frame.colorspace = Colorspace.ITU709
         kind = "gbrp16le" if hdr else "rgb24"  # FFmpeg 8 mixes the channels of rgb48le where widths are odd
         rgb = frame.to_ndarray(format=kind, width=width, height=height)
         if not hdr:

@@ -12,13 +12,14 @@ import av
 import numpy as np
 import pytest
 import trimesh
+from av.video.reformatter import Colorspace
 
 from pipeline.core.errors import InputError
 from pipeline.data import images
 from pipeline.geometry import rigid
 from pipeline.recordings import extraction, stray_scanner, tum
 from pipeline.recordings.formats import format_of, open_recording
-from pipeline.recordings.movies import Movie
+from pipeline.recordings.movies import UNSPECIFIED, Movie
 from pipeline.workflow.sources import recording_digest
 from tests.pipeline.recordings import made_formats
 from tests.stages.extract_frames.made_recordings import Made, walk, write_zip
@@ -376,6 +377,21 @@ def test_hdr_has_the_colours_of_an_ordinary_video(tmp_path, curve):
     found = Movie(tmp_path / "a.mov", square_pixels=True).read(1)
     assert found.shape == (32, 161, 3)
     np.testing.assert_allclose(found[16, 16::32], color, atol=8)
+
+
+@pytest.mark.parametrize(("rows", "matrix"), [(720, Colorspace.ITU709), (480, Colorspace.SMPTE170M)])
+def test_video_that_names_no_color_matrix_is_read_by_that_of_its_size(tmp_path, rows, matrix):
+    color = np.array([200, 40, 40], np.uint8)
+    made = av.VideoFrame.from_ndarray(np.tile(color, (rows, rows, 1)), format="rgb24")
+    with av.open(str(tmp_path / "a.mp4"), "w") as written:
+        track = written.add_stream("libx264", rate=10)
+        track.width, track.height, track.pix_fmt, track.options = rows, rows, "yuv420p", {"crf": "4"}
+        for time in range(3):
+            frame = made.reformat(format="yuv420p", dst_colorspace=matrix)
+            frame.colorspace, frame.pts = UNSPECIFIED, time
+            written.mux(track.encode(frame))
+        written.mux(track.encode())
+    np.testing.assert_allclose(Movie(tmp_path / "a.mp4").read(1)[9, 9], color, atol=3)
 
 
 def _remux(path, source, *, still=False, **options):
