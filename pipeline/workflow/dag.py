@@ -133,6 +133,7 @@ OF_HOMES = (
     *(Need(name, option="homes", homes="other", flow="recordings") for name in HOME_ARTIFACTS),
 )
 FLOW: tuple[Node, ...] = (
+    # Make starts the first job that is ready: first what the longest chains of jobs wait for.
     Node("synthetic_capture", "synthesize_capture", threads=2),
     Node("frames", "extract_frames", (RECORDING,), roles=(*VIEWED, "heldout"), seconds_per_frame=0.006),
     Node(
@@ -143,6 +144,26 @@ FLOW: tuple[Node, ...] = (
         table="extract_frames",
         mapped=True,
         seconds_per_frame=0.006,
+    ),
+    Node("feature_basis", "fit_feature_basis", (Need("frames", VIEWED, ("train", "none"), measured=True),)),
+    Node("features", "extract_features", ("frames", "feature_basis"), roles=VIEWED),
+    Node("scene_template", "build_scene_template", merging("frames", "features", roles=("walkthrough",))),
+    Node(
+        "scene_localizer",
+        "train_localizer",
+        ("feature_basis", "scene_template", *merging("frames", roles=("walkthrough",))),
+        fixed={"target": "scene"},
+        gpu=1,
+        distributed=True,
+    ),
+    Node(
+        "estimated_frames",
+        "estimate_depth",
+        ("pictures", Need("frames", roles=("walkthrough",)), "scene_template"),
+        roles=AGENT,
+        mapped=True,
+        stands_in_for="frames",
+        seconds_per_frame=0.5,
     ),
     Node("flow", "estimate_flow", ("frames",), roles=AGENT, seconds_per_frame=0.06),
     Node(
@@ -161,30 +182,10 @@ FLOW: tuple[Node, ...] = (
         begins_animal=True,
         seconds_per_frame=0.11,
     ),
-    Node("feature_basis", "fit_feature_basis", (Need("frames", VIEWED, ("train", "none"), measured=True),)),
-    Node("features", "extract_features", ("frames", "feature_basis"), roles=VIEWED),
-    Node("scene_template", "build_scene_template", merging("frames", "features", roles=("walkthrough",))),
-    Node(
-        "estimated_frames",
-        "estimate_depth",
-        ("pictures", Need("frames", roles=("walkthrough",)), "scene_template"),
-        roles=AGENT,
-        mapped=True,
-        stands_in_for="frames",
-        seconds_per_frame=0.5,
-    ),
     Node(
         "agent_template",
         "build_agent_template",
         merging("frames", "masks", "features", roles=("turnaround",)),
-    ),
-    Node(
-        "scene_localizer",
-        "train_localizer",
-        ("feature_basis", "scene_template", *merging("frames", roles=("walkthrough",))),
-        fixed={"target": "scene"},
-        gpu=1,
-        distributed=True,
     ),
     Node(
         "agent_localizer",
@@ -255,7 +256,6 @@ FLOW: tuple[Node, ...] = (
         distributed=True,
         flows=BOTH,
     ),
-    Node("longterm", "train_longterm", ("reconstruction", "behavior_data"), resumable=True, distributed=True),
     Node("longterm_world", "synthesize_capture.motions", on_demand=True),
     Node(
         "longterm_ablations",
@@ -308,14 +308,6 @@ FLOW: tuple[Node, ...] = (
         ("reconstruction", "behavior_data", "behavior", *LONGTERM_STUDIES),
         on_demand=True,
     ),
-    Node("simulator", "export_simulator", READ_BY_PAGES),
-    Node(
-        "home_simulator",
-        "export_simulator.home",
-        tuple(Need(name, others=True) for name in READ_BY_PAGES),
-        table="export_simulator",
-        of_several=True,
-    ),
     Node(
         "reconstruction_metrics",
         "evaluate.reconstruction_metrics",
@@ -327,6 +319,15 @@ FLOW: tuple[Node, ...] = (
         table="evaluate",
         gpu=1,
         extra_inputs=("clicks.json",),
+    ),
+    Node("longterm", "train_longterm", ("reconstruction", "behavior_data"), resumable=True, distributed=True),
+    Node("simulator", "export_simulator", READ_BY_PAGES),
+    Node(
+        "home_simulator",
+        "export_simulator.home",
+        tuple(Need(name, others=True) for name in READ_BY_PAGES),
+        table="export_simulator",
+        of_several=True,
     ),
     Node(
         "evaluation",
