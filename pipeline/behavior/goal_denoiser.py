@@ -117,26 +117,28 @@ class CleanGoalEstimate(nn.Module):
 
 
 class RestLikelihood(nn.Module):
-    """Likelihood of a noisy goal under Gaussian priors of several spreads about the current position."""
+    """Likelihood of a noisy goal under Gaussian priors of several deviations about the current position."""
 
-    SPREADS = (0.0, 0.05, 0.2, 0.6)
+    REST_STDS = (0.0, 0.05, 0.2, 0.6)
     """standard deviations of the goals of resting animals, in scaled units"""
-    NUMBERS = 5 * len(SPREADS)
+    NUMBERS = 5 * len(REST_STDS)
     MIN, MAX = -4.0, 5.0
     """bounds of its outputs"""
-    spread: Tensor
+    rest_variance: Tensor
 
     def __init__(self):
         super().__init__()
-        self.register_buffer("spread", torch.tensor(self.SPREADS).square(), persistent=False)
+        self.register_buffer("rest_variance", torch.tensor(self.REST_STDS).square(), persistent=False)
 
     def forward(
         self, mean: Float[Tensor, "batch 3"], variance: Float[Tensor, "batch 1"]
     ) -> Float[Tensor, "batch 20"]:
         """Return unnormalised likelihoods, their logarithms, and likelihood-weighted posterior means."""
-        log_likelihood = -mean.square().sum(-1, keepdim=True) / (2 * (variance + self.spread))
+        log_likelihood = -mean.square().sum(-1, keepdim=True) / (2 * (variance + self.rest_variance))
         likelihood = log_likelihood.exp()
-        shrunk = mean[:, None] * (likelihood * self.spread / (variance + self.spread))[..., None]
+        shrunk = (
+            mean[:, None] * (likelihood * self.rest_variance / (variance + self.rest_variance))[..., None]
+        )
         logarithm = (log_likelihood / 5).clamp_min(self.MIN)
         return torch.cat([likelihood, logarithm, shrunk.flatten(1).clamp(-self.MAX, self.MAX)], dim=-1)
 

@@ -297,10 +297,10 @@ class Sampler:
             )
 
         denoisers = [denoise(codes.full, float(sampling.goal)), *map(denoise, codes.references)]
-        correct, spread = partial(self.paths_out_of_solid, codes), sampling.path_noise_std
+        correct = partial(self.paths_out_of_solid, codes)
         shape = (len(goal), PATH_CHANNELS, self.scaling.path_std.shape[1])
         solver, steps = self.of_sequences(sampling)
-        path = self._denoised(denoisers, shape, solver, steps, rng, correct, spread)
+        path = self._denoised(denoisers, shape, solver, steps, rng, correct, solver.path_noise_std)
         return self.decode_paths(codes, path, goal, sampling)
 
     def bodies(
@@ -321,14 +321,18 @@ class Sampler:
         shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
         denoisers = [denoise(codes.full, 1.0), *map(denoise, codes.references)]
         solver, steps = self.of_sequences(replace(sampling, guidance=min(sampling.guidance, 1.0)))
-        spread = sampling.body_noise_std if solver.method == "dpm_solver" else 1.0
-        body = self._denoised(denoisers, shape, solver, steps, rng, spread=spread)
+        body = self._denoised(denoisers, shape, solver, steps, rng, noise_std=solver.body_noise_std)
         return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
 
     def of_sequences(self, sampling: PlanSamplingConfig) -> tuple[PlanSamplingConfig, int]:
-        """Return the sampler of paths and bodies, which is the schedule's, and its number of steps."""
-        steps = sampling.sequence_steps or self.schedule.sampled_steps
-        return replace(sampling, method=self.schedule.method), steps
+        """Return the sampler of paths and bodies, which is the schedule's, and its number of steps.
+
+        DDPM, which adds noise at every step, begins with unit variance.
+        """
+        steps, method = sampling.sequence_steps or self.schedule.sampled_steps, self.schedule.method
+        if method == "ddpm":
+            sampling = replace(sampling, path_noise_std=1.0, body_noise_std=1.0)
+        return replace(sampling, method=method), steps
 
     def paths_out_of_solid(
         self, codes: PlanCondition, scaled: Float[np.ndarray, "plan 4 frame"]
@@ -359,10 +363,10 @@ class Sampler:
         count: int,
         rng: np.random.Generator,
         correct: Callable[[Array], Array] | None = None,
-        spread: float | Array = 1.0,
+        noise_std: float | Array = 1.0,
     ) -> Array:
         def draw() -> Array:
-            return (spread * rng.standard_normal(shape, dtype=np.float32)).astype(np.float32)
+            return (noise_std * rng.standard_normal(shape, dtype=np.float32)).astype(np.float32)
 
         denoise = guided(denoisers, (sampling.guidance, sampling.companions_guidance))
         method = sampling.method or self.schedule.method

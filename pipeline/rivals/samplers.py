@@ -173,11 +173,11 @@ class OneStageSampler(Sampler):
 
         body = len(self.scaling.body_mean)
         shape = len(codes.full), PATH_CHANNELS + body, frames
-        stds = sampling.path_noise_std, sampling.body_noise_std
-        spread = np.repeat(stds, (PATH_CHANNELS, body))[:, None]
         denoisers = [denoise(code) for code in (codes.full, *codes.references)]
         solver, steps = self.of_sequences(sampling)
-        return self._denoised(denoisers, shape, solver, steps, rng, correct, spread)
+        stds = solver.path_noise_std, solver.body_noise_std
+        noise_std = np.repeat(stds, (PATH_CHANNELS, body))[:, None]
+        return self._denoised(denoisers, shape, solver, steps, rng, correct, noise_std)
 
 
 def _step(x: Array, t: float) -> Array:

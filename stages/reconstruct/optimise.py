@@ -193,7 +193,7 @@ def _fit_segment(
     """Pose the template in one segment of frames, with a ``share`` of the usual rays; returns the loss."""
     loss = SegmentLoss(problem, posed, plan.weights, share)
     fit(
-        modules={"chunk": posed},
+        modules={"segment": posed},
         optimizer=torch.optim.AdamW(posed.groups()),
         loss=lambda step, generator: loss(step / steps, generator),
         steps=steps,

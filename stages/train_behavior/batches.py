@@ -201,15 +201,15 @@ def statistics_from_windows(windows: TrainingWindows, turn_rad: float) -> Window
     heading_std = (1 + np.abs(mean[:3]).max()) / STANDARD.clip
     body_std = np.concatenate([np.full(3, heading_std), std[3:]])
     strides = velocity_channels_from_path(tracks.root[:, past:], tracks.root[:, past - 1], rate_hz)
-    velocity_std = np.array([[*_spread(strides[..., :3].double().numpy().reshape(-1, 3)), 1.0]])
-    goal_std = _spread(with_powered_length(future[:, -1], GOAL_LENGTH_POWER))
+    velocity_std = np.array([[*_axis_rms(strides[..., :3].double().numpy().reshape(-1, 3)), 1.0]])
+    goal_std = _axis_rms(with_powered_length(future[:, -1], GOAL_LENGTH_POWER))
     scaling = Scaling(goal_std, velocity_std, path_std, mean, body_std, rate_hz)
     position = tracks.root[:, :past].std().clip(MIN_WAY_STD).expand(3)
     mean, std = (torch.from_numpy(numbers).float() for numbers in (mean, std))
     return WindowStatistics(scaling, torch.cat([torch.zeros(3), mean]), torch.cat([position, std]))
 
 
-def _spread(vectors: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "3"]:
+def _axis_rms(vectors: Float[np.ndarray, "row 3"]) -> Float[np.ndarray, "3"]:
     """Return the root mean square per axis, horizontal axes pooled."""
     square = (vectors**2).mean(0)
     return np.sqrt([square[::2].mean(), square[1], square[::2].mean()]).clip(MIN_WAY_STD)
