@@ -45,9 +45,6 @@ class PlanSamplingConfig:
     guidance: float = 1.25
     """Scale s of classifier-free guidance, for bodies at most 1. Of 1, 1.25, 1.5, 2 it has the least energy
     score of goals and the right share of flights in left-out sessions of the built-in cat."""
-    guided: Guided | None = None
-    """Conditions that guidance amplifies; none: all if the model was trained with `joint_dropout`, as in the
-    paper, otherwise the observer."""
     companions_guidance: float = 1.0
     """Guidance scale of companions, where the reference keeps all other conditions."""
     scene: bool = True

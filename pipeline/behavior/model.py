@@ -98,7 +98,7 @@ class Architecture:
     ensemble_size: int = 3
     map_lookup: MapLookup = "attention"
     guided: Guided = "observer"
-    """conditions that guidance amplifies unless a caller chooses"""
+    """conditions that guidance amplifies: all if trained with `joint_dropout`"""
 
     @property
     def body_channels(self) -> int:

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import nn
 
-from pipeline.behavior.config import Ego, PlanSamplingConfig
+from pipeline.behavior.config import Ego, Guided, PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule, guided, sample
 from pipeline.behavior.model import (
     ROOT_CHANNELS,
@@ -185,6 +185,8 @@ class Sampler:
     networks: Networks
     schedule: Schedule
     scaling: Scaling
+    guided: Guided = "observer"
+    """conditions that guidance amplifies"""
 
     def plan(
         self,
@@ -237,7 +239,7 @@ class Sampler:
         def code(seen: Observation) -> Array:
             return self.networks.perceive(seen.scene_grid, seen.others, seen.past, keep).repeat(count, axis=0)
 
-        full, references, by_observer = code(observation), [], sampling.guided != "all"
+        full, references, by_observer = code(observation), [], self.guided == "observer"
         accompanied = by_observer and observation.others.shape[1] > 1 and sampling.companions_guidance != 1
         if by_observer and (sampling.guidance != 1 or accompanied):
             references.append(code(observation.without_observer()))
@@ -313,7 +315,7 @@ class Sampler:
         """Draw bodies along paths; if all conditions are guided, the path is one of them."""
         control = self.scaling.scaled_path(path)
 
-        def denoise(code: Array, keep: float = float(sampling.guided != "all")) -> Denoise:
+        def denoise(code: Array, keep: float = float(self.guided == "observer")) -> Denoise:
             return lambda x, t: self.networks.body(
                 x, _filled(len(x), t), code, control, _filled((len(x), 1), keep)
             )

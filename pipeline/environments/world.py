@@ -116,7 +116,7 @@ class AnimalWorld:
         architecture, nets, scaling, schedule, _ = behavior.load(build / "behavior")
         behavior.refuse_unplayable(architecture, str(build))
         data = BehaviorData.load(build / "behavior_data")
-        sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
+        sampler = Sampler(TorchNetworks(nets, device), schedule, scaling, architecture.guided)
         habitat = settle(build, data, homes)
         camera = RgbdCamera.load(build, homes or (build,)) if "rgbd" in config.observations else None
         return cls(sampler, habitat, architecture.ego, config, camera=camera)

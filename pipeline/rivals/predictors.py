@@ -154,11 +154,7 @@ class Ats:
             volume = (volume if isinstance(volume, Scenes) else Scenes.of(volume)).without_features()
         sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
         uses_scene = architecture.ablated_input != "scene" and architecture.scene != "none"
-        sampling = replace(
-            sampling,
-            avoid_solid=sampling.avoid_solid and uses_scene,
-            guided=sampling.guided or architecture.guided,
-        )
+        sampling = replace(sampling, avoid_solid=sampling.avoid_solid and uses_scene)
         return cls(sampler, volume, rest, architecture.ego, sampling)
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:

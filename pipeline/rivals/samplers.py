@@ -29,11 +29,11 @@ def sampler_of(
     """Return the sampler for the architecture's family."""
     match architecture.family:
         case "diffusion":
-            return Sampler(networks, schedule, scaling)
+            return Sampler(networks, schedule, scaling, architecture.guided)
         case "one_stage":
-            return OneStageSampler(networks, schedule, scaling)
+            return OneStageSampler(networks, schedule, scaling, architecture.guided)
         case "gaussian":
-            return GaussianSampler(networks, schedule, scaling)
+            return GaussianSampler(networks, schedule, scaling, architecture.guided)
         case _:
             assert_never(architecture.family)
 

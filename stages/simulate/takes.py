@@ -230,7 +230,7 @@ def _simulator(
         past="past" not in c.without,
         goal="goal" not in c.without,
     )
-    sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
+    sampler = Sampler(TorchNetworks(nets, device), schedule, scaling, architecture.guided)
     return Simulator(sampler, data, scenes, architecture.ego, sampling=sampling, chaining=chaining)
 
 

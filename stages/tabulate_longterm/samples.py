@@ -65,7 +65,7 @@ def rows(
 ) -> Float[np.ndarray, "window 2 4"]:
     """Return `NAMES` of each window's plan before and after optimisation."""
     architecture, nets, scaling, schedule, _ = behavior.load(model)
-    sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
+    sampler = Sampler(TorchNetworks(nets, device), schedule, scaling, architecture.guided)
     context, future = data.windows(windows)
     scenes = Scenes.load(behavior_data, data.videos)
     observation = observe(context, scenes, data.agent_from_bone_rest, architecture.ego)

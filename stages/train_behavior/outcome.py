@@ -97,5 +97,5 @@ def write_exported(
         good="goals that spread over where the animal could go and shift away from a close observer",
         bad="goals inside furniture, goals that ignore an approach, or an animal that shies at a far person",
         checks=pictures.checks(fitted.record, reaction, difference),
-        pictures=pictures.pictures(sampler, moments, scenes, fitted.record, architecture.guided, seed=seed),
+        pictures=pictures.pictures(sampler, moments, scenes, fitted.record, seed=seed),
     )

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 from matplotlib.figure import Figure
 
-from pipeline.behavior.config import Guided, PlanSamplingConfig
+from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.planning import Observation, Sampler
 from pipeline.behavior.scenes import Scenes
@@ -32,7 +32,7 @@ CAPTIONS = {
 
 
 def pictures(
-    sampler: Sampler, moments: SampledMoments, scenes: Scenes, record: FitRecord, guided: Guided, *, seed: int
+    sampler: Sampler, moments: SampledMoments, scenes: Scenes, record: FitRecord, *, seed: int
 ) -> list[Picture]:
     """Draw a few training windows, sampled under different conditions."""
     chosen = np.linspace(0, len(moments.observation) - 1, SHOWN_WINDOWS + 2).astype(int)[1:-1]
@@ -56,7 +56,7 @@ def pictures(
         goals=fans(rooms, sampler, some, frame, removed, seed),
         guidance=fans(rooms, sampler, close, frame, strength, seed),
         paths=fans(rooms, sampler, some, frame, with_scene, seed, paths=True),
-        guided_paths=guided_paths(rooms, sampler, some, frame, guided, seed),
+        guided_paths=guided_paths(rooms, sampler, some, frame, seed),
         losses=plots.loss_curves({"training": record.terms}),
     )
 
@@ -118,13 +118,12 @@ def guided_paths(
     sampler: Sampler,
     observation: Observation,
     frame: Float[np.ndarray, "window 4 4"],
-    guided: Guided,
     seed: int,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Draw paths to one goal per window, the farthest of a few sampled ones, by scale of guidance."""
     windows, scales = len(frame), (1, 0.5, 0)
     figure, grid = windows_panels(len(scales), windows)
-    plain = PlanSamplingConfig(guided=guided, max_path_draws=1)
+    plain = PlanSamplingConfig(max_path_draws=1)
     codes = sampler.codes(observation, plain, GUIDED_PATHS)
     sampled = sampler.goals(codes, plain, np.random.default_rng(seed))
     sampled = sampled.reshape(windows, GUIDED_PATHS, 3)

@@ -495,12 +495,11 @@ def test_reactions_measure_a_known_animal(data, windows):
 def test_paths_are_drawn_by_scale_of_guidance_for_every_window(data, windows):
     seen = moments(data, Scenes.of(room()), ARCHITECTURE, 2)
     statistics = statistics_from_windows(windows, 0.0)
-    sampler = Sampler(
-        TorchNetworks(initial_nets(ARCHITECTURE, Schedule(), statistics, 0)), Schedule(), statistics.scaling
-    )
+    networks = TorchNetworks(initial_nets(ARCHITECTURE, Schedule(), statistics, 0))
     rooms = [pictures.RoomMap(room())] * 2
     for guided in ("observer", "all"):
-        image = pictures.guided_paths(rooms, sampler, seen.observation, seen.world_from_ego, guided, 0)
+        sampler = Sampler(networks, Schedule(), statistics.scaling, guided)
+        image = pictures.guided_paths(rooms, sampler, seen.observation, seen.world_from_ego, 0)
         rows = np.array_split(image.astype(int), 3)
         assert all(row.std() > 1 for row in rows)
         assert np.abs(rows[0] - rows[2]).max() > 50, "guidance changes the paths"
