@@ -21,6 +21,8 @@ MEAN_STEP, LOG_STD_STEP = 0.0, 1.0
 """Steps at which the networks, given a zero sample, predict mean and log standard deviation."""
 LOG_STD_BOUNDS = (-5.0, 2.0)
 """Bounds of the log standard deviation."""
+PLANS_AT_ONCE = 512
+"""Whole plans that are sampled at once where only their goals are wanted; bounds the memory."""
 
 
 def sampler_of(
@@ -151,8 +153,11 @@ class OneStageSampler(Sampler):
     def goals(
         self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan 3"]:
-        """Draw whole plans and keep the ends of their paths."""
-        return self._path(codes, self._sequence(codes, sampling, rng))[:, -1]
+        """Draw whole plans, some at once, and keep the ends of their paths."""
+        rows = np.arange(len(codes.full))
+        some = (codes[rows[start : start + PLANS_AT_ONCE]] for start in range(0, len(rows), PLANS_AT_ONCE))
+        paths = (self._path(each, self._sequence(each, sampling, rng)) for each in some)
+        return np.concatenate([path[:, -1] for path in paths])
 
     def _path(self, codes: PlanCondition, sequence: Array) -> Float[np.ndarray, "plan frame 3"]:
         path = self.scaling.path(sequence[:, :PATH_CHANNELS], codes.start)
