@@ -46,7 +46,6 @@ class Setting:
 
 SETTINGS = (
     *(Setting("bank", views) for views in (100, 250, 500)),
-    *(Setting("coordinates", 500, steps) for steps in (500, 2000, 8000)),
     *(Setting("regression", 500, steps) for steps in (250, 1000, 2500)),
 )
 
@@ -164,7 +163,7 @@ def main() -> None:
     parser.add_argument("--queries", type=int, default=60, help="fresh renders that are localized")
     parser.add_argument("--frames", type=int, default=12, help="frames of each session that are localized")
     parser.add_argument(
-        "--max-steps", type=int, default=8000, help="networks that learn for longer are left out"
+        "--max-steps", type=int, default=2500, help="networks that learn for longer are left out"
     )
     parser.add_argument(
         "--kinds",
