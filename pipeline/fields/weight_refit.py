@@ -1,8 +1,7 @@
-"""Approximate dual-quaternion skinning by linear blend skinning with four or eight bones per vertex.
+"""Approximate dual-quaternion skinning by linear blend skinning with four bones per vertex.
 
 `blend_dual_quaternions` poses the surface as the reconstruction does; `refit_weights` finds, per vertex, the
-best four and the best eight bones and convex weights for linear blending over a set of poses; `residual_m`
-measures the error.
+best four bones and convex weights for linear blending over a set of poses; `residual_m` measures the error.
 """
 
 from dataclasses import dataclass
@@ -14,7 +13,10 @@ from jaxtyping import Float, Float32, Int, UInt8
 
 from pipeline.fields import skinning
 
-FOUR, EIGHT = 4, 8
+FOUR = 4
+"""Bones of a vertex that every player blends."""
+_CANDIDATES = 8
+"""Heaviest bones among which they are chosen."""
 _DESCENT_STEPS = 150
 
 
@@ -70,9 +72,9 @@ def blend_dual_quaternions(
 
 def refit_weights(
     vertices: Float[np.ndarray, "vertex 3"], weights: Float[np.ndarray, "vertex bone"], poses: Poses
-) -> tuple[Influences, Influences]:
-    """Return the best four and the best eight bones per vertex with convex weights, by least squares."""
-    candidates = np.argsort(-weights, axis=1, kind="stable")[:, : min(EIGHT, weights.shape[1])]
+) -> Influences:
+    """Return the best four bones per vertex with convex weights, by least squares."""
+    candidates = np.argsort(-weights, axis=1, kind="stable")[:, :_CANDIDATES]
     gram = _gram(vertices, candidates, poses)
     start = np.take_along_axis(weights, candidates, 1)
     descended = _descend_on_simplex(gram, start / start.sum(1, keepdims=True))
@@ -80,19 +82,14 @@ def refit_weights(
     best = np.zeros_like(descended)
     sub_gram = np.take_along_axis(np.take_along_axis(gram, chosen[:, :, None], 1), chosen[:, None, :], 2)
     np.put_along_axis(best, chosen, _best_on_simplex(sub_gram), 1)
-    is_better = _cost(gram, best) < _cost(gram, descended)
-    return _influences(candidates, best, FOUR), _influences(
-        candidates, np.where(is_better[:, None], best, descended), EIGHT
-    )
+    return _heaviest(candidates, best)
 
 
-def _influences(
-    candidates: Int[np.ndarray, "vertex k"], weights: Float[np.ndarray, "vertex k"], count: int
-) -> Influences:
-    """Order by weight and keep, or fill up to, `count`; bones without weight become bone 0, as glTF asks."""
-    order = np.argsort(-weights, axis=1, kind="stable")[:, :count]
+def _heaviest(candidates: Int[np.ndarray, "vertex k"], weights: Float[np.ndarray, "vertex k"]) -> Influences:
+    """Order by weight and keep, or fill up to, four; bones without weight become bone 0, as glTF asks."""
+    order = np.argsort(-weights, axis=1, kind="stable")[:, :FOUR]
     heaviest, joints = np.take_along_axis(weights, order, 1), np.take_along_axis(candidates, order, 1)
-    padding = ((0, 0), (0, count - order.shape[1]))
+    padding = ((0, 0), (0, FOUR - order.shape[1]))
     joints, heaviest = np.pad(np.where(heaviest > 0, joints, 0), padding), np.pad(heaviest, padding)
     return Influences(joints.astype(np.uint8), (heaviest / heaviest.sum(1, keepdims=True)).astype(np.float32))
 

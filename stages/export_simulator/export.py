@@ -32,9 +32,6 @@ class SimulatorParts:
     skin: Skin
     residual_m: Float[np.ndarray, "frame vertex"]
     """distance of the four-weight linear blend from dual-quaternion blending, poses that were not fitted"""
-    eight: weight_refit.Influences
-    """the same surface with eight weights, for players that can"""
-    eight_residual_m: Float[np.ndarray, "frame vertex"]
     actions: list[Action]
     scene: Mesh
     splat_rows: bytes
@@ -49,7 +46,7 @@ def simulator(
     """Thin the surfaces, fit the weights, resample the motion."""
     agent, source_vertex = decimate(body.mesh, config.agent_faces)
     thinned = CanonicalAgent(agent, body.weights[source_vertex], body.agent_from_bone_rest)
-    (four, residual_m), (eight, eight_residual_m) = fit_weights(thinned, motions)
+    four, residual_m = fit_weights(thinned, motions)
     names = tuple(f"bone_{bone:02d}" for bone in range(len(body.agent_from_bone_rest)))
     room, _ = decimate(scene, config.scene_faces)
     inside = np.concatenate([motion.world_from_camera[:, :3, 3] for motion in motions]).mean(0)
@@ -58,8 +55,6 @@ def simulator(
         agent=agent,
         skin=Skin(four.joints, four.weights, body.agent_from_bone_rest, names),
         residual_m=residual_m,
-        eight=eight,
-        eight_residual_m=eight_residual_m,
         actions=[animation(motion, ACTION_RATE_HZ) for motion in motions],
         scene=surfaces.orient_towards(room, inside),
         splat_rows=surfaces.splat_rows(gaussians.scene, config.scene_splats),
@@ -71,10 +66,10 @@ def simulator(
 
 def fit_weights(
     body: CanonicalAgent, motions: list[SessionClip]
-) -> list[tuple[weight_refit.Influences, Float[np.ndarray, "frame vertex"]]]:
-    """Fit four and eight weights a vertex to recorded poses that differ most.
+) -> tuple[weight_refit.Influences, Float[np.ndarray, "frame vertex"]]:
+    """Fit four weights a vertex to recorded poses that differ most.
 
-    Returns both with the distance, metres, that each leaves in poses that were not fitted.
+    Returns them with the distance, metres, that they leave in poses that were not fitted.
     """
     recorded = np.concatenate([motion.agent_from_bone for motion in motions])
     chosen = weight_refit.farthest_poses(recorded, FITTED_POSES)
@@ -88,5 +83,5 @@ def fit_weights(
         )
         for at in (chosen, judged)
     )
-    blends = weight_refit.refit_weights(vertices, body.weights, fit)
-    return [(blend, weight_refit.residual_m(vertices, blend, held)) for blend in blends]
+    four = weight_refit.refit_weights(vertices, body.weights, fit)
+    return four, weight_refit.residual_m(vertices, four, held)

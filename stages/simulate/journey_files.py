@@ -124,7 +124,7 @@ def fit_skin(body: SkinnedBody, agent_from_bone: Float[np.ndarray, "frame bone 4
     posed = PosedSurface(body)(roots, torch.from_numpy(some).float()).double().numpy()
     poses = weight_refit.Poses(some @ rigid.inverse(rest), posed)
     vertices = np.asarray(body.mesh.vertices, np.float64)
-    four, _ = weight_refit.refit_weights(vertices, body.weights, poses)
+    four = weight_refit.refit_weights(vertices, body.weights, poses)
     return glb.Skin(four.joints, four.weights, rest, tuple(f"bone_{bone:02d}" for bone in range(len(rest))))
 
 
