@@ -70,7 +70,6 @@ STEMS = {
 }  # fmt: skip
 METHODS = {
     "rendered_": "volume rendering",
-    "retrieval_only_": "image retrieval",
     "sift_only_": "SIFT and PnP",
     "agent_confidence_": "animal's root",
 }
