@@ -101,13 +101,13 @@ def resample_motion(timestamp_s: Float[np.ndarray, "frame"], motion: BodyMotion)
     return _interpolate(timestamp_s, motion, query_s)
 
 
-def stretches(trajectory: Trajectory, shortest_s: float = STEPS / RATE_HZ) -> list[BodyMotion]:
-    """Return the uninterrupted stretches of a trajectory that last ``shortest_s`` or longer, at 30 fps."""
+def stretches(trajectory: Trajectory) -> list[BodyMotion]:
+    """Return the uninterrupted stretches of a trajectory that hold a whole short motion, at 30 fps."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], trajectory.valid, [False]]).astype(np.int8)))
     found = []
     for start, end in zip(edges[::2], edges[1::2], strict=True):
         when = trajectory.timestamp_s[start:end]
-        if len(when) > 2 and when[-1] - when[0] >= shortest_s - 1e-6:
+        if len(when) > 2 and when[-1] - when[0] >= STEPS / RATE_HZ - 1e-6:
             motion = BodyMotion(trajectory.world_from_agent[start:end], trajectory.agent_from_bone[start:end])
             found.append(resample_motion(when, motion))
     return found

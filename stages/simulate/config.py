@@ -5,7 +5,7 @@ from typing import Literal
 
 from pipeline.behavior.config import PlanSamplingConfig
 
-ObserverScript = Literal["away", "still", "approach", "circle"]
+ObserverScript = Literal["away", "still", "approach"]
 """What a scripted observer does."""
 SubgoalSource = Literal["none", "visited", "behavior"]
 """Where sub-goals come from that no file gives."""
@@ -37,8 +37,6 @@ class Config:
     optimise: bool = True
     """Make the motion physically plausible; a take of the behaviour model only where `--longterm` and
     `--reconstruction` are given."""
-    recording: str | None = None
-    """Take the reconstructed motion of this session, its longest stretch, instead."""
     pictures_per_s: float = 10.0
     """Pictures per second of long-term motion; 0: none."""
     absent: tuple[str, ...] = ()
