@@ -52,13 +52,15 @@ def static(mesh: Mesh, name: str) -> bytes:
     return document.packed()
 
 
-def skinned(mesh: Mesh, skin: Skin, actions: Sequence[Action], name: str = "agent") -> bytes:
+def skinned(mesh: Mesh, skin: Skin, actions: Sequence[Action]) -> bytes:
     """Return a file of a skinned mesh (agent frame, metres) with one animation per action."""
     document = _Document()
-    document.add_mesh(mesh, name, skin)
+    document.add_mesh(mesh, "agent", skin)
     joints = list(range(_FIRST_JOINT, _FIRST_JOINT + len(skin.bone_names)))
-    document.file.nodes = [gltf.Node(name=name, children=joints)]
-    document.file.nodes.append(gltf.Node(name=f"{name}_surface", mesh=0, skin=0))
+    document.file.nodes = [
+        gltf.Node(name="agent", children=joints),
+        gltf.Node(name="agent_surface", mesh=0, skin=0),
+    ]
     translations, quaternions = _translation_quaternion(skin.agent_from_bone_rest)
     for bone, translation, quaternion in zip(skin.bone_names, translations, quaternions, strict=True):
         place, turn = translation.tolist(), quaternion.tolist()

@@ -38,7 +38,6 @@ def skinning_weights(
     points_agent: Float[Tensor, "*#batch point 3"],
     agent_from_bone_rest: Float[Tensor, "*#batch bone 4 4"],
     bone_scale_m: Float[Tensor, "bone 3"],
-    temperature: float = 1.0,
     delta: Float[Tensor, "*#batch point bone"] | None = None,
 ) -> Float[Tensor, "*#batch point bone"]:
     """Return the probability of each bone for each point (paper 001, Sec. 3.1).
@@ -47,10 +46,9 @@ def skinning_weights(
         points_agent: points in the agent frame, in metres.
         agent_from_bone_rest: bones at rest, or posed bones when the points are posed.
         bone_scale_m: standard deviations of the Gaussian bones along their own axes.
-        temperature: divides the squared distance; larger is smoother.
         delta: learned correction, added to the logits.
     """
-    logits = -squared_mahalanobis(points_agent, agent_from_bone_rest, bone_scale_m) / temperature
+    logits = -squared_mahalanobis(points_agent, agent_from_bone_rest, bone_scale_m)
     return (logits if delta is None else logits + delta).softmax(-1)
 
 

@@ -19,6 +19,8 @@ from pipeline.geometry import rigid
 RATE_HZ = 30
 STEPS = 60
 """k of the paper: a short motion has k + 1 frames, the first and the last of which are given"""
+SEAM_REACH = 6
+"""Frames on both sides of a seam that are interpolated."""
 EARLY, LATE = (0.2, 0.55), (0.45, 0.8)
 """phases of a jump, as shares of its duration: first up (or across), then across (or down)"""
 
@@ -63,17 +65,17 @@ def _smoothstep(share: Float[np.ndarray, "frame"], low: float, high: float) -> F
     return part * part * (3 - 2 * part)
 
 
-def smooth_seams(motion: BodyMotion, every: int = STEPS, reach: int = 6) -> BodyMotion:
-    """Interpolate over the ``reach`` frames on both sides of the seam at every ``every``-th frame.
+def smooth_seams(motion: BodyMotion) -> BodyMotion:
+    """Interpolate over the `SEAM_REACH` frames on both sides of the seams of short motions.
 
     Each clip ends in a given body that was sampled independently, and would snap to it in its last frames.
     """
-    frame, last = np.arange(len(motion)), (len(motion) - 1) // every - 1
+    frame, last = np.arange(len(motion)), (len(motion) - 1) // STEPS - 1
     if last < 1:
         return motion
-    seam = np.clip(np.round(frame / every), 1, last) * every
+    seam = np.clip(np.round(frame / STEPS), 1, last) * STEPS
     offset = np.abs(frame - seam)
-    anchors = np.flatnonzero((offset == 0) | (offset > reach))
+    anchors = np.flatnonzero((offset == 0) | (offset > SEAM_REACH))
     return _interpolate(anchors, motion[anchors], frame)
 
 

@@ -44,14 +44,14 @@ class Floor:
         return centers[np.argmin(((centers - point) ** 2).sum(-1))]
 
     def route(
-        self, start: Ground, goal: Ground, *, avoid: Ground | None = None, avoid_m: float = 1.0
+        self, start: Ground, goal: Ground, *, avoid: Ground | None = None
     ) -> Float[np.ndarray, "waypoint 2"]:
         """Return a shortest path that avoids ``avoid``; blocked cells are crossed as a last resort."""
         cost = np.where(self.free, 1.0, 60.0)
         if avoid is not None:
             x = (np.arange(self.free.shape[0]) + 0.5) * CELL_M - WIDTH_M / 2 - avoid[0]
             z = (np.arange(self.free.shape[1]) + 0.5) * CELL_M - DEPTH_M / 2 - avoid[1]
-            cost = cost * (1 + 8 * np.exp(-(x[:, None] ** 2 + z[None, :] ** 2) / (0.5 * avoid_m) ** 2))
+            cost = cost * (1 + 8 * np.exp(-(x[:, None] ** 2 + z[None, :] ** 2) / 0.5**2))
         cells, _ = route_through_array(
             cost, self.cell(start), self.cell(goal), fully_connected=True, geometric=True
         )
