@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Float32, Int, UInt8
 
 from pipeline.fields import skinning
+from pipeline.geometry import subsampling
 
 FOUR = 4
 """Bones of a vertex that every player blends."""
@@ -43,13 +44,8 @@ def farthest_poses(
 ) -> Int[np.ndarray, " chosen"]:
     """Choose poses by farthest-point sampling, beginning with the one furthest from the mean."""
     flat = agent_from_bone[:, :, :3].reshape(len(agent_from_bone), -1)
-    distance = ((flat - flat.mean(0)) ** 2).sum(1)
-    chosen = [int(distance.argmax())]
-    distance = ((flat - flat[chosen[0]]) ** 2).sum(1)
-    while len(chosen) < min(count, len(flat)):
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, ((flat - flat[chosen[-1]]) ** 2).sum(1))
-    return np.unique(chosen)
+    first = int(((flat - flat.mean(0)) ** 2).sum(1).argmax())
+    return np.unique(subsampling.farthest_points(flat, count, first))
 
 
 def blend_dual_quaternions(

@@ -83,9 +83,9 @@ def rotation_from_yaw(yaw_rad: Float[np.ndarray, "*batch"] | float) -> Float[np.
     return rotation_from_vector(np.asarray(yaw_rad)[..., None] * np.array([0.0, 1.0, 0.0]))
 
 
-def wrap(angle_rad: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
+def wrap(angle_rad: Float[np.ndarray, "*any"] | float) -> Float[np.ndarray, "*any"]:
     """Bring angles to -pi..pi, radians."""
-    return (angle_rad + np.pi) % (2 * np.pi) - np.pi
+    return (np.asarray(angle_rad) + np.pi) % (2 * np.pi) - np.pi
 
 
 def rotation_angle(

@@ -176,14 +176,6 @@ def calibrate(score: Float[np.ndarray, "sample"], good: Bool[np.ndarray, "sample
     return Calibration(float(weights[0]), float(weights[1]))
 
 
-def errors(
-    map_from_camera: Float[np.ndarray, "*batch 4 4"], truth: Float[np.ndarray, "*batch 4 4"]
-) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
-    """Return rotation errors (degrees) and translation errors (metres)."""
-    rotation = np.rad2deg(rigid.rotation_angle(map_from_camera[..., :3, :3], truth[..., :3, :3]))
-    return rotation, np.linalg.norm(map_from_camera[..., :3, 3] - truth[..., :3, 3], axis=-1)
-
-
 def save(folder: Path, localizer: Localizer, report: dict) -> None:
     """Write ``localizer.safetensors`` and ``localizer.json``; the report holds the held-out errors."""
     match localizer.model:

@@ -314,7 +314,7 @@ def _poses_along_path(
             given = yaw_rad[-1] if yaw_rad else 0.0
         yaw_rad.append(float(np.arctan2(tangent[0], tangent[2])) if given is None else given)
     for index in range(2, len(yaw_rad)):
-        turn = (yaw_rad[index] - yaw_rad[index - 1] + np.pi) % (2 * np.pi) - np.pi
+        turn = float(rigid.wrap(yaw_rad[index] - yaw_rad[index - 1]))
         rests = np.linalg.norm(points[index - 2 : index + 1] - points[index], axis=1).max() < 1e-6
         if rests and headings[index - 1] is None and abs(turn) > LARGE_TURN_RAD:
             yaw_rad[index - 1] += turn / 2

@@ -8,6 +8,7 @@ from pipeline.geometry import rigid
 from pipeline.localization import localizer as model
 from pipeline.localization.networks import GRID, on_grid, pose_loss
 from pipeline.localization.patches import Patches, PatchSampling, PcaBasis
+from pipeline.metrics.pose_errors import pose_errors
 from stages.train_localizer.config import NetworkConfig
 from stages.train_localizer.described_views import DescribedViews
 from stages.train_localizer.networks import train_regressor
@@ -46,9 +47,8 @@ def asked(net, seen: DescribedViews) -> tuple[np.ndarray, np.ndarray, np.ndarray
     sampling, solver = PatchSampling("scene", 100.0, 0, 8, (6,)), model.RansacSolver(0.15, 0.3, 200, 1)
     localizer = model.Localizer(sampling, seen.basis, net, model.Calibration(0.0, 1.0), solver)
     answers = [localizer.localize_patches(patches)[0] for patches in seen.patches]
-    return *model.errors(
-        np.stack([answer.map_from_camera for answer in answers]), seen.map_from_camera
-    ), np.array([answer.inlier_ratio for answer in answers])
+    errors = pose_errors(np.stack([answer.map_from_camera for answer in answers]), seen.map_from_camera)
+    return errors.degrees, errors.meters, np.array([answer.inlier_ratio for answer in answers])
 
 
 @pytest.mark.slow
