@@ -1,18 +1,17 @@
 """Approximate dual-quaternion skinning by linear blend skinning with four bones per vertex.
 
-`blend_dual_quaternions` poses the surface as the reconstruction does; `refit_weights` finds, per vertex, the
-best four bones and convex weights for linear blending over a set of poses; `residual_m` measures the error.
+`refit_weights` finds, per vertex, the best four bones and convex weights for linear blending over a set of
+poses; `residual_m` measures the error.
 """
 
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-import torch
 from jaxtyping import Float, Float32, Int, UInt8
 
-from pipeline.fields import skinning
-from pipeline.geometry import subsampling
+from pipeline.fields.skinning import SkinnedShape
+from pipeline.geometry import rigid, subsampling
 
 FOUR = 4
 """Bones of a vertex that every player blends."""
@@ -30,6 +29,12 @@ class Poses:
     posed: Float[np.ndarray, "frame vertex 3"]
     """target surface"""
 
+    @classmethod
+    def of(cls, body: SkinnedShape, agent_from_bone: Float[np.ndarray, "frame bone 4 4"]) -> "Poses":
+        """Pose a surface by dual-quaternion blending, as the reconstruction does."""
+        posed = np.stack([body.posed(bones) for bones in agent_from_bone])
+        return cls(agent_from_bone @ rigid.inverse(body.agent_from_bone_rest), posed)
+
 
 @dataclass(frozen=True)
 class Influences:
@@ -46,24 +51,6 @@ def farthest_poses(
     flat = agent_from_bone[:, :, :3].reshape(len(agent_from_bone), -1)
     first = int(((flat - flat.mean(0)) ** 2).sum(1).argmax())
     return np.unique(subsampling.farthest_points(flat, count, first))
-
-
-def blend_dual_quaternions(
-    vertices: Float[np.ndarray, "vertex 3"],
-    weights: Float[np.ndarray, "vertex bone"],
-    agent_from_bone: Float[np.ndarray, "frame bone 4 4"],
-    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"],
-) -> Float[np.ndarray, "frame vertex 3"]:
-    """Pose the surface by dual-quaternion blending with all weights; metres, agent frame."""
-    points, weight, rest = (
-        torch.from_numpy(np.ascontiguousarray(values, np.float32))
-        for values in (vertices, weights, agent_from_bone_rest)
-    )
-    posed = [
-        skinning.move(skinning.blend(weight, torch.from_numpy(np.float32(bones)), rest), points)
-        for bones in agent_from_bone
-    ]
-    return torch.stack(posed).numpy().astype(np.float64)
 
 
 def refit_weights(

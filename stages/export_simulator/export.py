@@ -1,20 +1,21 @@
 """Turn a reconstruction and its recordings into the parts of a simulator: light, re-fitted, resampled."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.data.glb import Action, Skin
 from pipeline.fields import weight_refit
-from pipeline.geometry import rigid
+from pipeline.fields.skinning import SkinnedShape
 from pipeline.geometry.decimation import decimate
 from pipeline.geometry.meshes import Mesh
 from pipeline.geometry.subsampling import evenly
+from pipeline.longterm.bodies import SkinnedBody
 from stages.export_simulator import surfaces
 from stages.export_simulator.actions import SessionClip, animation
 from stages.export_simulator.config import Config
-from stages.export_simulator.reading import CanonicalAgent, SplatClouds
+from stages.export_simulator.reading import SplatClouds
 
 FITTED_POSES = 48
 """Recorded poses, as different as can be, that weights are fitted to: more change the loss by under 1 %."""
@@ -41,11 +42,11 @@ class SimulatorParts:
 
 
 def simulator(
-    body: CanonicalAgent, scene: Mesh, gaussians: SplatClouds, motions: list[SessionClip], config: Config
+    body: SkinnedBody, scene: Mesh, gaussians: SplatClouds, motions: list[SessionClip], config: Config
 ) -> SimulatorParts:
     """Thin the surfaces, fit the weights, resample the motion."""
     agent, source_vertex = decimate(body.mesh, config.agent_faces)
-    thinned = CanonicalAgent(agent, body.weights[source_vertex], body.agent_from_bone_rest)
+    thinned = replace(body, mesh=agent, weights=body.weights[source_vertex])
     four, residual_m = fit_weights(thinned, motions)
     names = tuple(f"bone_{bone:02d}" for bone in range(len(body.agent_from_bone_rest)))
     room, _ = decimate(scene, config.scene_faces)
@@ -65,7 +66,7 @@ def simulator(
 
 
 def fit_weights(
-    body: CanonicalAgent, motions: list[SessionClip]
+    body: SkinnedBody, motions: list[SessionClip]
 ) -> tuple[weight_refit.Influences, Float[np.ndarray, "frame vertex"]]:
     """Fit four weights a vertex to recorded poses that differ most.
 
@@ -75,13 +76,8 @@ def fit_weights(
     chosen = weight_refit.farthest_poses(recorded, FITTED_POSES)
     others = np.setdiff1d(np.arange(len(recorded)), chosen)
     judged = others[evenly(len(others), _JUDGED_POSES)] if len(others) else chosen
-    vertices, rest = body.mesh.vertices.astype(np.float64), body.agent_from_bone_rest
-    fit, held = (
-        weight_refit.Poses(
-            recorded[at] @ rigid.inverse(rest),
-            weight_refit.blend_dual_quaternions(vertices, body.weights, recorded[at], rest),
-        )
-        for at in (chosen, judged)
-    )
+    vertices = body.mesh.vertices.astype(np.float64)
+    shape = SkinnedShape(vertices, body.weights, body.agent_from_bone_rest)
+    fit, held = (weight_refit.Poses.of(shape, recorded[at]) for at in (chosen, judged))
     four = weight_refit.refit_weights(vertices, body.weights, fit)
     return four, weight_refit.residual_m(vertices, four, held)

@@ -17,6 +17,7 @@ from pipeline.environments.rgbd import FAR_M, INTRINSICS, PITCH_RAD, RgbdCamera
 from pipeline.environments.world import AnimalWorld
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
+from pipeline.longterm.bodies import SkinnedBody
 from stages.train_behavior.export import write_contract
 from tests.pipeline.behavior.wandering import ARCHITECTURE, BONES, REST, wandering
 from tests.pipeline.environments.test_other_home import write
@@ -132,7 +133,7 @@ def test_depth_is_measured_from_the_eyes():
     body, wall = box((0.2, 0.2, 0.2), RED), box((20, 20, 1.0), BLUE, (0, 0, 2.1))
     weights = np.zeros((8, BONES))
     weights[:, 1] = 1
-    camera = RgbdCamera([wall], body, weights, REST)
+    camera = RgbdCamera([wall], SkinnedBody(body, weights, REST, np.zeros(0)))
     level = rigid.make(np.eye(3), np.array([0.0, 0.0, 1.0]))
     eye = np.zeros(3)
     _, depth_m = camera.picture(0, eye, 0.0, rigid.make(np.eye(3), np.array([0.0, 50, 0])), REST)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.fields import weight_refit
+from pipeline.fields.skinning import SkinnedShape
 from pipeline.geometry import rigid
 
 RNG = np.random.default_rng(0)
@@ -22,10 +23,7 @@ def world(bones: int, bend_rad: float) -> tuple[np.ndarray, np.ndarray, np.ndarr
 @pytest.mark.parametrize("bones", [2, 4, 12])
 def test_weights_are_convex_and_beat_the_four_heaviest(bones: int) -> None:
     points, weights, rest, posed_bones = world(bones, 0.3)
-    poses = weight_refit.Poses(
-        posed_bones @ rigid.inverse(rest),
-        weight_refit.blend_dual_quaternions(points, weights, posed_bones, rest),
-    )
+    poses = weight_refit.Poses.of(SkinnedShape(points, weights, rest), posed_bones)
     fitted = weight_refit.refit_weights(points, weights, poses)
     assert fitted.joints.shape == fitted.weights.shape == (200, 4)
     assert (fitted.weights >= 0).all()
@@ -41,10 +39,7 @@ def test_weights_are_convex_and_beat_the_four_heaviest(bones: int) -> None:
 def test_one_bone_a_point_is_exact() -> None:
     points, weights, rest, posed_bones = world(6, 0.5)
     alone = np.eye(6)[weights.argmax(1)]
-    poses = weight_refit.Poses(
-        posed_bones @ rigid.inverse(rest),
-        weight_refit.blend_dual_quaternions(points, alone, posed_bones, rest),
-    )
+    poses = weight_refit.Poses.of(SkinnedShape(points, alone, rest), posed_bones)
     fitted = weight_refit.refit_weights(points, alone, poses)
     assert weight_refit.residual_m(points, fitted, poses).max() < 1e-4, "metres: float32 blending"
 
