@@ -23,7 +23,7 @@ from pipeline.behavior.trajectories import PAST, RATE_HZ, TEST, TRAIN, BehaviorD
 from pipeline.core.errors import InputError
 from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.floor import PersonFloor, to_local, to_world
-from pipeline.environments.homes import Habitat, settle
+from pipeline.environments.homes import Habitat, open_homes
 from pipeline.environments.rewards import ENDING, REWARDS, StepOutcome
 from pipeline.environments.rgbd import RgbdCamera
 from pipeline.metrics.flight import WITHIN_S, flees
@@ -117,7 +117,7 @@ class AnimalWorld:
         behavior.refuse_unplayable(architecture, str(build))
         data = BehaviorData.load(build / "behavior_data")
         sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
-        habitat = settle(build, data, homes)
+        habitat = open_homes(build, data, homes)
         camera = RgbdCamera.load(build, homes or (build,)) if "rgbd" in config.observations else None
         return cls(sampler, habitat, architecture.ego, config, camera=camera)
 

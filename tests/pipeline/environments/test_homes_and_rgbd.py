@@ -12,7 +12,7 @@ from pipeline.behavior.model import BehaviorNets
 from pipeline.core.errors import InputError
 from pipeline.data import npz, ply
 from pipeline.environments.config import EnvironmentConfig
-from pipeline.environments.homes import settle
+from pipeline.environments.homes import open_homes
 from pipeline.environments.rgbd import FAR_M, INTRINSICS, PITCH_RAD, RgbdCamera
 from pipeline.environments.world import AnimalWorld
 from pipeline.geometry import rigid
@@ -94,8 +94,8 @@ def test_episodes_begin_in_every_home_and_animals_of_all_plan_together(builds):
 def test_joined_homes_keep_their_own_moments_and_volumes(builds):
     own, other = builds
     data = wandering()
-    alone = settle(own, data, [other])
-    both = settle(own, data, [own, other])
+    alone = open_homes(own, data, [other])
+    both = open_homes(own, data, [own, other])
     assert both.scenes.number(np.arange(len(both.data.videos)), len(both.data.videos)).tolist() == [
         *([0] * len(data.videos)),
         *([1] * len(alone.data.videos)),
@@ -104,7 +104,7 @@ def test_joined_homes_keep_their_own_moments_and_volumes(builds):
     np.testing.assert_array_equal(
         both.data.windows(late[:5])[0].world_from_agent, alone.data.windows(np.arange(5))[0].world_from_agent
     )
-    assert settle(own, data, []).data is data
+    assert open_homes(own, data, []).data is data
 
 
 @pytest.mark.slow

@@ -120,7 +120,7 @@ def test_a_verdict_is_the_worst_of_its_own_and_of_what_it_stands_on() -> None:
     assert {name: each.light for name, each in judged.items()} == {
         "frames": "ok", "masks": "fail", "reconstruction": "fail", "simulator": "fail", "evaluation": "fail",
     }  # fmt: skip
-    assert judged["simulator"].own_light == "ok"
+    assert judged["simulator"].own_status == "ok"
     assert [cause.artifact for cause in judged["simulator"].causes] == ["masks"], (
         "the root, not what lies between"
     )
