@@ -12,9 +12,9 @@ import pytest
 
 from pipeline.core.videos import Video
 from pipeline.data import images, qa
-from pipeline.metrics import bars
+from pipeline.metrics import bars, words
 from pipeline.workflow import artifact, dag
-from stages.report import collect, pages, stage
+from stages.report import collect, stage
 from stages.report.chapters import CHAPTERS, WORDS, remedy
 from stages.report.config import Config
 from tests.stages.export_simulator import browser
@@ -220,7 +220,7 @@ def test_a_rival_must_be_beaten_and_all_videos_reached() -> None:
     ],
 )
 def test_numbers_are_readable(value: float | None, text: str) -> None:
-    assert pages.number(value) == text
+    assert words.number(value) == text
 
 
 def test_a_safe_report_shows_no_view(tmp_path: Path) -> None:
