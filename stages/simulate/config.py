@@ -23,8 +23,6 @@ class Config:
     """Walking speed of the observer, m/s."""
     guidance: float = PlanSamplingConfig.guidance
     """Scale of classifier-free guidance: the interactivity."""
-    without: tuple[Literal["scene", "observer", "past", "goal"], ...] = ()
-    """Conditions that plans are drawn without."""
     goal_steps: int = 0
     """Denoising steps of the goal; 0: as the model is best sampled."""
     sequence_steps: int = 10

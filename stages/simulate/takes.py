@@ -205,13 +205,7 @@ def _simulator(
     architecture, nets, scaling, schedule, _ = behavior.load(_required(inputs, "behavior"))
     behavior.refuse_unplayable(architecture, str(inputs.behavior))
     sampling = PlanSamplingConfig(
-        goal_steps=c.goal_steps,
-        sequence_steps=c.sequence_steps,
-        guidance=c.guidance,
-        scene="scene" not in c.without,
-        observer="observer" not in c.without,
-        past="past" not in c.without,
-        goal="goal" not in c.without,
+        goal_steps=c.goal_steps, sequence_steps=c.sequence_steps, guidance=c.guidance
     )
     sampler = Sampler(TorchNetworks(nets, device), schedule, scaling)
     return Simulator(sampler, data, scenes, architecture.ego, sampling=sampling, chaining=chaining)
