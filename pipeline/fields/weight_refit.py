@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Int
 
+from pipeline.data.glb import Skin
 from pipeline.fields.skinning import SkinnedShape
 from pipeline.geometry import rigid, subsampling
 
@@ -36,14 +37,6 @@ class Poses:
         return cls(agent_from_bone @ rigid.inverse(body.agent_from_bone_rest), posed)
 
 
-@dataclass(frozen=True)
-class Influences:
-    """Bones of each vertex and their convex weights, heaviest first."""
-
-    joints: UInt8[np.ndarray, "vertex influence"]
-    weights: Float32[np.ndarray, "vertex influence"]
-
-
 def farthest_poses(
     agent_from_bone: Float[np.ndarray, "frame bone 4 4"], count: int
 ) -> Int[np.ndarray, " chosen"]:
@@ -53,39 +46,27 @@ def farthest_poses(
     return np.unique(subsampling.farthest_points(flat, count, first))
 
 
-def refit_weights(
-    vertices: Float[np.ndarray, "vertex 3"], weights: Float[np.ndarray, "vertex bone"], poses: Poses
-) -> Influences:
-    """Return the best four bones per vertex with convex weights, by least squares."""
-    candidates = np.argsort(-weights, axis=1, kind="stable")[:, :_CANDIDATES]
-    gram = _gram(vertices, candidates, poses)
-    start = np.take_along_axis(weights, candidates, 1)
+def refit_weights(body: SkinnedShape, poses: Poses) -> Skin:
+    """Return the best four bones per vertex with convex weights, heaviest first, by least squares."""
+    candidates = np.argsort(-body.weights, axis=1, kind="stable")[:, :_CANDIDATES]
+    gram = _gram(body.vertices, candidates, poses)
+    start = np.take_along_axis(body.weights, candidates, 1)
     descended = _descend_on_simplex(gram, start / start.sum(1, keepdims=True))
     chosen = np.argsort(-descended, axis=1, kind="stable")[:, :FOUR]
     best = np.zeros_like(descended)
     sub_gram = np.take_along_axis(np.take_along_axis(gram, chosen[:, :, None], 1), chosen[:, None, :], 2)
     np.put_along_axis(best, chosen, _best_on_simplex(sub_gram), 1)
-    return _heaviest(candidates, best)
-
-
-def _heaviest(candidates: Int[np.ndarray, "vertex k"], weights: Float[np.ndarray, "vertex k"]) -> Influences:
-    """Order by weight and keep, or fill up to, four; bones without weight become bone 0, as glTF asks."""
-    order = np.argsort(-weights, axis=1, kind="stable")[:, :FOUR]
-    heaviest, joints = np.take_along_axis(weights, order, 1), np.take_along_axis(candidates, order, 1)
-    padding = ((0, 0), (0, FOUR - order.shape[1]))
+    order = np.argsort(-best, axis=1, kind="stable")[:, :FOUR]
+    heaviest, joints = np.take_along_axis(best, order, 1), np.take_along_axis(candidates, order, 1)
+    padding = ((0, 0), (0, FOUR - order.shape[1]))  # bones without weight become bone 0, as glTF asks
     joints, heaviest = np.pad(np.where(heaviest > 0, joints, 0), padding), np.pad(heaviest, padding)
-    return Influences(joints.astype(np.uint8), (heaviest / heaviest.sum(1, keepdims=True)).astype(np.float32))
-
-
-def _cost(
-    gram: Float[np.ndarray, "vertex k k"], weights: Float[np.ndarray, "vertex k"]
-) -> Float[np.ndarray, " vertex"]:
-    """Return w' G w."""
-    return np.einsum("vi,vij,vj->v", weights, gram, weights)
+    heaviest = (heaviest / heaviest.sum(1, keepdims=True)).astype(np.float32)
+    names = tuple(f"bone_{bone:02d}" for bone in range(body.weights.shape[1]))
+    return Skin(joints.astype(np.uint8), heaviest, body.agent_from_bone_rest, names)
 
 
 def residual_m(
-    vertices: Float[np.ndarray, "vertex 3"], blend: Influences, poses: Poses
+    vertices: Float[np.ndarray, "vertex 3"], blend: Skin, poses: Poses
 ) -> Float[np.ndarray, "frame vertex"]:
     """Return the distance between the linear blend and the posed surface."""
     distance = np.empty(poses.posed.shape[:2])
@@ -143,7 +124,7 @@ def _best_on_simplex(gram: Float[np.ndarray, "vertex k k"]) -> Float[np.ndarray,
             total = solved.sum(1, keepdims=True)
             trial = np.zeros_like(best)
             trial[:, support] = solved / np.where(total == 0, 1, total)
-            cost = _cost(gram, trial)
+            cost = np.einsum("vi,vij,vj->v", trial, gram, trial)
             better = (trial >= 0).all(1) & (total[:, 0] > 0) & (cost < best_cost)
             best[better], best_cost[better] = trial[better], cost[better]
     return best

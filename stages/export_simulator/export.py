@@ -47,14 +47,13 @@ def simulator(
     """Thin the surfaces, fit the weights, resample the motion."""
     agent, source_vertex = decimate(body.mesh, config.agent_faces)
     thinned = replace(body, mesh=agent, weights=body.weights[source_vertex])
-    four, residual_m = fit_weights(thinned, motions)
-    names = tuple(f"bone_{bone:02d}" for bone in range(len(body.agent_from_bone_rest)))
+    skin, residual_m = fit_weights(thinned, motions)
     room, _ = decimate(scene, config.scene_faces)
     inside = np.concatenate([motion.world_from_camera[:, :3, 3] for motion in motions]).mean(0)
     positions = np.concatenate([motion.world_from_agent[:, :3, 3] for motion in motions])
     return SimulatorParts(
         agent=agent,
-        skin=Skin(four.joints, four.weights, body.agent_from_bone_rest, names),
+        skin=skin,
         residual_m=residual_m,
         actions=[animation(motion, ACTION_RATE_HZ) for motion in motions],
         scene=surfaces.orient_towards(room, inside),
@@ -67,7 +66,7 @@ def simulator(
 
 def fit_weights(
     body: SkinnedBody, motions: list[SessionClip]
-) -> tuple[weight_refit.Influences, Float[np.ndarray, "frame vertex"]]:
+) -> tuple[Skin, Float[np.ndarray, "frame vertex"]]:
     """Fit four weights a vertex to recorded poses that differ most.
 
     Returns them with the distance, metres, that they leave in poses that were not fitted.
@@ -79,5 +78,5 @@ def fit_weights(
     vertices = body.mesh.vertices.astype(np.float64)
     shape = SkinnedShape(vertices, body.weights, body.agent_from_bone_rest)
     fit, held = (weight_refit.Poses.of(shape, recorded[at]) for at in (chosen, judged))
-    four = weight_refit.refit_weights(vertices, body.weights, fit)
-    return four, weight_refit.residual_m(vertices, four, held)
+    skin = weight_refit.refit_weights(shape, fit)
+    return skin, weight_refit.residual_m(vertices, skin, held)

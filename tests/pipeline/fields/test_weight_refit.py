@@ -1,5 +1,7 @@
 """Four fitted weights: exact where four bones are enough, never worse than the four heaviest."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -23,15 +25,16 @@ def world(bones: int, bend_rad: float) -> tuple[np.ndarray, np.ndarray, np.ndarr
 @pytest.mark.parametrize("bones", [2, 4, 12])
 def test_weights_are_convex_and_beat_the_four_heaviest(bones: int) -> None:
     points, weights, rest, posed_bones = world(bones, 0.3)
-    poses = weight_refit.Poses.of(SkinnedShape(points, weights, rest), posed_bones)
-    fitted = weight_refit.refit_weights(points, weights, poses)
+    body = SkinnedShape(points, weights, rest)
+    poses = weight_refit.Poses.of(body, posed_bones)
+    fitted = weight_refit.refit_weights(body, poses)
     assert fitted.joints.shape == fitted.weights.shape == (200, 4)
     assert (fitted.weights >= 0).all()
     np.testing.assert_allclose(fitted.weights.sum(1), 1, atol=1e-6)
     heaviest = np.argsort(-weights, axis=1)[:, :4]
     plain = np.take_along_axis(weights, heaviest, 1)
     plain = (plain / plain.sum(1, keepdims=True)).astype(np.float32)
-    blends = (fitted, weight_refit.Influences(heaviest.astype(np.uint8), plain))
+    blends = (fitted, replace(fitted, joints=heaviest.astype(np.uint8), weights=plain))
     after, before = ((weight_refit.residual_m(points, blend, poses) ** 2).mean() for blend in blends)
     assert after <= before * (1 + 1e-6)
 
@@ -39,8 +42,9 @@ def test_weights_are_convex_and_beat_the_four_heaviest(bones: int) -> None:
 def test_one_bone_a_point_is_exact() -> None:
     points, weights, rest, posed_bones = world(6, 0.5)
     alone = np.eye(6)[weights.argmax(1)]
-    poses = weight_refit.Poses.of(SkinnedShape(points, alone, rest), posed_bones)
-    fitted = weight_refit.refit_weights(points, alone, poses)
+    body = SkinnedShape(points, alone, rest)
+    poses = weight_refit.Poses.of(body, posed_bones)
+    fitted = weight_refit.refit_weights(body, poses)
     assert weight_refit.residual_m(points, fitted, poses).max() < 1e-4, "metres: float32 blending"
 
 
