@@ -26,7 +26,7 @@ WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 # What ends in a command line or a path holds plain names only.
 PLAIN := a b c d e f g h i j k l m n o p q r s t u v w x y z 0 1 2 3 4 5 6 7 8 9 _ -
 rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)
-$(foreach name,AGENT NAME ABSENT REPLAYED OTHER VARIANT FORMAT INFLUENCES PLACES PROCESSES LOCK BODY,$(if $(call rest,$(PLAIN),$(value $(name))),$(error REC-004 \
+$(foreach name,AGENT NAME ABSENT REPLAYED OTHER VARIANT FORMAT PLACES PROCESSES LOCK BODY,$(if $(call rest,$(PLAIN),$(value $(name))),$(error REC-004 \
   $(name) is no plain name: use a-z, 0-9, _ and -)))
 # Where an agent's, its variant's, or in a home of several animals one's (NAME=) own things stand; what a variant does not
 # touch is its agent's (`INPUTS` knows).
@@ -93,7 +93,7 @@ export: .venv/.ok
 	@$(if $(BODY),$(PLAN) plan $(BODY))
 	@$(MAKE) $(NESTING) $(ANIMAL).simulator $(BODY:%=%.simulator)
 	@$(call INPUTS,simulator reconstruction splats behavior_data frames masks) && \
-	$(PYTHON) -m stages.export $$inputs --format $(or $(FORMAT),glb) $(if $(INFLUENCES),--influences $(INFLUENCES)) \
+	$(PYTHON) -m stages.export $$inputs --format $(or $(FORMAT),glb) \
 	  $(if $(wildcard $(HOME_OF)/take/manifest.json),--take $(HOME_OF)/take) \
 	  $(BODY:%=--body build/%/simulator) --videos build/$(ANIMAL)$(if $(NAME),/animals/$(NAME))/plan/videos.json --out $(EXPORTED)
 	@echo '[$(HOME_OF)] written: $(EXPORTED); export.json lists what is lost'

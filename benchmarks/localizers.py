@@ -27,6 +27,7 @@ from pipeline.data import npz, ply
 from pipeline.data.clips import Clip, Masks
 from pipeline.data.templates import SceneCameras
 from pipeline.localization import localizer as model
+from pipeline.metrics.pose_errors import pose_errors
 from stages.train_localizer import described_views, training
 from stages.train_localizer.config import Config, NetworkConfig, SceneConfig
 from stages.train_localizer.views import RenderedView
@@ -46,7 +47,6 @@ class Setting:
 
 SETTINGS = (
     *(Setting("bank", views) for views in (100, 250, 500)),
-    *(Setting("coordinates", 500, steps) for steps in (500, 2000, 8000)),
     *(Setting("regression", 500, steps) for steps in (250, 1000, 2500)),
 )
 
@@ -84,7 +84,7 @@ def errors_of_sessions(
     localizer: model.Localizer, build: Path, per_session: int
 ) -> tuple[float, float, float]:
     """Return the same over frames of the sessions, against the poses that the registration gave them."""
-    rotation, translation = [], []
+    found, truth = [], []
     for path in sorted(build.glob("registration/*/poses.npz")):
         clip, masks = (
             Clip.open(build / "frames" / path.parent.name),
@@ -94,14 +94,15 @@ def errors_of_sessions(
         for frame in np.linspace(0, len(clip) - 1, per_session).astype(int):
             camera = (clip.depth_intrinsics[frame], clip.intrinsics[frame])
             answers = localizer.localize(clip.color(frame), clip.depth(frame), *camera, masks[frame] == 0)
-            found = model.errors(answers[0].map_from_camera, poses[frame]) if answers else (np.nan, np.nan)
-            rotation.append(found[0])
-            translation.append(found[1])
-    return _summary(np.array(rotation), np.array(translation))
+            found.append(answers[0].map_from_camera if answers else np.full((4, 4), np.nan))
+            truth.append(poses[frame])
+    errors = pose_errors(np.array(found), np.array(truth))
+    return _summary(errors.degrees, errors.meters)
 
 
 def _summary(rotation, translation):
-    rotation, translation = np.nan_to_num(rotation, nan=180.0), np.nan_to_num(translation, nan=10.0)
+    rotation = np.nan_to_num(rotation, nan=180.0, posinf=180.0)
+    translation = np.nan_to_num(translation, nan=10.0, posinf=10.0)
     return (
         float(np.median(rotation)),
         float(np.median(translation)),
@@ -164,7 +165,7 @@ def main() -> None:
     parser.add_argument("--queries", type=int, default=60, help="fresh renders that are localized")
     parser.add_argument("--frames", type=int, default=12, help="frames of each session that are localized")
     parser.add_argument(
-        "--max-steps", type=int, default=8000, help="networks that learn for longer are left out"
+        "--max-steps", type=int, default=2500, help="networks that learn for longer are left out"
     )
     parser.add_argument(
         "--kinds",

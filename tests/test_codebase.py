@@ -7,9 +7,9 @@ import pytest
 from benchmarks import codebase_counts
 
 BARS = {
-    "lines": 58_600,
+    "lines": 58_150,
     "lines over 110 columns": 0,
-    "recipe keys": 326,
+    "recipe keys": 318,
     "packages over 16 modules": 0,
     "private words in identifiers": 0,
     "tell, told": 0,

@@ -44,7 +44,7 @@ def build(tmp_path):
     (tmp_path / "simulator/agent.glb").write_bytes(data)
     mesh, _, _ = glb.read_skinned(data)
     (tmp_path / "simulator/scene.glb").write_bytes(glb.static(mesh, "scene"))
-    about = {"agent": {"skinning_residual_mm": {}, "skinning_residual_8_mm": {}}}
+    about = {"agent": {"skinning_residual_mm": {}}}
     (tmp_path / "simulator/simulator.json").write_text(json.dumps(about))
     return tmp_path
 

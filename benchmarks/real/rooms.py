@@ -129,12 +129,10 @@ def measured(scene: Path, folder: Path) -> dict[str, dict[str, dict[str, float]]
     frames, clip = range(len(session.clip)), session.clip
     hide = [np.zeros(clip.color_size, bool)] * len(clip)
     points = localizing.sift_map(walk.clip, made.world_from_camera, range(len(walk.clip)))
-    pictures = localizing.gallery(walk.clip, made.world_from_camera, range(len(walk.clip)))
     poses = {
         "ours": registered(made, walk.clip, localizer, clip, nobody(clip, folder / "masks")),
         "ours, single frames": localizing.placed_by_localizer(localizer, clip, frames, hide)[0],
         "SIFT, PnP on the template's walk": localizing.placed_by_sift(points, clip, frames),
-        "retrieval": localizing.placed_by_retrieval(pictures, clip, frames),
     }
     known = structure.cameras(scene, [*walk.number.tolist(), *session.number.tolist()], folder / "structure")
     own = dict(

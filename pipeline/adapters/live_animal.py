@@ -57,13 +57,11 @@ class LiveAnimal:
     @property
     def pose(self) -> AnimalPose:
         """The current pose, interpolated between the simulator's adjacent frames."""
-        share = float(np.clip((self.time_s - self.before.time_s) * RATE_HZ, 0, 1))
-        bones = zip(self.before.agent_from_bone, self.after.agent_from_bone, strict=True)
-        return AnimalPose(
-            self.time_s,
-            _between(self.before.world_from_agent, self.after.world_from_agent, share),
-            np.stack([_between(first, last, share) for first, last in bones]),
-        )
+        share = np.array([(self.time_s - self.before.time_s) * RATE_HZ])
+        frames = self.before, self.after
+        tracks = np.stack([[each.world_from_agent, *each.agent_from_bone] for each in frames], axis=1)
+        root, *bones = (rigid.interpolate(np.arange(2.0), track, share)[0] for track in tracks)
+        return AnimalPose(self.time_s, root, np.stack(bones))
 
     def advance(self, seconds: float, observer_world: Float[np.ndarray, "3"]) -> AnimalPose:
         """Advance time with the observer's eyes at a position (world, metres) and return the new pose.
@@ -79,12 +77,3 @@ class LiveAnimal:
         while self.after.time_s < self.time_s - 1e-9:
             self.before, self.after = self.after, self.simulator.step(place)
         return self.pose
-
-
-def _between(
-    first: Float[np.ndarray, "4 4"], last: Float[np.ndarray, "4 4"], share: float
-) -> Float[np.ndarray, "4 4"]:
-    """Interpolate two rigid transforms at ``share`` (0..1)."""
-    turn = rigid.vector_from_rotation(first[:3, :3].T @ last[:3, :3])
-    place = first[:3, 3] * (1 - share) + last[:3, 3] * share
-    return rigid.make(first[:3, :3] @ rigid.rotation_from_vector(turn * share), place)

@@ -86,18 +86,16 @@ class FeatureBasis:
         return _unit((raw - self.mean) @ self.components.T)
 
 
-def fit_basis(
-    raw: Float[np.ndarray, "sample channel"], *, channels: int = CHANNELS, whitening: float = WHITENING
-) -> FeatureBasis:
+def fit_basis(raw: Float[np.ndarray, "sample channel"], *, whitening: float = WHITENING) -> FeatureBasis:
     """Fit principal axes; ``whitening`` 0 keeps each axis's variance, 1 makes all equal.
 
     Textureless samples (zero descriptors) are left out.
     """
     samples = raw[np.linalg.norm(raw, axis=1) > 0].astype(np.float64)
-    assert len(samples) > channels, len(samples)
+    assert len(samples) > CHANNELS, len(samples)
     mean = samples.mean(axis=0)
     variance, axes = np.linalg.eigh(np.cov(samples - mean, rowvar=False))
-    variance, axes = variance[::-1][:channels], axes.T[::-1][:channels]
+    variance, axes = variance[::-1][:CHANNELS], axes.T[::-1][:CHANNELS]
     sign = np.sign(np.take_along_axis(axes, np.abs(axes).argmax(axis=1, keepdims=True), axis=1))
     components = sign * axes / np.maximum(variance, 1e-12)[:, None] ** (whitening / 2)
     length = np.linalg.norm((samples - mean) @ components.T, axis=1)

@@ -34,14 +34,6 @@ class Dataclass(Protocol):
 C = TypeVar("C", bound=Dataclass)
 
 
-def load(config: type[C], path: Path) -> C:
-    """Read one stage's table from a JSON or TOML file into `config`.
-
-    Raises `InputError` REC-001 (unknown key), REC-002 (wrong type), REC-003 (not readable).
-    """
-    return from_table(config, read_table(path), where=str(path))
-
-
 def read_table(path: Path) -> dict[str, Any]:
     """Read a JSON (`.json`) or TOML file that holds one table."""
     try:

@@ -25,7 +25,7 @@ _ROOT_NODE, _MESH_NODE, _FIRST_JOINT = 0, 1, 2
 
 @dataclass(frozen=True)
 class Skin:
-    """Four or eight influences per vertex; `agent_from_bone_rest` is the bind pose."""
+    """Four influences per vertex; `agent_from_bone_rest` is the bind pose."""
 
     joints: UInt8[np.ndarray, "vertex influence"]
     weights: Float32[np.ndarray, "vertex influence"]
@@ -52,13 +52,15 @@ def static(mesh: Mesh, name: str) -> bytes:
     return document.packed()
 
 
-def skinned(mesh: Mesh, skin: Skin, actions: Sequence[Action], name: str = "agent") -> bytes:
+def skinned(mesh: Mesh, skin: Skin, actions: Sequence[Action]) -> bytes:
     """Return a file of a skinned mesh (agent frame, metres) with one animation per action."""
     document = _Document()
-    document.add_mesh(mesh, name, skin)
+    document.add_mesh(mesh, "agent", skin)
     joints = list(range(_FIRST_JOINT, _FIRST_JOINT + len(skin.bone_names)))
-    document.file.nodes = [gltf.Node(name=name, children=joints)]
-    document.file.nodes.append(gltf.Node(name=f"{name}_surface", mesh=0, skin=0))
+    document.file.nodes = [
+        gltf.Node(name="agent", children=joints),
+        gltf.Node(name="agent_surface", mesh=0, skin=0),
+    ]
     translations, quaternions = _translation_quaternion(skin.agent_from_bone_rest)
     for bone, translation, quaternion in zip(skin.bone_names, translations, quaternions, strict=True):
         place, turn = translation.tolist(), quaternion.tolist()
@@ -106,12 +108,8 @@ class _Document:
         if mesh.color is not None:
             attributes.COLOR_0 = self.add(_linear_rgba(mesh.color), "VEC4", _FLOAT, target=target)
         if skin is not None:
-            for number in range(skin.joints.shape[1] // 4):
-                four = slice(4 * number, 4 * number + 4)
-                joints = self.add(skin.joints[:, four], "VEC4", _U8, target=target)
-                weights = self.add(skin.weights[:, four], "VEC4", _FLOAT, target=target)
-                setattr(attributes, f"JOINTS_{number}", joints)
-                setattr(attributes, f"WEIGHTS_{number}", weights)
+            attributes.JOINTS_0 = self.add(skin.joints, "VEC4", _U8, target=target)
+            attributes.WEIGHTS_0 = self.add(skin.weights, "VEC4", _FLOAT, target=target)
         corners = mesh.faces.astype(np.uint32).reshape(-1)
         indices = self.add(corners, "SCALAR", _U32, target=gltf.ELEMENT_ARRAY_BUFFER)
         matte = gltf.PbrMetallicRoughness(metallicFactor=0.0, roughnessFactor=1.0)
@@ -183,12 +181,8 @@ def read_skinned(data: bytes) -> tuple[Mesh, Skin, list[Action]]:
     columns = document.values(table.inverseBindMatrices).reshape(-1, 4, 4)
     rest = rigid.inverse(columns.transpose(0, 2, 1).astype(np.float64))
     names = tuple(_given(document.file.nodes[joint].name) for joint in _given(table.joints))
-
-    def influences(kind: str) -> np.ndarray:
-        stored = [getattr(attributes, f"{kind}_{number}", None) for number in (0, 1)]
-        return np.concatenate([document.values(each) for each in stored if each is not None], 1)
-
-    skin = Skin(influences("JOINTS"), influences("WEIGHTS"), rest, names)
+    joints, weights = document.values(attributes.JOINTS_0), document.values(attributes.WEIGHTS_0)
+    skin = Skin(joints, weights, rest, names)
     actions = [document.action(animation, len(names)) for animation in document.file.animations]
     return document.mesh(), skin, actions
 

@@ -94,17 +94,14 @@ def time_series(
     time_s: Num[np.ndarray, "frame"],
     *,
     absent: Bool[np.ndarray, "frame"] | None = None,
-    limit: float | None = None,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw a panel of values over seconds per label; ``absent`` frames are red, ``limit`` is dashed."""
+    """Draw a panel of values over seconds per label; ``absent`` frames are red."""
     figure, axes = panels(len(values), 1, width_in=9.0, height_in=1.6 * len(values))
     for axis, (label, curve) in zip(axes[:, 0], values.items(), strict=True):
         axis.fill_between(time_s, curve, color=GREEN, step="mid", linewidth=0)
         if absent is not None:
             frame = axis.get_xaxis_transform()
             axis.fill_between(time_s, 0, 1, where=absent, color=RED, alpha=0.3, step="mid", transform=frame)
-        if limit is not None:
-            axis.axhline(limit, color="black", linestyle="--", linewidth=0.8)
         axis.set(ylabel=label, ylim=(0, None))
         axis.margins(x=0)
     axes[-1, 0].set_xlabel("time [s]")
@@ -169,10 +166,8 @@ def outlined(
     return drawn
 
 
-def depth_colors(
-    depth: Float[np.ndarray, "height width"], far_m: float = DEPTH_RANGE_M
-) -> UInt8[np.ndarray, "height width 3"]:
-    """Colour z depth in metres from near (yellow) to ``far_m`` (violet); unknown (0) is black."""
-    nearness = np.clip(255 * (1 - depth / far_m), 0, 255).astype(np.uint8)
+def depth_colors(depth: Float[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width 3"]:
+    """Colour z depth in metres from near (yellow) to far (violet); unknown (0) is black."""
+    nearness = np.clip(255 * (1 - depth / DEPTH_RANGE_M), 0, 255).astype(np.uint8)
     colors = cv2.applyColorMap(nearness, cv2.COLORMAP_VIRIDIS)[..., ::-1]
     return colors * (depth > 0)[..., None].astype(np.uint8)

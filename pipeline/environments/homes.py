@@ -1,6 +1,6 @@
 """The animal of one build in several homes, each with recorded starts and scenes.
 
-`settle` opens the animal's own home or other builds' homes; `together` joins them, so that animals in
+`open_homes` opens the animal's own home or other builds' homes; `together` joins them, so that animals in
 different homes plan in one batch.
 """
 
@@ -33,7 +33,7 @@ class Habitat:
         return cls(data, scenes, np.zeros(len(data.videos), int), (share_known,))
 
 
-def settle(build: Path, data: BehaviorData, homes: Sequence[Path]) -> Habitat:
+def open_homes(build: Path, data: BehaviorData, homes: Sequence[Path]) -> Habitat:
     """Put the animal of ``build`` and ``data`` into ``homes``, by default its own home.
 
     Raises the errors of `pipeline.environments.other_home` for unusable homes.

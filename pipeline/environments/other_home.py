@@ -106,7 +106,7 @@ class ReconstructedHome:
 
 
 @dataclass(frozen=True)
-class Moved:
+class MovedAnimal:
     """An animal in another home."""
 
     home: ReconstructedHome
@@ -117,12 +117,13 @@ class Moved:
     """Share (0..1) of the other home's surface cells that look like the known home's."""
 
 
-def move_in(own: ReconstructedHome, other: ReconstructedHome, data: BehaviorData, *, seed: int = 0) -> Moved:
+def move_in(own: ReconstructedHome, other: ReconstructedHome, data: BehaviorData) -> MovedAnimal:
     """Put the animal of ``own`` and ``data`` into the other home. Raises ART-007 and SIM-011 as `perceived`
     does, SIM-011 where no moment fits in.
     """
     seen = replace(perceived(own, other), stands_m=own.stands_m)
-    return Moved(seen, set_down(data, own, seen, np.random.default_rng(seed)), share_known(own, seen))
+    starts = place_starts(data, own, seen, np.random.default_rng(0))
+    return MovedAnimal(seen, starts, share_known(own, seen))
 
 
 def perceived(own: ReconstructedHome, other: ReconstructedHome) -> ReconstructedHome:
@@ -134,11 +135,11 @@ def perceived(own: ReconstructedHome, other: ReconstructedHome) -> Reconstructed
     if other.describer != own.describer:
         what = f"has features of {other.describer.backend}, the animal's own of {own.describer.backend}"
         raise _unusable(what, Path("the other home"))
-    features = expressed(other.volume.features, other.basis, own.basis)
+    features = change_basis(other.volume.features, other.basis, own.basis)
     return replace(other, volume=replace(other.volume, features=features))
 
 
-def expressed(
+def change_basis(
     features: Float[np.ndarray, "channel x y z"], written: FeatureBasis, read: FeatureBasis
 ) -> Float[np.ndarray, "channel x y z"]:
     """Return features of the basis ``written`` as the basis ``read`` would have them.
@@ -189,7 +190,7 @@ def _surface(home: ReconstructedHome) -> tuple[Float[np.ndarray, "cell 17"], Flo
     return np.concatenate([look.T, place[:, 1:2] - home.floor_m], axis=1).astype(np.float32), place
 
 
-def set_down(
+def place_starts(
     data: BehaviorData, own: ReconstructedHome, other: ReconstructedHome, rng: np.random.Generator
 ) -> BehaviorData:
     """Place recorded moments on the floor of the other home, each moved rigidly as a whole.

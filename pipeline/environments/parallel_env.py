@@ -11,7 +11,6 @@ from pettingzoo import ParallelEnv
 from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.environments.floor import to_local, to_world
 from pipeline.environments.rendering import bird_view
-from pipeline.environments.rewards import ENDING, REWARDS
 from pipeline.environments.spaces import (
     FAR,
     person_action_space,
@@ -79,10 +78,8 @@ class PersonAnimalEnv(ParallelEnv):
             self.world.animals.command((root[:3, 3] + [goal[0], 0.0, goal[1]])[None])
         outcome = self.world.step(np.asarray(actions[PERSON])[None])
         self.frame += 1
-        reward = float(REWARDS[self.config.reward](outcome)[0])
-        over = self.config.reward in ENDING and bool(outcome.reached[0] | outcome.flees[0])
-        late = self.frame >= round(self.config.episode_s * RATE_HZ)
-        agents = self.agents
+        rewards, ended, out_of_time = self.world.judge(outcome, self.frame)
+        reward, over, late, agents = float(rewards[0]), bool(ended[0]), bool(out_of_time), self.agents
         if over or late:
             self.agents = []
         return (

@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.environments.rendering import PictureWindow, bird_view
-from pipeline.environments.rewards import ENDING, REWARDS
 from pipeline.environments.spaces import person_action_space, person_observation, person_observation_space
 from pipeline.environments.world import AnimalWorld
 
@@ -47,19 +46,16 @@ class PersonEnv(gymnasium.Env):
         """Let 0.1 s pass; an action in -1..1 is a part of the highest speeds."""
         outcome = self.world.step(np.asarray(action)[None])
         self.frame += 1
-        reward = float(REWARDS[self.config.reward](outcome)[0])
-        reached, fled = bool(outcome.reached[0]), bool(outcome.flees[0])
-        terminated = self.config.reward in ENDING and (reached or fled)
-        truncated = self.frame >= round(self.config.episode_s * RATE_HZ)
+        reward, over, late = self.world.judge(outcome, self.frame)
         self._show()
         info = {
             "distance_m": float(outcome.distance_m[0]),
-            "reached": reached,
-            "flees": fled,
+            "reached": bool(outcome.reached[0]),
+            "flees": bool(outcome.flees[0]),
             "plans_per_step": self.world.plans_per_step,
             "home": int(self.world.home[0]),
         }
-        return self._observation(), reward, terminated, truncated, info
+        return self._observation(), float(reward[0]), bool(over[0]), bool(late), info
 
     def render(self):
         """Return a picture from above (`rgb_array`)."""

@@ -8,16 +8,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 
 from pipeline.data import ply
-from pipeline.data.templates import SKIN
-from pipeline.fields import skinning
+from pipeline.fields.skinning import SkinnedShape
 from pipeline.geometry import rigid
 from pipeline.geometry.decimation import decimate
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 from pipeline.geometry.views import shade
+from pipeline.longterm.bodies import SkinnedBody, load_body
 from pipeline.workflow import artifact
 
 HEIGHT_PX, WIDTH_PX = 48, 64
@@ -37,19 +36,11 @@ INTRINSICS = np.array([[FOCAL_PX, 0, WIDTH_PX / 2], [0, FOCAL_PX, HEIGHT_PX / 2]
 class RgbdCamera:
     """Renders the surfaces of homes and their animal."""
 
-    def __init__(
-        self,
-        scenes: Sequence[Mesh],
-        body: Mesh,
-        weights: Float[np.ndarray, "vertex bone"],
-        agent_from_bone_rest: Float[np.ndarray, "bone 4 4"],
-    ):
-        """``scenes`` are in the world frames of their homes, ``body`` in the agent frame, metres."""
+    def __init__(self, scenes: Sequence[Mesh], body: SkinnedBody):
+        """``scenes`` are in the world frames of their homes, metres."""
         self.scenes = [RayCaster(scene) for scene in scenes]
-        self.body, nearest = decimate(body, AGENT_FACES)
-        self.weights = torch.from_numpy(np.asarray(weights[nearest], np.float32))
-        self.rest = torch.from_numpy(np.asarray(agent_from_bone_rest, np.float32))
-        self.points = torch.from_numpy(np.asarray(self.body.vertices, np.float32))
+        self.body, nearest = decimate(body.mesh, AGENT_FACES)
+        self.skin = SkinnedShape(self.body.vertices, body.weights[nearest], body.agent_from_bone_rest)
 
     @classmethod
     def load(cls, build: Path, homes: Sequence[Path]) -> "RgbdCamera":
@@ -59,10 +50,8 @@ class RgbdCamera:
         for folder in (build, *homes):
             remedy = "make it: make <agent>.reconstruction, or leave `rgbd` out of `observations`"
             artifact.require(folder, "reconstruction", remedy=remedy)
-        skin = SKIN.load(build / "reconstruction/skin.npz", "weights", "agent_from_bone_rest")
         scenes = [ply.read_ply(home / "reconstruction/scene.ply") for home in homes]
-        body = ply.read_ply(build / "reconstruction/agent.ply")
-        return cls(scenes, body, skin["weights"], skin["agent_from_bone_rest"])
+        return cls(scenes, load_body(build / "reconstruction"))
 
     def picture(
         self,
@@ -81,17 +70,10 @@ class RgbdCamera:
         caster = self.scenes[scene]
         depth, hits = render_view(caster, camera, INTRINSICS, HEIGHT_PX, WIDTH_PX)
         rgb = shade(caster.mesh, hits).reshape(HEIGHT_PX, WIDTH_PX, 3)
-        posed = RayCaster(self._posed(world_from_agent, agent_from_bone))
+        world = rigid.apply(np.asarray(world_from_agent, float), self.skin.posed(agent_from_bone))
+        posed = RayCaster(Mesh(world.astype(np.float32), self.body.faces, self.body.color))
         near, struck = render_view(posed, camera, INTRINSICS, HEIGHT_PX, WIDTH_PX)
         animal = (near > 0) & ((depth == 0) | (near < depth))
         rgb = np.where(animal[..., None], shade(posed.mesh, struck).reshape(rgb.shape), rgb)
         depth_m = np.where(animal, near, depth).clip(0, FAR_M)
         return rgb.astype(np.uint8), depth_m.astype(np.float32)
-
-    def _posed(
-        self, world_from_agent: Float[np.ndarray, "4 4"], agent_from_bone: Float[np.ndarray, "bone 4 4"]
-    ) -> Mesh:
-        bones = torch.from_numpy(np.asarray(agent_from_bone, np.float32))
-        points = skinning.move(skinning.blend(self.weights, bones, self.rest), self.points).numpy()
-        world = rigid.apply(np.asarray(world_from_agent, float), points.astype(float))
-        return Mesh(world.astype(np.float32), self.body.faces, self.body.color)

@@ -11,8 +11,6 @@ import numpy as np
 from jaxtyping import Float
 from stable_baselines3.common.vec_env import VecEnv
 
-from pipeline.behavior.trajectories import RATE_HZ
-from pipeline.environments.rewards import ENDING, REWARDS
 from pipeline.environments.spaces import person_action_space, person_observation, person_observation_space
 from pipeline.environments.world import AnimalWorld
 
@@ -55,8 +53,8 @@ class PersonStableVecEnv(VecEnv):
         """Let 0.1 s pass everywhere and begin ended episodes anew."""
         outcome = self.world.step(self.actions)
         self.frame += 1
-        over = (outcome.reached | outcome.flees) & (self.config.reward in ENDING)
-        late = ~over & (self.frame >= round(self.config.episode_s * RATE_HZ))
+        reward, over, late = self.world.judge(outcome, self.frame)
+        late &= ~over
         observation = person_observation(self.world)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         ended = np.flatnonzero(over | late)
@@ -71,8 +69,7 @@ class PersonStableVecEnv(VecEnv):
             self.world.restart(ended, self.split)
             self.frame[ended] = 0
             observation = person_observation(self.world)
-        reward = REWARDS[self.config.reward](outcome).astype(np.float32)
-        return observation, reward, over | late, infos
+        return observation, reward.astype(np.float32), over | late, infos
 
     def close(self) -> None:
         """Nothing to close."""

@@ -9,7 +9,6 @@ from gymnasium.vector.utils import batch_space
 from jaxtyping import Float
 
 from pipeline.behavior.trajectories import RATE_HZ
-from pipeline.environments.rewards import ENDING, REWARDS
 from pipeline.environments.spaces import person_action_space, person_observation, person_observation_space
 from pipeline.environments.world import AnimalWorld
 
@@ -51,11 +50,8 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
         if len(again):
             self.world.restart(again, self.split)
         self.frame = np.where(self.ended, 0, self.frame + 1)
-        lived = ~self.ended
-        ending = self.config.reward in ENDING
-        terminated = lived & ending & (outcome.reached | outcome.flees)
-        truncated = lived & (self.frame >= round(self.config.episode_s * RATE_HZ))
-        reward = np.where(lived, REWARDS[self.config.reward](outcome), 0.0)
+        lived, (reward, over, late) = ~self.ended, self.world.judge(outcome, self.frame)
+        terminated, truncated, reward = lived & over, lived & late, np.where(lived, reward, 0.0)
         self.ended = terminated | truncated
         info = {
             "distance_m": outcome.distance_m,

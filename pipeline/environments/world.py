@@ -23,8 +23,8 @@ from pipeline.behavior.trajectories import PAST, RATE_HZ, TEST, TRAIN, BehaviorD
 from pipeline.core.errors import InputError
 from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.floor import PersonFloor, to_local, to_world
-from pipeline.environments.homes import Habitat, settle
-from pipeline.environments.rewards import StepOutcome
+from pipeline.environments.homes import Habitat, open_homes
+from pipeline.environments.rewards import ENDING, REWARDS, StepOutcome
 from pipeline.environments.rgbd import RgbdCamera
 from pipeline.metrics.flight import WITHIN_S, flees
 from pipeline.workflow import artifact
@@ -117,7 +117,7 @@ class AnimalWorld:
         behavior.refuse_unplayable(architecture, str(build))
         data = BehaviorData.load(build / "behavior_data")
         sampler = Sampler(TorchNetworks(nets, device), schedule, scaling, architecture.guided)
-        habitat = settle(build, data, homes)
+        habitat = open_homes(build, data, homes)
         camera = RgbdCamera.load(build, homes or (build,)) if "rgbd" in config.observations else None
         return cls(sampler, habitat, architecture.ego, config, camera=camera)
 
@@ -147,6 +147,14 @@ class AnimalWorld:
         self.steps += len(before)
         moved = np.linalg.norm((self.animal_position - last)[:, [0, 2]], axis=-1)
         return StepOutcome(before, self.distance_m, moved * RATE_HZ, self.fleeing)
+
+    def judge(
+        self, outcome: StepOutcome, frame: int | Int[np.ndarray, "person"]
+    ) -> tuple[Float[np.ndarray, "person"], Bool[np.ndarray, "person"], Bool[np.ndarray, "*person"]]:
+        """Return rewards, whether the outcome ends the episode, and whether ``frame`` is its last one."""
+        over = (outcome.reached | outcome.flees) & (self.config.reward in ENDING)
+        late = np.asarray(frame) >= round(self.config.episode_s * RATE_HZ)
+        return REWARDS[self.config.reward](outcome), over, late
 
     @property
     def data(self) -> BehaviorData:

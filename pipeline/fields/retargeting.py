@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
+from pipeline.fields.skinning import SkinnedShape
 from pipeline.geometry import rigid, subsampling
 
 NEIGHBOURS = 4
@@ -25,21 +26,6 @@ SWEEPS = 6
 FRAMES_AT_ONCE = 256
 ROTATION_PRIOR = 1e-3
 """Weight of the transferred rotation relative to the points: resolves fits of collinear points."""
-
-
-@dataclass(frozen=True)
-class SkinnedShape:
-    """A surface at rest with its skinning weights and bones."""
-
-    vertices: Float[np.ndarray, "vertex 3"]
-    weights: Float[np.ndarray, "vertex bone"]
-    """linear blend skinning"""
-    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
-
-    @property
-    def extent(self) -> Float[np.ndarray, "2 3"]:
-        """Return the lower and the upper end along each axis."""
-        return np.percentile(self.vertices, EXTENT_PERCENT, axis=0)
 
 
 @dataclass(frozen=True)
@@ -59,10 +45,7 @@ def retarget(
     agent_from_bone: Float[np.ndarray, "frame source_bone 4 4"],
 ) -> Retargeted:
     """Return the motion of ``source`` on the body ``target``."""
-    chosen = subsampling.evenly(len(target.vertices), SURFACE_POINTS)
-    part = SkinnedShape(
-        target.vertices[chosen].astype(float), target.weights[chosen], target.agent_from_bone_rest
-    )
+    part = target.only(subsampling.evenly(len(target.vertices), SURFACE_POINTS))
     place, weights = find_correspondences(source, target, part.vertices)
     bones, residual = [], []
     for start in range(0, len(agent_from_bone), FRAMES_AT_ONCE):
@@ -90,7 +73,7 @@ def find_correspondences(
 def shape_distance_m(source: SkinnedShape, target: SkinnedShape) -> float:
     """Return how far the body plans differ: mean distance from the target's vertices to the source's after
     aligning extents, metres."""
-    scaled = _scaled(source, target, source.vertices.astype(float))
+    scaled = _scaled(source, target, source.vertices)
     return float(KDTree(scaled).query(target.vertices)[0].mean())
 
 
@@ -159,7 +142,7 @@ def retarget_root(
 ) -> Float[np.ndarray, "frame 4 4"]:
     """Scale the root's horizontal path by the ratio of root heights above the feet, from the same start, and
     raise it by their difference."""
-    source_height, target_height = -source.extent[0, 1], -target.extent[0, 1]
+    source_height, target_height = -extent(source)[0, 1], -extent(target)[0, 1]
     root = world_from_agent.copy()
     place, begin = root[:, :3, 3], root[0, :3, 3].copy()
     level = [0, 2]
@@ -168,9 +151,14 @@ def retarget_root(
     return root
 
 
+def extent(shape: SkinnedShape) -> Float[np.ndarray, "2 3"]:
+    """Return the lower and the upper end of a body along each axis."""
+    return np.percentile(shape.vertices, EXTENT_PERCENT, axis=0)
+
+
 def _scaled(
     source: SkinnedShape, target: SkinnedShape, points: Float[np.ndarray, "*batch 3"]
 ) -> Float[np.ndarray, "*batch 3"]:
     """Stretch points of the source to the extents of the target."""
-    (low, high), (own_low, own_high) = source.extent, target.extent
+    (low, high), (own_low, own_high) = extent(source), extent(target)
     return own_low + (points - low) / (high - low) * (own_high - own_low)

@@ -2,14 +2,17 @@
 
 `skinning_weights` gives the probability of each bone for each point (Gaussian bones, softmax over the
 negative squared Mahalanobis distance); `blend` mixes the bones' motions by dual quaternions; `move` applies
-the result. Forward (rest to posed) uses the weights at rest. Backward uses the same weights evaluated with
-the posed bones at the posed points, and the inverse of the blended motion (Yang et al., BANMo, Eqs. 4-7).
+the result; `SkinnedShape.posed` does both for NumPy arrays. Forward (rest to posed) uses the weights at rest.
+Backward uses the same weights evaluated with the posed bones at the posed points, and the inverse of the
+blended motion (Yang et al., BANMo, Eqs. 4-7).
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -38,7 +41,6 @@ def skinning_weights(
     points_agent: Float[Tensor, "*#batch point 3"],
     agent_from_bone_rest: Float[Tensor, "*#batch bone 4 4"],
     bone_scale_m: Float[Tensor, "bone 3"],
-    temperature: float = 1.0,
     delta: Float[Tensor, "*#batch point bone"] | None = None,
 ) -> Float[Tensor, "*#batch point bone"]:
     """Return the probability of each bone for each point (paper 001, Sec. 3.1).
@@ -47,10 +49,9 @@ def skinning_weights(
         points_agent: points in the agent frame, in metres.
         agent_from_bone_rest: bones at rest, or posed bones when the points are posed.
         bone_scale_m: standard deviations of the Gaussian bones along their own axes.
-        temperature: divides the squared distance; larger is smoother.
         delta: learned correction, added to the logits.
     """
-    logits = -squared_mahalanobis(points_agent, agent_from_bone_rest, bone_scale_m) / temperature
+    logits = -squared_mahalanobis(points_agent, agent_from_bone_rest, bone_scale_m)
     return (logits if delta is None else logits + delta).softmax(-1)
 
 
@@ -109,6 +110,27 @@ def move(
     inner = [c + w * p for c, p in zip(_cross(turn, place), place, strict=True)]
     moved = torch.stack([p + 2 * c for p, c in zip(place, _cross(turn, inner), strict=True)], dim=-1)
     return moved if inverse else moved + torch.stack(shift, dim=-1)
+
+
+@dataclass(frozen=True)
+class SkinnedShape:
+    """A surface at rest with its skinning weights and bones; agent frame, metres."""
+
+    vertices: Float[np.ndarray, "vertex 3"]
+    weights: Float[np.ndarray, "vertex bone"]
+    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
+
+    def posed(self, agent_from_bone: Float[np.ndarray, "bone 4 4"]) -> Float[np.ndarray, "vertex 3"]:
+        """Return the vertices posed by dual-quaternion blending, computed in single precision."""
+        weights, bones, rest, points = (
+            torch.as_tensor(np.ascontiguousarray(part, np.float32))
+            for part in (self.weights, agent_from_bone, self.agent_from_bone_rest, self.vertices)
+        )
+        return move(blend(weights, bones, rest), points).numpy().astype(np.float64)
+
+    def only(self, index: Int[np.ndarray, "chosen"]) -> "SkinnedShape":
+        """Return some of the vertices."""
+        return SkinnedShape(self.vertices[index], self.weights[index], self.agent_from_bone_rest)
 
 
 def _cross(a: Sequence[Tensor], b: Sequence[Tensor]) -> list[Tensor]:

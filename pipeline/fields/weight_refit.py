@@ -1,20 +1,23 @@
-"""Approximate dual-quaternion skinning by linear blend skinning with four or eight bones per vertex.
+"""Approximate dual-quaternion skinning by linear blend skinning with four bones per vertex.
 
-`blend_dual_quaternions` poses the surface as the reconstruction does; `refit_weights` finds, per vertex, the
-best four and the best eight bones and convex weights for linear blending over a set of poses; `residual_m`
-measures the error.
+`refit_weights` finds, per vertex, the best four bones and convex weights for linear blending over a set of
+poses; `residual_m` measures the error.
 """
 
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-import torch
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Int
 
-from pipeline.fields import skinning
+from pipeline.data.glb import Skin
+from pipeline.fields.skinning import SkinnedShape
+from pipeline.geometry import rigid, subsampling
 
-FOUR, EIGHT = 4, 8
+FOUR = 4
+"""Bones of a vertex that every player blends."""
+_CANDIDATES = 8
+"""Heaviest bones among which they are chosen."""
 _DESCENT_STEPS = 150
 
 
@@ -27,13 +30,11 @@ class Poses:
     posed: Float[np.ndarray, "frame vertex 3"]
     """target surface"""
 
-
-@dataclass(frozen=True)
-class Influences:
-    """Bones of each vertex and their convex weights, heaviest first."""
-
-    joints: UInt8[np.ndarray, "vertex influence"]
-    weights: Float32[np.ndarray, "vertex influence"]
+    @classmethod
+    def of(cls, body: SkinnedShape, agent_from_bone: Float[np.ndarray, "frame bone 4 4"]) -> "Poses":
+        """Pose a surface by dual-quaternion blending, as the reconstruction does."""
+        posed = np.stack([body.posed(bones) for bones in agent_from_bone])
+        return cls(agent_from_bone @ rigid.inverse(body.agent_from_bone_rest), posed)
 
 
 def farthest_poses(
@@ -41,71 +42,31 @@ def farthest_poses(
 ) -> Int[np.ndarray, " chosen"]:
     """Choose poses by farthest-point sampling, beginning with the one furthest from the mean."""
     flat = agent_from_bone[:, :, :3].reshape(len(agent_from_bone), -1)
-    distance = ((flat - flat.mean(0)) ** 2).sum(1)
-    chosen = [int(distance.argmax())]
-    distance = ((flat - flat[chosen[0]]) ** 2).sum(1)
-    while len(chosen) < min(count, len(flat)):
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, ((flat - flat[chosen[-1]]) ** 2).sum(1))
-    return np.unique(chosen)
+    first = int(((flat - flat.mean(0)) ** 2).sum(1).argmax())
+    return np.unique(subsampling.farthest_points(flat, count, first))
 
 
-def blend_dual_quaternions(
-    vertices: Float[np.ndarray, "vertex 3"],
-    weights: Float[np.ndarray, "vertex bone"],
-    agent_from_bone: Float[np.ndarray, "frame bone 4 4"],
-    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"],
-) -> Float[np.ndarray, "frame vertex 3"]:
-    """Pose the surface by dual-quaternion blending with all weights; metres, agent frame."""
-    points, weight, rest = (
-        torch.from_numpy(np.ascontiguousarray(values, np.float32))
-        for values in (vertices, weights, agent_from_bone_rest)
-    )
-    posed = [
-        skinning.move(skinning.blend(weight, torch.from_numpy(np.float32(bones)), rest), points)
-        for bones in agent_from_bone
-    ]
-    return torch.stack(posed).numpy().astype(np.float64)
-
-
-def refit_weights(
-    vertices: Float[np.ndarray, "vertex 3"], weights: Float[np.ndarray, "vertex bone"], poses: Poses
-) -> tuple[Influences, Influences]:
-    """Return the best four and the best eight bones per vertex with convex weights, by least squares."""
-    candidates = np.argsort(-weights, axis=1, kind="stable")[:, : min(EIGHT, weights.shape[1])]
-    gram = _gram(vertices, candidates, poses)
-    start = np.take_along_axis(weights, candidates, 1)
+def refit_weights(body: SkinnedShape, poses: Poses) -> Skin:
+    """Return the best four bones per vertex with convex weights, heaviest first, by least squares."""
+    candidates = np.argsort(-body.weights, axis=1, kind="stable")[:, :_CANDIDATES]
+    gram = _gram(body.vertices, candidates, poses)
+    start = np.take_along_axis(body.weights, candidates, 1)
     descended = _descend_on_simplex(gram, start / start.sum(1, keepdims=True))
     chosen = np.argsort(-descended, axis=1, kind="stable")[:, :FOUR]
     best = np.zeros_like(descended)
     sub_gram = np.take_along_axis(np.take_along_axis(gram, chosen[:, :, None], 1), chosen[:, None, :], 2)
     np.put_along_axis(best, chosen, _best_on_simplex(sub_gram), 1)
-    is_better = _cost(gram, best) < _cost(gram, descended)
-    return _influences(candidates, best, FOUR), _influences(
-        candidates, np.where(is_better[:, None], best, descended), EIGHT
-    )
-
-
-def _influences(
-    candidates: Int[np.ndarray, "vertex k"], weights: Float[np.ndarray, "vertex k"], count: int
-) -> Influences:
-    """Order by weight and keep, or fill up to, `count`; bones without weight become bone 0, as glTF asks."""
-    order = np.argsort(-weights, axis=1, kind="stable")[:, :count]
-    heaviest, joints = np.take_along_axis(weights, order, 1), np.take_along_axis(candidates, order, 1)
-    padding = ((0, 0), (0, count - order.shape[1]))
+    order = np.argsort(-best, axis=1, kind="stable")[:, :FOUR]
+    heaviest, joints = np.take_along_axis(best, order, 1), np.take_along_axis(candidates, order, 1)
+    padding = ((0, 0), (0, FOUR - order.shape[1]))  # bones without weight become bone 0, as glTF asks
     joints, heaviest = np.pad(np.where(heaviest > 0, joints, 0), padding), np.pad(heaviest, padding)
-    return Influences(joints.astype(np.uint8), (heaviest / heaviest.sum(1, keepdims=True)).astype(np.float32))
-
-
-def _cost(
-    gram: Float[np.ndarray, "vertex k k"], weights: Float[np.ndarray, "vertex k"]
-) -> Float[np.ndarray, " vertex"]:
-    """Return w' G w."""
-    return np.einsum("vi,vij,vj->v", weights, gram, weights)
+    heaviest = (heaviest / heaviest.sum(1, keepdims=True)).astype(np.float32)
+    names = tuple(f"bone_{bone:02d}" for bone in range(body.weights.shape[1]))
+    return Skin(joints.astype(np.uint8), heaviest, body.agent_from_bone_rest, names)
 
 
 def residual_m(
-    vertices: Float[np.ndarray, "vertex 3"], blend: Influences, poses: Poses
+    vertices: Float[np.ndarray, "vertex 3"], blend: Skin, poses: Poses
 ) -> Float[np.ndarray, "frame vertex"]:
     """Return the distance between the linear blend and the posed surface."""
     distance = np.empty(poses.posed.shape[:2])
@@ -163,7 +124,7 @@ def _best_on_simplex(gram: Float[np.ndarray, "vertex k k"]) -> Float[np.ndarray,
             total = solved.sum(1, keepdims=True)
             trial = np.zeros_like(best)
             trial[:, support] = solved / np.where(total == 0, 1, total)
-            cost = _cost(gram, trial)
+            cost = np.einsum("vi,vij,vj->v", trial, gram, trial)
             better = (trial >= 0).all(1) & (total[:, 0] > 0) & (cost < best_cost)
             best[better], best_cost[better] = trial[better], cost[better]
     return best

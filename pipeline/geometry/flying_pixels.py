@@ -3,18 +3,16 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
-SUPPORTERS = 3
+SUPPORTERS, TOLERANCE_M = 3, 0.03
 """neighbours of similar depth on a surface; a flying pixel along a straight edge has two"""
 
 
-def supported(
-    depth: Float[np.ndarray, "height width"], tolerance_m: float = 0.03
-) -> Bool[np.ndarray, "height width"]:
+def supported(depth: Float[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
     """Return which pixels have three of eight neighbours at nearly their own depth (metres, 0 = unknown)."""
     height, width = depth.shape
     around = np.pad(depth, 1)
     count = np.zeros(depth.shape, np.uint8)
     for row, column in np.ndindex(3, 3):
         neighbour = around[row : row + height, column : column + width]
-        count += (np.abs(neighbour - depth) < tolerance_m) & (neighbour > 0)
+        count += (np.abs(neighbour - depth) < TOLERANCE_M) & (neighbour > 0)
     return (depth > 0) & (count > SUPPORTERS)

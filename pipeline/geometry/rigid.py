@@ -83,9 +83,9 @@ def rotation_from_yaw(yaw_rad: Float[np.ndarray, "*batch"] | float) -> Float[np.
     return rotation_from_vector(np.asarray(yaw_rad)[..., None] * np.array([0.0, 1.0, 0.0]))
 
 
-def wrap(angle_rad: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
+def wrap(angle_rad: Float[np.ndarray, "*any"] | float) -> Float[np.ndarray, "*any"]:
     """Bring angles to -pi..pi, radians."""
-    return (angle_rad + np.pi) % (2 * np.pi) - np.pi
+    return (np.asarray(angle_rad) + np.pi) % (2 * np.pi) - np.pi
 
 
 def rotation_angle(
@@ -153,14 +153,12 @@ def interpolate(
     return make(rotation, translation)
 
 
-def smoothed(
-    a_from_b: Float[np.ndarray, "frame 4 4"], sigma_frames: float, places: bool = True
-) -> Float[np.ndarray, "frame 4 4"]:
-    """Smooth transforms in time: positions (if ``places``) by a Gaussian, rotations by its chordal mean."""
+def smoothed(a_from_b: Float[np.ndarray, "frame 4 4"], sigma_frames: float) -> Float[np.ndarray, "frame 4 4"]:
+    """Smooth transforms in time: positions by a Gaussian, rotations by its chordal mean."""
     if sigma_frames <= 0:
         return a_from_b
     mean = gaussian_filter1d(a_from_b[:, :3], sigma_frames, axis=0, mode="nearest")
-    return make(nearest_rotation(mean[:, :, :3]), mean[:, :, 3] if places else a_from_b[:, :3, 3])
+    return make(nearest_rotation(mean[:, :, :3]), mean[:, :, 3])
 
 
 def nearest_rotation(matrix: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3 3"]:

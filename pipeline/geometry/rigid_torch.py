@@ -65,20 +65,3 @@ def rotation_from_6d(columns: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batc
 def rotation_to_6d(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 6"]:
     """Return the first two columns of rotations (Zhou et al. 2019); undone by `rotation_from_6d`."""
     return torch.cat([rotation[..., 0], rotation[..., 1]], dim=-1)
-
-
-def rotation_angle(
-    first: Float[Tensor, "*#batch 3 3"], second: Float[Tensor, "*#batch 3 3"]
-) -> Float[Tensor, "*#batch"]:
-    """Return the geodesic angle between rotations in radians (atan2 form, exact at zero)."""
-    relative = first.transpose(-1, -2) @ second
-    axis = torch.stack(
-        [
-            relative[..., 2, 1] - relative[..., 1, 2],
-            relative[..., 0, 2] - relative[..., 2, 0],
-            relative[..., 1, 0] - relative[..., 0, 1],
-        ],
-        dim=-1,
-    )
-    trace = relative.diagonal(dim1=-2, dim2=-1).sum(-1)
-    return torch.atan2(axis.norm(dim=-1), trace - 1.0)

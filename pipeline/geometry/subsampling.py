@@ -1,5 +1,7 @@
 """Even subsampling of frames and other sequences, and tests for short gaps in them."""
 
+import itertools
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -11,6 +13,26 @@ def evenly(count: int, most: int, *, rounded: bool = False) -> Int[np.ndarray, "
     """
     places = np.linspace(0, max(count - 1, 0), min(most, count))
     return np.unique((np.round(places) if rounded else places).astype(int))
+
+
+def sharpest_of_steps(
+    step: Int[np.ndarray, "frame"], sharpness: Float[np.ndarray, "frame"]
+) -> Int[np.ndarray, "chosen"]:
+    """Return the sharpest frame of every step; steps are numbered in order of time."""
+    starts = np.flatnonzero(np.diff(step, prepend=-1) > 0)
+    bounds = np.append(starts, len(step))
+    return np.array([low + int(sharpness[low:high].argmax()) for low, high in itertools.pairwise(bounds)])
+
+
+def farthest_points(
+    points: Float[np.ndarray, "point axis"], count: int, first: int
+) -> Int[np.ndarray, "chosen"]:
+    """Choose up to ``count`` points by farthest-point sampling, beginning with the index ``first``."""
+    chosen, distance = [first], np.full(len(points), np.inf)
+    while len(chosen) < min(count, len(points)):
+        distance = np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(1))
+        chosen.append(int(distance.argmax()))
+    return np.sort(np.array(chosen))
 
 
 def within_short_gaps(

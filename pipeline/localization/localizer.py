@@ -1,25 +1,24 @@
 """Localizers: estimate the camera pose of one RGB-D picture relative to a map (the scene or the agent).
 
-Three kinds: nearest neighbours in a bank of rendered patches and scene-coordinate regression, both followed
-by RANSAC over rigid alignments (depth is known), and the paper's absolute pose regression. Descriptors are
-DAISY or those of the network that the features were fitted with. The inlier ratio is calibrated to a
-probability. `load` opens a trained localizer, `Localizer.localize` queries it.
+Two kinds: nearest neighbours in a bank of rendered patches, followed by RANSAC over rigid alignments (depth
+is known), and the paper's absolute pose regression. Descriptors are DAISY or those of the network that the
+features were fitted with. The inlier ratio is calibrated to a probability. `load` opens a trained localizer,
+`Localizer.localize` queries it.
 """
 
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal, TypeVar, assert_never
+from typing import Literal, assert_never
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from safetensors.numpy import load_file, save_file
-from torch import nn
 
 from pipeline.backends.descriptors import Describer
 from pipeline.geometry import align, rigid
-from pipeline.localization.networks import PoseRegressor, SceneCoordinateNet
+from pipeline.localization.networks import PoseRegressor
 from pipeline.localization.patches import (
     Describe,
     PatchBank,
@@ -29,8 +28,7 @@ from pipeline.localization.patches import (
     extract_patches,
 )
 
-Net = TypeVar("Net", bound=nn.Module)
-Kind = Literal["bank", "coordinates", "regression"]
+Kind = Literal["bank", "regression"]
 MIN_INLIERS = 4
 """Least number of inliers of a pose: three points always fit."""
 MIN_SECTOR_PATCHES = 6
@@ -89,7 +87,7 @@ class Localizer:
 
     sampling: PatchSampling
     basis: PcaBasis
-    model: PatchBank | SceneCoordinateNet | PoseRegressor
+    model: PatchBank | PoseRegressor
     calibration: Calibration
     solver: RansacSolver
     describer: Describer = Describer()
@@ -125,8 +123,6 @@ class Localizer:
                     for sector in sectors
                     if sector is None or len(sector) >= MIN_SECTOR_PATCHES
                 ]
-            case SceneCoordinateNet() as net:
-                poses = [self._solve(patches, *net.match(query))]
             case PoseRegressor() as net:
                 poses = [self._regress(patches, *net.regress(query, patches.cell, self._anchor(patches)))]
             case _:
@@ -180,23 +176,14 @@ def calibrate(score: Float[np.ndarray, "sample"], good: Bool[np.ndarray, "sample
     return Calibration(float(weights[0]), float(weights[1]))
 
 
-def errors(
-    map_from_camera: Float[np.ndarray, "*batch 4 4"], truth: Float[np.ndarray, "*batch 4 4"]
-) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch"]]:
-    """Return rotation errors (degrees) and translation errors (metres)."""
-    rotation = np.rad2deg(rigid.rotation_angle(map_from_camera[..., :3, :3], truth[..., :3, :3]))
-    return rotation, np.linalg.norm(map_from_camera[..., :3, 3] - truth[..., :3, 3], axis=-1)
-
-
 def save(folder: Path, localizer: Localizer, report: dict) -> None:
     """Write ``localizer.safetensors`` and ``localizer.json``; the report holds the held-out errors."""
     match localizer.model:
         case PatchBank() as bank:
             kind, arguments, arrays = "bank", {}, bank.arrays()
-        case SceneCoordinateNet() as net:
-            kind, arguments, arrays = "coordinates", net.arguments, _state_arrays(net)
         case PoseRegressor() as net:
-            kind, arguments, arrays = "regression", net.arguments, _state_arrays(net)
+            state = {name: value.cpu().numpy() for name, value in net.state_dict().items()}
+            kind, arguments, arrays = "regression", net.arguments, state
         case _:
             assert_never(localizer.model)
     basis = {f"basis.{name}": value for name, value in vars(localizer.basis).items()}
@@ -217,10 +204,10 @@ def load(folder: Path, device: str = "cpu") -> Localizer:
     match kind:
         case "bank":
             model = PatchBank.from_arrays(arrays)
-        case "coordinates":
-            model = _load_weights(SceneCoordinateNet(**metadata["arguments"]), arrays)
         case "regression":
-            model = _load_weights(PoseRegressor(**metadata["arguments"]), arrays)
+            model = PoseRegressor(**metadata["arguments"])
+            model.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
+            model.eval()
         case _:
             assert_never(kind)
     sampling = PatchSampling(**{**metadata["sampling"], "radii_px": tuple(metadata["sampling"]["radii_px"])})
@@ -233,12 +220,3 @@ def load(folder: Path, device: str = "cpu") -> Localizer:
 def open_describer(describer: Describer, device: str) -> Describe | None:
     """Load a descriptor network; None for DAISY, which `extract_patches` computes itself."""
     return None if describer.backend == "daisy" else describer.open(device)
-
-
-def _state_arrays(net: nn.Module) -> dict[str, np.ndarray]:
-    return {name: value.cpu().numpy() for name, value in net.state_dict().items()}
-
-
-def _load_weights(net: Net, arrays: dict[str, np.ndarray]) -> Net:
-    net.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
-    return net.eval()

@@ -1,11 +1,8 @@
-"""Neural localizers: scene-coordinate regression and the paper's absolute pose regression.
+"""The paper's absolute pose regression.
 
-`SceneCoordinateNet` maps each patch independently of its neighbours to its point of the map (ACE, Brachmann
-et al. 2023). `PoseRegressor`, a ResNet-18 with group normalisation over dense descriptors, regresses the
-camera's rotation (a unit quaternion) and position (Eq. 5). Both also predict their expected error.
+`PoseRegressor`, a ResNet-18 with group normalisation over dense descriptors, regresses the camera's rotation
+(a unit quaternion) and position (Eq. 5), and its expected error.
 """
-
-import itertools
 
 import numpy as np
 import torch
@@ -14,8 +11,6 @@ from torch import Tensor, nn
 
 from pipeline.geometry import rigid, rigid_torch
 
-MIN_LOG_M, MAX_LOG_M = -4.0, 3.0
-"""Bounds of the predicted log distance (2 cm to 20 m)."""
 GRID = 16
 """Cells along each side of the regressor's descriptor grid."""
 GROUPS, HIDDEN = 8, 256
@@ -24,44 +19,6 @@ MIN_LOG, MAX_LOG = -6.0, 3.0
 """Bounds of the predicted log error (radians + metres)."""
 IDENTITY_BIAS = 1e-3
 """Added to the quaternion's real part, so that zero output is a rotation."""
-
-
-class SceneCoordinateNet(nn.Module):
-    """Patch descriptor -> map point (metres) and log of its expected error."""
-
-    middle: Tensor
-    extent: Tensor
-
-    def __init__(self, axes: int, width: int, layers: int):
-        super().__init__()
-        self.arguments = {"axes": axes, "width": width, "layers": layers}
-        sizes = [axes] + [width] * layers
-        hidden = [part for i, o in itertools.pairwise(sizes) for part in (nn.Linear(i, o), nn.ReLU())]
-        self.net = nn.Sequential(*hidden, nn.Linear(width, 4))
-        self.register_buffer("middle", torch.zeros(3))
-        self.register_buffer("extent", torch.ones(()))
-
-    def forward(
-        self, descriptors: Float[Tensor, "patch axis"]
-    ) -> tuple[Float[Tensor, "patch 3"], Float[Tensor, "patch"]]:
-        """Return map points (metres) and log expected errors."""
-        out = self.net(descriptors * descriptors.shape[-1] ** 0.5)
-        return self.middle + self.extent * out[:, :3], out[:, 3].clamp(MIN_LOG_M, MAX_LOG_M)
-
-    @torch.no_grad()
-    def match(
-        self, query: Float[np.ndarray, "query axis"]
-    ) -> tuple[Float[np.ndarray, "query 3"], Float[np.ndarray, "query"]]:
-        """Return each patch's map point (metres), weighted by its precision."""
-        points, log_m = self(torch.from_numpy(np.ascontiguousarray(query, np.float32)))
-        return points.double().numpy(), torch.exp(-2 * log_m).double().numpy()
-
-
-def coordinate_loss(
-    points: Float[Tensor, "patch 3"], log_m: Float[Tensor, "patch"], truth: Float[Tensor, "patch 3"]
-) -> Float[Tensor, "patch"]:
-    """Return |x - y| / b + log b, the Laplace negative log likelihood with scale b (metres)."""
-    return (points - truth).norm(dim=-1) * torch.exp(-log_m) + log_m
 
 
 class _ResidualBlock(nn.Module):

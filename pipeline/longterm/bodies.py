@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from pipeline.behavior.model import channels_from_bones
 from pipeline.data import ply
 from pipeline.data.templates import SKIN
-from pipeline.geometry import rigid, rigid_torch
+from pipeline.geometry import rigid, rigid_torch, subsampling
 from pipeline.geometry.meshes import Mesh
 
 LEVER_M = 0.1
@@ -40,12 +40,7 @@ class SkinnedBody:
 
     def sample_vertices(self, count: int) -> Int[np.ndarray, "vertex"]:
         """Choose vertices by farthest point sampling, starting from the first vertex."""
-        points = np.asarray(self.mesh.vertices, np.float64)
-        chosen, distance = [0], np.full(len(points), np.inf)
-        while len(chosen) < min(count, len(points)):
-            distance = np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(1))
-            chosen.append(int(distance.argmax()))
-        return np.sort(np.array(chosen))
+        return subsampling.farthest_points(np.asarray(self.mesh.vertices, np.float64), count, 0)
 
 
 def load_body(reconstruction: Path) -> SkinnedBody:

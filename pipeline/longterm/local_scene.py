@@ -50,16 +50,15 @@ def distance_fields(
     world_from_clip: Float[np.ndarray, "clip 4 4"],
     scene: Int[np.ndarray, "clip"],
     scenes: Sequence[MotionScene],
-    batch_size: int = 100,
 ) -> Float[Tensor, "clip x y z"]:
-    """Sample the signed distance around clips, ``batch_size`` at a time; 0 without scenes."""
+    """Sample the signed distance around clips; 0 without scenes."""
     axes = [low + VOXEL_M * torch.arange(count) for low, count in zip(LOW_M, SHAPE, strict=True)]
     voxels = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
     frames = torch.from_numpy(np.asarray(world_from_clip)).float()
     field = torch.zeros(1, *SHAPE, dtype=torch.half)
     field = field.expand(len(frames), *SHAPE) if not scenes else field.repeat(len(frames), 1, 1, 1)
     for index, each in enumerate(scenes):
-        for rows in torch.from_numpy(np.flatnonzero(np.asarray(scene) == index)).split(batch_size):
+        for rows in torch.from_numpy(np.flatnonzero(np.asarray(scene) == index)).split(100):
             points = voxels @ frames[rows, :3, :3].transpose(1, 2) + frames[rows, None, :3, 3]
             distance = each.distance.at(points).clamp(MIN_DISTANCE_M, MAX_DISTANCE_M)
             field[rows] = distance.unflatten(1, SHAPE).half()

@@ -19,6 +19,8 @@ from pipeline.geometry import rigid
 RATE_HZ = 30
 STEPS = 60
 """k of the paper: a short motion has k + 1 frames, the first and the last of which are given"""
+SEAM_REACH = 6
+"""Frames on both sides of a seam that are interpolated."""
 EARLY, LATE = (0.2, 0.55), (0.45, 0.8)
 """phases of a jump, as shares of its duration: first up (or across), then across (or down)"""
 
@@ -63,17 +65,17 @@ def _smoothstep(share: Float[np.ndarray, "frame"], low: float, high: float) -> F
     return part * part * (3 - 2 * part)
 
 
-def smooth_seams(motion: BodyMotion, every: int = STEPS, reach: int = 6) -> BodyMotion:
-    """Interpolate over the ``reach`` frames on both sides of the seam at every ``every``-th frame.
+def smooth_seams(motion: BodyMotion) -> BodyMotion:
+    """Interpolate over the `SEAM_REACH` frames on both sides of the seams of short motions.
 
     Each clip ends in a given body that was sampled independently, and would snap to it in its last frames.
     """
-    frame, last = np.arange(len(motion)), (len(motion) - 1) // every - 1
+    frame, last = np.arange(len(motion)), (len(motion) - 1) // STEPS - 1
     if last < 1:
         return motion
-    seam = np.clip(np.round(frame / every), 1, last) * every
+    seam = np.clip(np.round(frame / STEPS), 1, last) * STEPS
     offset = np.abs(frame - seam)
-    anchors = np.flatnonzero((offset == 0) | (offset > reach))
+    anchors = np.flatnonzero((offset == 0) | (offset > SEAM_REACH))
     return _interpolate(anchors, motion[anchors], frame)
 
 
@@ -101,13 +103,13 @@ def resample_motion(timestamp_s: Float[np.ndarray, "frame"], motion: BodyMotion)
     return _interpolate(timestamp_s, motion, query_s)
 
 
-def stretches(trajectory: Trajectory, shortest_s: float = STEPS / RATE_HZ) -> list[BodyMotion]:
-    """Return the uninterrupted stretches of a trajectory that last ``shortest_s`` or longer, at 30 fps."""
+def stretches(trajectory: Trajectory) -> list[BodyMotion]:
+    """Return the uninterrupted stretches of a trajectory that hold a whole short motion, at 30 fps."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], trajectory.valid, [False]]).astype(np.int8)))
     found = []
     for start, end in zip(edges[::2], edges[1::2], strict=True):
         when = trajectory.timestamp_s[start:end]
-        if len(when) > 2 and when[-1] - when[0] >= shortest_s - 1e-6:
+        if len(when) > 2 and when[-1] - when[0] >= STEPS / RATE_HZ - 1e-6:
             motion = BodyMotion(trajectory.world_from_agent[start:end], trajectory.agent_from_bone[start:end])
             found.append(resample_motion(when, motion))
     return found

@@ -46,6 +46,8 @@ LANDING_CLEARANCE = 2.6
 """Preferred clearance, in root heights, where a jump takes off or lands: the body is stretched out."""
 LARGE_TURN_RAD = 1.7
 """A larger turn at rest takes two legs."""
+VISITED_CELL_M, APART_M = 0.25, 0.5
+"""Cells in which visits are counted, and least distance of consecutive sampled sub-goals."""
 MORE_LEGS = 4
 """Maximum number of legs beyond those that the pace requires, to keep legs out of furniture."""
 
@@ -216,22 +218,17 @@ def move_into_scene(subgoals: list[Subgoal], scene: MotionScene, motion_prior: M
 
 
 def sample_visited_subgoals(
-    positions_world: Float[np.ndarray, "frame 3"],
-    count: int,
-    rng: np.random.Generator,
-    *,
-    cell_m: float = 0.25,
-    apart_m: float = 0.5,
+    positions_world: Float[np.ndarray, "frame 3"], count: int, rng: np.random.Generator
 ) -> list[Subgoal]:
-    """Sample sub-goals from visited cells in proportion to visits, consecutive ones ``apart_m`` apart."""
-    places = np.floor(positions_world[:, [0, 2]] / cell_m)
+    """Sample sub-goals from visited cells in proportion to visits, consecutive ones apart."""
+    places = np.floor(positions_world[:, [0, 2]] / VISITED_CELL_M)
     cells, number, visits = np.unique(places, axis=0, return_inverse=True, return_counts=True)
     number, found = number.reshape(-1), []
     for _ in range(count):
         weight = visits.astype(float)
         if found:
-            offset = (cells + 0.5) * cell_m - found[-1].position_world[[0, 2]]
-            weight *= np.linalg.norm(offset, axis=1) > apart_m
+            offset = (cells + 0.5) * VISITED_CELL_M - found[-1].position_world[[0, 2]]
+            weight *= np.linalg.norm(offset, axis=1) > APART_M
         weight = weight if weight.sum() > 0 else visits.astype(float)
         chosen = rng.choice(len(cells), p=weight / weight.sum())
         found.append(Subgoal(np.median(positions_world[number == chosen], axis=0)))
@@ -317,7 +314,7 @@ def _poses_along_path(
             given = yaw_rad[-1] if yaw_rad else 0.0
         yaw_rad.append(float(np.arctan2(tangent[0], tangent[2])) if given is None else given)
     for index in range(2, len(yaw_rad)):
-        turn = (yaw_rad[index] - yaw_rad[index - 1] + np.pi) % (2 * np.pi) - np.pi
+        turn = float(rigid.wrap(yaw_rad[index] - yaw_rad[index - 1]))
         rests = np.linalg.norm(points[index - 2 : index + 1] - points[index], axis=1).max() < 1e-6
         if rests and headings[index - 1] is None and abs(turn) > LARGE_TURN_RAD:
             yaw_rad[index - 1] += turn / 2

@@ -21,8 +21,8 @@ MIN_DEPTH_M = 0.1
 """Smaller depth counts as missing, metres."""
 MAX_STEP_M, MAX_STEP_SHARE = 0.05, 0.05
 """Pixels whose neighbour differs by more (metres plus share of the depth) are depth edges and not used."""
-MAX_NORMAL_STEP_M, MAX_NORMAL_STEP_SHARE = 0.05, 0.06
-"""The same over the span of `image_normals`."""
+SPAN_PX, MAX_NORMAL_STEP_M, MAX_NORMAL_STEP_SHARE = 4, 0.05, 0.06
+"""Span of the differences of `image_normals`, and the same over it."""
 QUERY_RADIUS_RATIO = 1.5
 """Search radius over reach: the nearest vertex may be farther than the plane through it."""
 
@@ -48,20 +48,20 @@ def depth_noise(depth_m: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]
 
 
 def image_normals(
-    depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"], span_px: int = 4
+    depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "height width 3"]:
     """Return camera-facing unit normals by central differences; zero at depth edges and unknown depth."""
     points = cameras.back_project(depth, intrinsics)
     normals = np.zeros_like(points)
-    inner = slice(span_px, -span_px)
-    right = points[inner, 2 * span_px :] - points[inner, : -2 * span_px]
-    down = points[2 * span_px :, inner] - points[: -2 * span_px, inner]
+    inner = slice(SPAN_PX, -SPAN_PX)
+    right = points[inner, 2 * SPAN_PX :] - points[inner, : -2 * SPAN_PX]
+    down = points[2 * SPAN_PX :, inner] - points[: -2 * SPAN_PX, inner]
     cross = np.cross(down, right)
     length = np.linalg.norm(cross, axis=-1)
     centre = depth[inner, inner]
     limit = MAX_NORMAL_STEP_M + MAX_NORMAL_STEP_SHARE * centre
     known = (centre > 0) & (length > 1e-9) & (np.abs(right[..., 2]) < limit) & (np.abs(down[..., 2]) < limit)
-    for end in (slice(2 * span_px, None), slice(None, -2 * span_px)):
+    for end in (slice(2 * SPAN_PX, None), slice(None, -2 * SPAN_PX)):
         known &= (depth[inner, end] > 0) & (depth[end, inner] > 0)
     normals[inner, inner] = np.where(known[..., None], cross / np.maximum(length, 1e-9)[..., None], 0)
     return normals

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass
+from typing import Any
 
 SUBJECTS = {
     "agent": "animal's root",
@@ -70,7 +71,6 @@ STEMS = {
 }  # fmt: skip
 METHODS = {
     "rendered_": "volume rendering",
-    "retrieval_only_": "image retrieval",
     "sift_only_": "SIFT and PnP",
     "agent_confidence_": "animal's root",
 }
@@ -112,6 +112,17 @@ def describe(key: str) -> MetricWords:
     unit = unit or ("px" if name.startswith("epe_px") else "dB" if name == "psnr" else "")
     words.append(STEMS.get(name, name.replace("_", " ")))
     return MetricWords(", ".join([": ".join(words), *tail]), unit)
+
+
+def number(value: Any) -> str:
+    """Format a number with three significant digits, without exponent if possible."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return str(value)
+    if value == round(value) or abs(value) >= 100:
+        return f"{value:.0f}"
+    return f"{value:#.3g}".rstrip(".") if abs(value) >= 1e-3 else f"{value:.1e}"
 
 
 def _subject(name: str) -> str:

@@ -104,7 +104,6 @@ def check_poses(
     pose: Float[np.ndarray, "frame 7"] | None,
     timestamp_s: Float[np.ndarray, "frame"],
     depth_view: Callable[[int], DepthPicture],
-    pairs: int = POSE_PAIRS,
     documented: Convention = OPENGL,
     among: Sequence[Convention] = CONVENTIONS,
 ) -> PoseCheck:
@@ -112,7 +111,7 @@ def check_poses(
     broken = "the recording has no device poses" if pose is None else _invalid_reason(pose)
     if pose is None or broken:
         return PoseCheck("unusable", documented, 0, np.nan, np.nan, TOLERANCE_M, broken)
-    chosen = moving_pairs(odometry_from_pose(pose, documented), timestamp_s, pairs)
+    chosen = moving_pairs(odometry_from_pose(pose, documented), timestamp_s, POSE_PAIRS)
     if len(chosen) == 0:
         reason = "the phone moved too little to test its poses"
         return PoseCheck("untested", documented, 0, np.nan, np.nan, TOLERANCE_M, reason)

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, UInt8
 
 from pipeline.core.errors import InputError
 from pipeline.data import images
-from pipeline.geometry import cameras, rigid
+from pipeline.geometry import align, cameras, rigid
 from pipeline.geometry.subsampling import evenly
 from pipeline.mapping import picture_agreement
 from pipeline.mapping.picture_agreement import Clock, PictureAgreement, PosedPicture
@@ -163,7 +163,8 @@ def _upright(
         return None, turns or quarter_turns_from_surfaces(room()), False
     odometry_from_camera = conventions.odometry_from_pose(pose, check.convention)
     if recording.up is not None:
-        odometry_from_camera = _y_up_from(recording.up) @ odometry_from_camera
+        turned = align.rotation_between(np.array(recording.up), np.array([0.0, 1.0, 0.0]))
+        odometry_from_camera = rigid.make(turned, np.zeros(3)) @ odometry_from_camera
         up = up_from_room(odometry_from_camera, room())
         if up is not None and up[1] < np.cos(np.radians(MAX_TILT_DEG)):
             turns = quarter_turns_from_gravity(odometry_from_camera, up_odometry=up)
@@ -216,13 +217,6 @@ def _tracked(recording: Recording) -> tuple[Int[np.ndarray, "used"], Float[np.nd
     lost = "" if known.all() else f"{100 * (1 - known.mean()):.0f} % of the frames have no device pose"
     used = known if known.mean() >= MIN_TRACKED else np.ones_like(known)
     return everything[used], recording.pose[used], lost
-
-
-def _y_up_from(up: tuple[float, float, float]) -> Float[np.ndarray, "4 4"]:
-    """Return the smallest rotation of the poses' world that maps ``up`` to +y."""
-    axis, angle = np.cross(up, (0.0, 1.0, 0.0)), np.arccos(np.clip(up[1] / np.linalg.norm(up), -1, 1))
-    axis = axis / np.linalg.norm(axis) if np.linalg.norm(axis) > 1e-9 else np.array([1.0, 0.0, 0.0])
-    return rigid.make(rigid.rotation_from_vector(axis * angle), np.zeros(3))
 
 
 def picture(

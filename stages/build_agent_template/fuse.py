@@ -65,7 +65,7 @@ class ClosedBody:
 class Limb:
     """Where a limb has been, and the frames in which it has one pose."""
 
-    frames: Int[np.ndarray, "alike"]
+    frames: Int[np.ndarray, "chosen"]
     points_world: Float[np.ndarray, "point 3"]
     """measured on it in all frames, metres"""
 

@@ -12,24 +12,25 @@ from pipeline.geometry import views as overview
 from pipeline.geometry.meshes import Mesh, RayCaster
 from stages.build_agent_template.template import CanonicalTemplate
 
+VIEWS, SIZE_PX = 8, 220
 FOCAL, LIFTS_RAD, DISTANCE = 1.4, (0.25, 0.9), 3.2
 """the turntable's focal length in picture widths, elevations, and distance in radii of the mesh"""
 SATURATION, VALUES = 0.75, (0.7, 0.95)
 """saturation and value of a bone's colour; neighbours alternate in value"""
 
 
-def turntable(mesh: Mesh, views: int = 8, size_px: int = 220) -> UInt8[np.ndarray, "height width 3"]:
+def turntable(mesh: Mesh) -> UInt8[np.ndarray, "height width 3"]:
     """Draw the mesh (agent frame) all around, starting at the head, one row per elevation."""
     caster, radius = RayCaster(mesh), float(np.linalg.norm(mesh.vertices, axis=1).max())
-    focal, up = FOCAL * size_px, np.array([0.0, 1.0, 0.0])
-    intrinsics = np.array([[focal, 0, size_px / 2], [0, focal, size_px / 2], [0, 0, 1]])
+    focal, up = FOCAL * SIZE_PX, np.array([0.0, 1.0, 0.0])
+    intrinsics = np.array([[focal, 0, SIZE_PX / 2], [0, focal, SIZE_PX / 2], [0, 0, 1]])
     shown = []
     for lift in LIFTS_RAD:
-        for turn in 2 * np.pi * np.arange(views) / views:
+        for turn in 2 * np.pi * np.arange(VIEWS) / VIEWS:
             toward = np.array([np.cos(lift) * np.sin(turn), np.sin(lift), np.cos(lift) * np.cos(turn)])
             camera = rigid.look_at(DISTANCE * radius * toward, np.zeros(3), up)
-            shown.append(overview.view(caster, camera, intrinsics, size_px, size_px))
-    return plots.grid(shown, views)
+            shown.append(overview.view(caster, camera, intrinsics, SIZE_PX, SIZE_PX))
+    return plots.grid(shown, VIEWS)
 
 
 def bone_colors(weights: Float[np.ndarray, "vertex bone"]) -> UInt8[np.ndarray, "vertex 3"]:

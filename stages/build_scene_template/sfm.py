@@ -5,7 +5,6 @@ Repetitive texture passes epipolar verification one period off. `verify_matches`
 rigid motion of the matched depth points, and drops pairs with few inliers or that contradict odometry.
 """
 
-import itertools
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from jaxtyping import Float, Int, Num
 
 from pipeline.core.progress import log
 from pipeline.data.clips import Clip
-from pipeline.geometry import align, cameras, rigid
+from pipeline.geometry import align, cameras, rigid, subsampling
 from pipeline.mapping import colmap
 from pipeline.mapping.bundle_adjustment import TrackedPoints, build_tracks
 from pipeline.mapping.colmap import SparseModel, read_sparse_model
@@ -58,10 +57,7 @@ def choose_keyframes(clip: Clip, config: SfmConfig) -> Int[np.ndarray, "key"]:
         rotated = np.rad2deg(rigid.rotation_angle(pose[:-1, :3, :3], pose[1:, :3, :3])) / KEYFRAME_DEG
         progress = np.concatenate([[0.0], np.cumsum(np.maximum(moved, rotated))])
     progress = progress * min(1.0, (config.max_keyframes - 2) / max(progress[-1], 1e-6))
-    step = np.floor(progress).astype(int)
-    starts = np.flatnonzero(np.diff(step, prepend=-1) > 0)
-    bounds = np.append(starts, len(step))
-    return np.array([low + int(clip.quality[low:high].argmax()) for low, high in itertools.pairwise(bounds)])
+    return subsampling.sharpest_of_steps(np.floor(progress).astype(int), clip.quality)
 
 
 def choose_pairs(

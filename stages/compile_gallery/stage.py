@@ -1,12 +1,12 @@
 """The stage: all finished builds -> one page that links to their simulators and reports."""
 
-import math
 from pathlib import Path
 
 import jinja2
 
 from pipeline.core.errors import InputError
 from pipeline.data import qa
+from pipeline.metrics import words
 from stages.compile_gallery import reading
 
 _WORDS = {"ok": "all checks fine", "warn": "checks to look at", "fail": "checks failed", "none": "no checks"}
@@ -30,13 +30,5 @@ def run(root: Path) -> str:
     environment = jinja2.Environment(
         loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=undefined
     )
-    environment.filters["number"] = number
+    environment.filters["number"] = words.number
     return environment.get_template("gallery.html").render(cards=cards, marks=qa.MARKS, words=_WORDS)
-
-
-def number(value: float) -> str:
-    """Format a number with three significant digits; integers exactly."""
-    if value == round(value) or abs(value) >= 100:
-        return f"{value:.0f}"
-    digits = max(0, 2 - math.floor(math.log10(abs(value))))
-    return f"{value:.{digits}f}"

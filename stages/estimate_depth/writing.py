@@ -10,14 +10,13 @@ from jaxtyping import Int
 from pipeline.data import images, plots, qa
 from pipeline.data.clips import FRAMES, MAPPED, Pictures
 from pipeline.geometry import cameras, subsampling
+from pipeline.recordings.extraction import quality_of
 from stages.estimate_depth.depth import FrameDepth
 from stages.estimate_depth.lens import Lens
 from stages.estimate_depth.tracking import Tracked
 
 SHOWN = 10
 """Frames on the contact sheet."""
-DARK = 0.15
-"""Mean brightness (0..1) below which a picture loses quality."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ def write(folder: Path, pictures: Pictures, estimated: Estimated, jpeg_quality: 
         images.write_depth(folder / "depth" / f"{number:06d}.exr", found.depth)
         images.write_gray(folder / "confidence" / f"{number:06d}.png", found.confidence)
     valid = np.array([(each.depth > 0).mean() for each in estimated.depths])
-    sharp = np.minimum(pictures.sharpness / max(float(np.median(pictures.sharpness)), 1e-6), 1)[chosen]
+    pictured = quality_of(pictures.sharpness, pictures.brightness, np.ones(len(pictures.sharpness)))
     small = cameras.scale_intrinsics(lens.intrinsics, lens.size, estimated.depths[0].depth.shape)
     FRAMES.save(
         folder / "frames.npz",
@@ -61,7 +60,7 @@ def write(folder: Path, pictures: Pictures, estimated: Estimated, jpeg_quality: 
         sharpness=pictures.sharpness[chosen],
         brightness=pictures.brightness[chosen],
         depth_valid=valid.astype(np.float32),
-        quality=(sharp * np.minimum(pictures.brightness[chosen] / DARK, 1) * valid).astype(np.float32),
+        quality=(pictured[chosen] * valid).astype(np.float32),
     )
 
 

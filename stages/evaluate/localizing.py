@@ -1,7 +1,6 @@
-"""Single frames of real sessions placed on the map without odometry: our localizer and two simple rivals.
+"""Single frames of real sessions placed on the map without odometry: our localizer and a simple rival.
 
-The rivals show that the built-in world is not easy: SIFT points of the walk-through with PnP (colour only),
-and the pose of the most similar walk-through picture.
+The rival shows that the built-in world is not easy: SIFT points of the walk-through with PnP (colour only).
 """
 
 from collections.abc import Sequence
@@ -11,7 +10,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.backends.daisy import describe
 from pipeline.data.clips import Clip
 from pipeline.geometry import rigid
 from pipeline.localization.localizer import Localizer
@@ -21,7 +19,6 @@ from pipeline.metrics.pose_errors import PoseErrors
 
 WITHIN_DEG, WITHIN_M = 5, 0.2
 """Error bounds in the metric's name."""
-RETRIEVAL_STRIDE_PX = 40
 REPROJECTION_PX, PNP_ITERATIONS = 4.0, 2000
 FAILED = "more than half of the frames were not placed"
 
@@ -32,14 +29,6 @@ class SiftMap:
 
     descriptors: Float[np.ndarray, "point 128"]
     points_world: Float[np.ndarray, "point 3"]
-
-
-@dataclass(frozen=True)
-class Gallery:
-    """Global descriptors of walk-through frames, with their cameras."""
-
-    descriptors: Float[np.ndarray, "picture channel"]
-    world_from_camera: Float[np.ndarray, "picture 4 4"]
 
 
 def metrics_of(name: str, errors: PoseErrors) -> Metrics:
@@ -100,23 +89,6 @@ def placed_by_sift(known: SiftMap, clip: Clip, frames: Sequence[int]) -> Float[n
         if ok and inliers is not None and len(inliers) >= 8:
             found[-1] = rigid.inverse(rigid.make(rigid.rotation_from_vector(turn[:, 0]), shift[:, 0]))
     return np.array(found).reshape(-1, 4, 4)
-
-
-def gallery(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], frames: Sequence[int]) -> Gallery:
-    """Compute the global descriptors of walk-through frames."""
-    descriptors = np.stack([_whole(clip.color(frame)) for frame in frames])
-    return Gallery(descriptors, world_from_camera[np.array(frames)])
-
-
-def placed_by_retrieval(known: Gallery, clip: Clip, frames: Sequence[int]) -> Float[np.ndarray, "frame 4 4"]:
-    """Give each frame the camera of the most similar walk-through frame."""
-    nearest = [int(np.argmax(known.descriptors @ _whole(clip.color(frame)))) for frame in frames]
-    return known.world_from_camera[nearest]
-
-
-def _whole(color: np.ndarray) -> Float[np.ndarray, "channel"]:
-    raw = describe(color, RETRIEVAL_STRIDE_PX).ravel()
-    return raw / max(float(np.linalg.norm(raw)), 1e-6)
 
 
 def _sift(color: np.ndarray) -> sift.Keypoints:

@@ -15,6 +15,7 @@ from pipeline.data.motion import TRACKS, Motion
 from pipeline.data.templates import SkinTable, bones_at_rest
 from pipeline.fields import fields, gaussians
 from pipeline.fields.render import Renderer, render_depth
+from pipeline.fields.skinning import SkinnedShape
 from pipeline.geometry import rigid, subsampling
 from pipeline.geometry.meshes import Mesh, RayCaster
 from pipeline.metrics.lpips import Lpips
@@ -26,7 +27,6 @@ from stages.evaluate.config import Config
 from stages.evaluate.heldout import HeldoutShot, HeldoutView
 from stages.evaluate.reading import BuildFolders, Reconstructed, RecordingWithTruth, TruthAlignment
 from stages.evaluate.registration import root_metrics
-from stages.evaluate.surfaces import SkinnedPoints
 from stages.evaluate.truth import read_depth
 
 CAMERAS_FOR_SEEN = 40
@@ -215,9 +215,9 @@ def _drawn_by_splats(
     return views
 
 
-def _skin(folders: Reconstructed) -> tuple[Mesh, SkinnedPoints]:
+def _skin(folders: Reconstructed) -> tuple[Mesh, SkinnedShape]:
     mesh, table = (ply.read_ply(folders.reconstruction / "agent.ply"), SkinTable.open(folders.reconstruction))
-    return mesh, SkinnedPoints(mesh.vertices, table.weights, table.agent_from_bone_rest)
+    return mesh, SkinnedShape(mesh.vertices, table.weights, table.agent_from_bone_rest)
 
 
 def track_distances(
@@ -229,7 +229,7 @@ def track_distances(
 ) -> list[Float[np.ndarray, "point"]]:
     """Return distances, metres per visible frame, of surface points matched to truth in the turnaround."""
     skin = _skin(folders)[1].only(TRACKS.load(folders.reconstruction / "tracks.npz")["vertex_index"])
-    partner = surfaces.matched_once(skin.points_agent, _at_rest(turnaround, frames))
+    partner = surfaces.matched_once(skin.vertices, _at_rest(turnaround, frames))
     distances = []
     for each in sessions:
         motion = motions[each.video.id]
@@ -249,10 +249,10 @@ def _at_rest(turnaround: RecordingWithTruth, frames: TruthAlignment, every: int 
         yield rigid.apply(frames.agent_from_true_agent, in_agent)
 
 
-def _posed(skin: SkinnedPoints, motion: Motion | None, frame: int) -> np.ndarray | None:
+def _posed(skin: SkinnedShape, motion: Motion | None, frame: int) -> np.ndarray | None:
     if motion is None or not np.isfinite(motion.world_from_agent[frame]).all():
         return None
-    return skin.posed(motion.world_from_agent[frame], motion.agent_from_bone[frame])
+    return rigid.apply(motion.world_from_agent[frame], skin.posed(motion.agent_from_bone[frame]))
 
 
 def _agent_chamfer(

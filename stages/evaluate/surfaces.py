@@ -1,14 +1,11 @@
 """Surfaces against truth: points followed on the animal, chamfer distances of scene and animal."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from pipeline.fields import skinning
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import RayCaster
 from pipeline.metrics.metrics import Metrics, median, percentile
@@ -17,31 +14,6 @@ from stages.evaluate.registration import REFUSED, REFUSED_TENTH
 NEAREST_M, RANGE_M = 0.05, 5.0
 REACHED = 0.99
 """Share of the way to a point that must be free: the point is part of a surface itself."""
-
-
-@dataclass(frozen=True)
-class SkinnedPoints:
-    """The agent's surface points and how bones move them."""
-
-    points_agent: Float[np.ndarray, "point 3"]
-    """at rest"""
-    weights: Float[np.ndarray, "point bone"]
-    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
-
-    def posed(
-        self, world_from_agent: Float[np.ndarray, "4 4"], agent_from_bone: Float[np.ndarray, "bone 4 4"]
-    ) -> Float[np.ndarray, "point 3"]:
-        """Return the points in the world."""
-        weights, bones, rest, points = (
-            torch.as_tensor(np.asarray(part, np.float32))
-            for part in (self.weights, agent_from_bone, self.agent_from_bone_rest, self.points_agent)
-        )
-        moved = skinning.move(skinning.blend(weights, bones, rest), points).numpy().astype(np.float64)
-        return rigid.apply(world_from_agent, moved)
-
-    def only(self, index: Int[np.ndarray, "chosen"]) -> "SkinnedPoints":
-        """Return some of the points."""
-        return SkinnedPoints(self.points_agent[index], self.weights[index], self.agent_from_bone_rest)
 
 
 def matched_once(

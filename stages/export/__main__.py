@@ -12,4 +12,4 @@ from stages.export import stage
 from stages.export.config import Config
 
 if __name__ == "__main__":
-    cli.main(__doc__, stage.run, stage.Inputs, Config, options=("format", "rate_hz", "influences"))
+    cli.main(__doc__, stage.run, stage.Inputs, Config, options=("format", "rate_hz"))

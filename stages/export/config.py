@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 Format = Literal["glb", "splats", "usd", "bvh", "mjcf", "tables", "movement", "nwb", "nerfstudio", "colmap"]
-Influences = Literal["4", "8"]
 
 
 @dataclass(frozen=True)
@@ -15,7 +14,5 @@ class Config:
     """one of the formats above"""
     rate_hz: float = 30.0
     """keys of animations, per second"""
-    influences: Influences = "4"
-    """bones that move a vertex in glb and usd: four, which every player blends, or eight, with less loss"""
     pictures_per_video: int = 150
     """frames of each recording, evenly spread, for nerfstudio and colmap, which alone hold pictures"""

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,6 @@ from pipeline.data.motion import Motion
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
 from pipeline.geometry.subsampling import evenly
-from stages.export.config import Influences
 
 
 @dataclass(frozen=True)
@@ -81,18 +80,15 @@ class Occupancy:
     voxel_m: float
 
 
-def agent(simulator: Path, take: Path | None, rate_hz: float, influences: Influences = "4") -> Agent:
+def agent(simulator: Path, take: Path | None, rate_hz: float) -> Agent:
     """Read the animal from `agent.glb`, keys resampled to `rate_hz`; a generated take is one motion more."""
     with other_versions_refused("simulator", str(simulator)):
         mesh, skin, actions = gltf.read_skinned((simulator / "agent.glb").read_bytes())
-        residual_mm = json.loads((simulator / "simulator.json").read_bytes())["agent"]
-        loss_mm = residual_mm["skinning_residual_8_mm" if influences == "8" else "skinning_residual_mm"]
+        loss_mm = json.loads((simulator / "simulator.json").read_bytes())["agent"]["skinning_residual_mm"]
     if take:
         names = ("timestamp_s", "world_from_agent", "agent_from_bone")
         made = npz.load(take, names)
         actions = [*actions, Action("generated", *(made[name].astype(np.float64) for name in names))]
-    if influences == "8":
-        skin = replace(skin, **npz.load(simulator / "skin_8.npz", ("joints", "weights")))
     return Agent(mesh, skin, [_resampled(action, rate_hz) for action in actions], loss_mm)
 
 

@@ -5,6 +5,7 @@ from jaxtyping import Float
 
 from pipeline.data.glb import Action, Skin
 from pipeline.fields import retargeting
+from pipeline.fields.skinning import SkinnedShape
 from stages.export.reading import Agent
 
 
@@ -25,9 +26,9 @@ def onto(agent: Agent, other: Agent) -> Agent:
     return Agent(other.mesh, other.skin, actions, other.skinning_loss_mm, loss_mm)
 
 
-def _body(agent: Agent) -> retargeting.SkinnedShape:
+def _body(agent: Agent) -> SkinnedShape:
     rest = agent.skin.agent_from_bone_rest.astype(float)
-    return retargeting.SkinnedShape(agent.mesh.vertices.astype(float), _dense(agent.skin, len(rest)), rest)
+    return SkinnedShape(agent.mesh.vertices.astype(float), _dense(agent.skin, len(rest)), rest)
 
 
 def _dense(skin: Skin, bones: int) -> Float[np.ndarray, "vertex bone"]:

@@ -55,10 +55,10 @@ def run(inputs: Inputs, config: Config, out: Path) -> writing.ExportRecord:
 
 def _agent(inputs: Inputs, config: Config) -> reading.Agent:
     take = inputs.take / "take.npz" if inputs.take is not None else None
-    agent = reading.agent(inputs.simulator, take, config.rate_hz, config.influences)
+    agent = reading.agent(inputs.simulator, take, config.rate_hz)
     if inputs.body is None:
         return agent
-    return retarget.onto(agent, reading.agent(inputs.body, None, config.rate_hz, config.influences))
+    return retarget.onto(agent, reading.agent(inputs.body, None, config.rate_hz))
 
 
 def _frames(inputs: Inputs, config: Config) -> list[reading.CameraFrame]:

@@ -65,7 +65,6 @@ def contract(
             **gait(motions),
             "root_height_m": [round(float(height), 4) for height in np.percentile(heights, [0.5, 99.5])],
             "skinning_residual_mm": loss_mm(parts.residual_m),
-            "skinning_residual_8_mm": loss_mm(parts.eight_residual_m),
         },
         "clips": [
             {

@@ -1,20 +1,21 @@
 """Turn a reconstruction and its recordings into the parts of a simulator: light, re-fitted, resampled."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.data.glb import Action, Skin
 from pipeline.fields import weight_refit
-from pipeline.geometry import rigid
+from pipeline.fields.skinning import SkinnedShape
 from pipeline.geometry.decimation import decimate
 from pipeline.geometry.meshes import Mesh
 from pipeline.geometry.subsampling import evenly
+from pipeline.longterm.bodies import SkinnedBody
 from stages.export_simulator import surfaces
 from stages.export_simulator.actions import SessionClip, animation
 from stages.export_simulator.config import Config
-from stages.export_simulator.reading import CanonicalAgent, SplatClouds
+from stages.export_simulator.reading import SplatClouds
 
 FITTED_POSES = 48
 """Recorded poses, as different as can be, that weights are fitted to: more change the loss by under 1 %."""
@@ -32,9 +33,6 @@ class SimulatorParts:
     skin: Skin
     residual_m: Float[np.ndarray, "frame vertex"]
     """distance of the four-weight linear blend from dual-quaternion blending, poses that were not fitted"""
-    eight: weight_refit.Influences
-    """the same surface with eight weights, for players that can"""
-    eight_residual_m: Float[np.ndarray, "frame vertex"]
     actions: list[Action]
     scene: Mesh
     splat_rows: bytes
@@ -44,22 +42,19 @@ class SimulatorParts:
 
 
 def simulator(
-    body: CanonicalAgent, scene: Mesh, gaussians: SplatClouds, motions: list[SessionClip], config: Config
+    body: SkinnedBody, scene: Mesh, gaussians: SplatClouds, motions: list[SessionClip], config: Config
 ) -> SimulatorParts:
     """Thin the surfaces, fit the weights, resample the motion."""
     agent, source_vertex = decimate(body.mesh, config.agent_faces)
-    thinned = CanonicalAgent(agent, body.weights[source_vertex], body.agent_from_bone_rest)
-    (four, residual_m), (eight, eight_residual_m) = fit_weights(thinned, motions)
-    names = tuple(f"bone_{bone:02d}" for bone in range(len(body.agent_from_bone_rest)))
+    thinned = replace(body, mesh=agent, weights=body.weights[source_vertex])
+    skin, residual_m = fit_weights(thinned, motions)
     room, _ = decimate(scene, config.scene_faces)
     inside = np.concatenate([motion.world_from_camera[:, :3, 3] for motion in motions]).mean(0)
     positions = np.concatenate([motion.world_from_agent[:, :3, 3] for motion in motions])
     return SimulatorParts(
         agent=agent,
-        skin=Skin(four.joints, four.weights, body.agent_from_bone_rest, names),
+        skin=skin,
         residual_m=residual_m,
-        eight=eight,
-        eight_residual_m=eight_residual_m,
         actions=[animation(motion, ACTION_RATE_HZ) for motion in motions],
         scene=surfaces.orient_towards(room, inside),
         splat_rows=surfaces.splat_rows(gaussians.scene, config.scene_splats),
@@ -70,23 +65,18 @@ def simulator(
 
 
 def fit_weights(
-    body: CanonicalAgent, motions: list[SessionClip]
-) -> list[tuple[weight_refit.Influences, Float[np.ndarray, "frame vertex"]]]:
-    """Fit four and eight weights a vertex to recorded poses that differ most.
+    body: SkinnedBody, motions: list[SessionClip]
+) -> tuple[Skin, Float[np.ndarray, "frame vertex"]]:
+    """Fit four weights a vertex to recorded poses that differ most.
 
-    Returns both with the distance, metres, that each leaves in poses that were not fitted.
+    Returns them with the distance, metres, that they leave in poses that were not fitted.
     """
     recorded = np.concatenate([motion.agent_from_bone for motion in motions])
     chosen = weight_refit.farthest_poses(recorded, FITTED_POSES)
     others = np.setdiff1d(np.arange(len(recorded)), chosen)
     judged = others[evenly(len(others), _JUDGED_POSES)] if len(others) else chosen
-    vertices, rest = body.mesh.vertices.astype(np.float64), body.agent_from_bone_rest
-    fit, held = (
-        weight_refit.Poses(
-            recorded[at] @ rigid.inverse(rest),
-            weight_refit.blend_dual_quaternions(vertices, body.weights, recorded[at], rest),
-        )
-        for at in (chosen, judged)
-    )
-    blends = weight_refit.refit_weights(vertices, body.weights, fit)
-    return [(blend, weight_refit.residual_m(vertices, blend, held)) for blend in blends]
+    vertices = body.mesh.vertices.astype(np.float64)
+    shape = SkinnedShape(vertices, body.weights, body.agent_from_bone_rest)
+    fit, held = (weight_refit.Poses.of(shape, recorded[at]) for at in (chosen, judged))
+    skin = weight_refit.refit_weights(shape, fit)
+    return skin, weight_refit.residual_m(vertices, skin, held)

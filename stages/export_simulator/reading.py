@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,22 +12,12 @@ from jaxtyping import Float, Shaped
 from pipeline.behavior.support import JUMP_KERNEL, SUPPORTED
 from pipeline.behavior.trajectories import BehaviorData
 from pipeline.core.errors import InputError
-from pipeline.data import gaussian_ply, npz, ply
-from pipeline.data.templates import SkinTable
-from pipeline.geometry.meshes import Mesh
+from pipeline.data import gaussian_ply, npz
+from pipeline.longterm.bodies import SkinnedBody, load_body
 from stages.export_simulator.actions import SessionClip, cut, longest_run
 
 NETWORKS = ("perception", "goal", "path", "body")
 _SHORTEST_CLIP_FRAMES = 16
-
-
-@dataclass(frozen=True)
-class CanonicalAgent:
-    """The canonical agent: surface and skin, agent frame, metres."""
-
-    mesh: Mesh
-    weights: Float[np.ndarray, "vertex bone"]
-    agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
 
 
 @dataclass(frozen=True)
@@ -56,11 +46,10 @@ class BehaviorAssets:
     """share of recorded frames whose root is above something that carries it; None where that is unknown"""
 
 
-def body(reconstruction: Path) -> CanonicalAgent:
+def body(reconstruction: Path) -> SkinnedBody:
     """Read the agent's surface and skin."""
-    skin, surface = SkinTable.open(reconstruction), ply.read_ply(reconstruction / "agent.ply")
-    rest = skin.agent_from_bone_rest.astype(np.float64)
-    return CanonicalAgent(surface, skin.weights.astype(np.float64), rest)
+    stored = load_body(reconstruction)
+    return replace(stored, weights=stored.weights.astype(np.float64))
 
 
 def motions(behavior_data: Path) -> list[SessionClip]:

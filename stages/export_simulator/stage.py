@@ -25,7 +25,7 @@ class Inputs:
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] = ()) -> float:
-    """Write page, `agent.glb`, `scene.glb`, `skin_8.npz`, `simulator.json`; return the page's megabytes.
+    """Write page, `agent.glb`, `scene.glb`, `simulator.json`; return the page's megabytes.
 
     Raises EXP-001 where no session is long enough, EXP-002 for a model that cannot be sampled, EXP-003 for
     another home without a take in it, ART-003 where that home lacks its surfaces.

@@ -7,7 +7,7 @@ from typing import Any, assert_never
 
 import numpy as np
 
-from pipeline.data import glb, npz
+from pipeline.data import glb
 from pipeline.data.qa import Check, Picture
 from stages.export_simulator import page, pictures
 from stages.export_simulator.config import Config, Layout
@@ -37,7 +37,6 @@ def write_simulator(
     size_mb = _write_page(folder, about, _room(parts, room) | _animal(parts, behavior), config.layout)
     (folder / "agent.glb").write_bytes(glb.skinned(parts.agent, parts.skin, parts.actions))
     (folder / "scene.glb").write_bytes(room)
-    npz.save(folder / "skin_8.npz", joints=parts.eight.joints, weights=parts.eight.weights)
     (folder / "simulator.json").write_text(json.dumps(about, indent=1) + "\n")
     return size_mb
 

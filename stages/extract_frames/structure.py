@@ -4,7 +4,6 @@
 lens. The model's scale is its own.
 """
 
-import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import pycolmap
 from jaxtyping import Float, Int, UInt8
 
 from pipeline.core.progress import log
+from pipeline.geometry import subsampling
 from pipeline.mapping import colmap
 from pipeline.mapping.colmap import SparseModel, read_sparse_model
 from stages.extract_frames.config import PhotogrammetryConfig
@@ -84,9 +84,7 @@ def choose_keyframes(
     """Pick the sharpest frame of every step of motion."""
     steps = min(travelled[-1] / config.keyframe_share, config.max_keyframes - 1)
     step = np.floor(travelled / max(travelled[-1], 1e-9) * steps).astype(int)
-    starts = np.flatnonzero(np.diff(step, prepend=-1) > 0)
-    bounds = np.append(starts, len(step))
-    return np.array([low + int(sharpness[low:high].argmax()) for low, high in itertools.pairwise(bounds)])
+    return subsampling.sharpest_of_steps(step, sharpness)
 
 
 def solve(

@@ -79,7 +79,7 @@ class ChapterReport:
     """the worst status of these"""
 
     @property
-    def own_light(self) -> str:
+    def own_status(self) -> str:
         """The worst status of all notes and thresholds."""
         found = [note.light for note in self.notes] + ([self.bars] if self.bars != "ok" else [])
         return max(found, key=LIGHTS.index, default="none")
@@ -87,10 +87,10 @@ class ChapterReport:
     @property
     def light(self) -> str:
         """The verdict: the worst of its own status and that of its dependencies."""
-        return max(self.own_light, self.inherited, key=LIGHTS.index) if self.causes else self.own_light
+        return max(self.own_status, self.inherited, key=LIGHTS.index) if self.causes else self.own_status
 
     @property
-    def worries(self) -> list[tuple[Note, dict[str, Any]]]:
+    def warnings(self) -> list[tuple[Note, dict[str, Any]]]:
         """Checks that are not ok, worst first."""
         bad = ("warn", "fail")
         found = [(note, check) for note in self.notes for check in note.checks if check["status"] in bad]
@@ -144,11 +144,11 @@ def with_verdicts(chapters: Sequence[ChapterReport], bars: Mapping[str, str]) ->
         name, mine = each.chapter.artifact, replace(each, bars=bars.get(each.chapter.artifact, "ok"))
         direct = [each for each in mine.depends_on if each in found]
         reached[name] = frozenset(direct).union(*(reached[below] for below in direct))
-        own = LIGHTS.index(mine.own_light)
+        own = LIGHTS.index(mine.own_status)
         worse = [found[below] for below in found if below in reached[name]]
-        worse = [below for below in worse if LIGHTS.index(below.own_light) > max(own, LIGHTS.index("ok"))]
-        inherited = max((below.own_light for below in worse), key=LIGHTS.index, default="ok")
-        causes = tuple(below.chapter for below in worse if below.own_light == inherited)
+        worse = [below for below in worse if LIGHTS.index(below.own_status) > max(own, LIGHTS.index("ok"))]
+        inherited = max((below.own_status for below in worse), key=LIGHTS.index, default="ok")
+        causes = tuple(below.chapter for below in worse if below.own_status == inherited)
         found[name] = replace(mine, causes=causes, inherited=inherited)
     return list(found.values())
 

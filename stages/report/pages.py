@@ -28,7 +28,7 @@ def render(
     environment = jinja2.Environment(
         loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=undefined
     )
-    environment.filters |= {"number": number, "in_words": in_words}
+    environment.filters |= {"number": metric_words.number, "in_words": in_words}
     environment.globals |= {"describe": metric_words.describe, "remedy": remedy}
     shared = {"name": name, "chapters": chapters, "judged": judged, "words": WORDS, "marks": qa.MARKS}
     index = environment.get_template("index.html")
@@ -44,14 +44,3 @@ def in_words(check: str) -> str:
     """Return a check's name; metric keys are spelled out in words."""
     group, _, rest = check.partition("/")
     return f"{group}: {metric_words.describe(check).text}" if rest and " " not in check else check
-
-
-def number(value: Any) -> str:
-    """Format a number with three significant digits, without exponent if possible."""
-    if value is None:
-        return "–"
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return str(value)
-    if value == round(value) or abs(value) >= 100:
-        return f"{value:.0f}"
-    return f"{value:#.3g}".rstrip(".") if abs(value) >= 1e-3 else f"{value:.1e}"

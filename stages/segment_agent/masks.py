@@ -53,9 +53,9 @@ class Segmentation:
     """One per frame, generated lazily."""
     path: CameraPath | None = None
     """Camera poses; None without depth."""
-    walkers: People | None = None
+    people: People | None = None
     """People in a session with depth."""
-    strangers: float | None = None
+    unknown_animals: float | None = None
     """Share of frames with a moving animal that is none of several known ones."""
     references: References | None = None
     """Depth pictures for checking the masks; None without depth."""
@@ -94,11 +94,11 @@ def segment(
             references = free_space.gather(clip, poses, config.references)
             return Segmentation(masks, path, references=references, shown="resting")
         case "session":
-            references, walkers = people.gather_without_people(clip, poses, config.references)
+            references, persons = people.gather_without_people(clip, poses, config.references)
             segmenter = _session_segmenter(clip, poses, references, placed, config, rng)
-            masks = people.hide(segmenter.masks(range(len(clip))), walkers, clip, poses)
+            masks = people.hide(segmenter.masks(range(len(clip))), persons, clip, poses)
             shown = "moving" if placed is None else "resting"
-            return Segmentation(masks, path, walkers, references=references, shown=shown)
+            return Segmentation(masks, path, persons, references=references, shown=shown)
         case _:
             assert_never(role)
 

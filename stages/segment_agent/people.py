@@ -105,11 +105,11 @@ def gather_without_people(
 ) -> tuple[References, People]:
     """Gather ``count`` references, find people by them, and make the references ignore people's motion."""
     references = free_space.gather(clip, world_from_camera, count)
-    walkers = find_people(clip, world_from_camera, references)
-    for axis, height_m in zip(walkers.axis_world, walkers.height_m, strict=True):
+    people = find_people(clip, world_from_camera, references)
+    for axis, height_m in zip(people.axis_world, people.height_m, strict=True):
         tall = "" if np.isnan(height_m) else f", {height_m:.2f} m tall"
         log(f"a person walks here, seen in {np.isfinite(axis[:, 0]).sum()} of {len(clip)} frames{tall}")
-    return replace(references, ignored=walkers.near if len(walkers.axis_world) else None), walkers
+    return replace(references, ignored=people.near if len(people.axis_world) else None), people
 
 
 @dataclass(frozen=True, eq=False)

@@ -88,8 +88,8 @@ def report_quality(
         poses, masks = found.path.world_from_camera, Masks.open(folder)
         by_space = overlap.estimate(clip, poses, found.references, masks, animal, found.shown)
         checks = checks_of(summary, found.path.residual_m, by_space)
-    if found is not None and found.strangers is not None:
-        checks.append(Check("frames with a stranger", 100 * found.strangers, "%", warn=5))
+    if found is not None and found.unknown_animals is not None:
+        checks.append(Check("frames with a stranger", 100 * found.unknown_animals, "%", warn=5))
     area, visible = np.array(summary.area), np.array(summary.visible)
     over_time = plots.time_series({"share": area}, clip.timestamp_s, absent=~visible)
     qa.write(

@@ -39,13 +39,13 @@ OTHER_LOG_ODDS = -1.0
 PORTRAITS_SHARE = 0.25
 """portraits for training, as a share of the recording's examples: more would outweigh its room"""
 STRANGER_SHARE = 0.5
-"""share of strangers among frames with a track above which an animal has no turnaround; fewer may be
+"""share of unknown animals among frames with a track above which an animal has no turnaround; fewer may be
 visitors"""
 
 
 @dataclass
 class IdentityScores:
-    """Log-odds of a frame's pixels per animal and for strangers, computed once and cached compressed."""
+    """Log-odds of a frame's pixels per animal and for unknown ones, computed once and cached compressed."""
 
     clip: Clip
     network: Identities
@@ -82,24 +82,24 @@ class IdentityScores:
 def segment(
     clip: Clip, flow: Path, followed: str, network: Identities, portraits: Sequence[Portrait], config: Config
 ) -> Segmentation:
-    """Return one mask per frame of the followed animal, poses, people, and the share of strangers.
+    """Return one mask per frame of the followed animal, poses, people, and the share of unknown animals.
 
-    Raises InputError MSK-007 if strangers prevail.
+    Raises InputError MSK-007 if unknown animals prevail.
     """
     path = estimate_trajectory(clip, flow, np.random.default_rng(config.seed))
     poses, scores = path.world_from_camera, IdentityScores(clip, network, config.height_px)
-    references, walkers = people.gather_without_people(clip, poses, config.references)
+    references, persons = people.gather_without_people(clip, poses, config.references)
     stranger_margin = scores.of(len(network.names))
-    strangers = tracked(find_mover(clip, poses, references, config.animal, None, margin_of=stranger_margin))
+    unknown = tracked(find_mover(clip, poses, references, config.animal, None, margin_of=stranger_margin))
     segmenters = find_all(clip, poses, references, config, scores, portraits)
     known = [tracked(segmenter.spheres) for segmenter in segmenters]
     for name, seen in zip(network.names, known, strict=True):
         log(f"{name}: tracked in {seen.sum()} of {len(clip)} frames" if seen.any() else f"{name} is not here")
-    _refuse_strangers(clip, strangers.sum() / max(np.any([strangers, *known], axis=0).sum(), MIN_FRAMES))
+    _refuse_unknown_animals(clip, unknown.sum() / max(np.any([unknown, *known], axis=0).sum(), MIN_FRAMES))
     own = network.names.index(followed)
     found = (resolve_overlaps(segmenters, scores, own, frame) for frame in range(len(clip)))
-    found = people.hide(found, walkers, clip, poses)
-    return Segmentation(found, path, walkers, float(strangers.mean()), references, "one of several")
+    found = people.hide(found, persons, clip, poses)
+    return Segmentation(found, path, persons, float(unknown.mean()), references, "one of several")
 
 
 def find_all(
@@ -217,7 +217,7 @@ def tracked(spheres: Sequence[Sphere | None]) -> Bool[np.ndarray, "frame"]:
     return np.array([sphere is not None and not sphere.presumed for sphere in spheres])
 
 
-def _refuse_strangers(clip: Clip, share: float) -> None:
+def _refuse_unknown_animals(clip: Clip, share: float) -> None:
     if share > STRANGER_SHARE:
         what = f"in {100 * share:.0f} % of the frames that show an animal it matches no turnaround"
         remedy = "film a turnaround of each animal that lives here (turnaround_<name>), or leave this out"

@@ -39,7 +39,7 @@ def write(folder: Path, masks: Iterable[Mask], count: int, pictures: int = 12) -
 
 def write_people(folder: Path, clip: Clip, found: Segmentation) -> None:
     """Write ``people.npz`` of a session with depth."""
-    if found.walkers is not None and found.path is not None:
-        feet_camera = found.walkers.feet_in_camera(found.path.world_from_camera)
-        time_s, height_m = clip.timestamp_s, found.walkers.height_m
+    if found.people is not None and found.path is not None:
+        feet_camera = found.people.feet_in_camera(found.path.world_from_camera)
+        time_s, height_m = clip.timestamp_s, found.people.height_m
         PEOPLE.save(folder / "people.npz", timestamp_s=time_s, feet_camera=feet_camera, height_m=height_m)

@@ -4,8 +4,8 @@ With `--behavior`: beside a scripted observer; writes `take.npz` and `take.csv`.
 `Simulator.reset(seed)` and `Simulator.step(observer)` of `pipeline.behavior.simulator`. With `--animals`: all
 animals of a home together, each with a take in a folder of its name, and `from_above.jpg`. With `--serve`:
 live in a browser, computed here; kept too. With `--longterm` and `--subgoals FILE` (see
-`stages.simulate.subgoal_file`) or `--places`, or a recording that `--config` names: writes `take.npz` at 30
-fps, `take.glb`, `take.json` and `frames/`. All in the space of `--behavior-data`.
+`stages.simulate.subgoal_file`) or `--places`: writes `take.npz` at 30 fps, `take.glb`, `take.json` and
+`frames/`. All in the space of `--behavior-data`.
 """
 
 from pipeline.workflow import cli

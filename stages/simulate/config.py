@@ -5,7 +5,7 @@ from typing import Literal
 
 from pipeline.behavior.config import PlanSamplingConfig
 
-ObserverScript = Literal["away", "still", "approach", "circle"]
+ObserverScript = Literal["away", "still", "approach"]
 """What a scripted observer does."""
 SubgoalSource = Literal["none", "visited", "behavior"]
 """Where sub-goals come from that no file gives."""
@@ -23,8 +23,6 @@ class Config:
     """Walking speed of the observer, m/s."""
     guidance: float = PlanSamplingConfig.guidance
     """Scale of classifier-free guidance: the interactivity."""
-    without: tuple[Literal["scene", "observer", "past", "goal"], ...] = ()
-    """Conditions that plans are drawn without."""
     goal_steps: int = 0
     """Denoising steps of the goal; 0: as the model is best sampled."""
     sequence_steps: int = 0
@@ -37,8 +35,6 @@ class Config:
     optimise: bool = True
     """Make the motion physically plausible; a take of the behaviour model only where `--longterm` and
     `--reconstruction` are given."""
-    recording: str | None = None
-    """Take the reconstructed motion of this session, its longest stretch, instead."""
     pictures_per_s: float = 10.0
     """Pictures per second of long-term motion; 0: none."""
     absent: tuple[str, ...] = ()

@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from pipeline.core import progress
 from pipeline.data import glb, images, npz
 from pipeline.fields import weight_refit
+from pipeline.fields.skinning import SkinnedShape
 from pipeline.geometry import rigid, views
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 from pipeline.longterm.bodies import PosedSurface, SkinnedBody
@@ -123,9 +124,8 @@ def fit_skin(body: SkinnedBody, agent_from_bone: Float[np.ndarray, "frame bone 4
     roots = torch.eye(4).expand(len(some), 4, 4)
     posed = PosedSurface(body)(roots, torch.from_numpy(some).float()).double().numpy()
     poses = weight_refit.Poses(some @ rigid.inverse(rest), posed)
-    vertices = np.asarray(body.mesh.vertices, np.float64)
-    four, _ = weight_refit.refit_weights(vertices, body.weights, poses)
-    return glb.Skin(four.joints, four.weights, rest, tuple(f"bone_{bone:02d}" for bone in range(len(rest))))
+    shape = SkinnedShape(np.asarray(body.mesh.vertices, np.float64), body.weights, rest)
+    return weight_refit.refit_weights(shape, poses)
 
 
 def _finite(metrics: Plausibility) -> dict[str, float | None]:

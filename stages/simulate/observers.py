@@ -11,8 +11,6 @@ from stages.simulate.config import ObserverScript
 
 Observer = Callable[[float, Float[np.ndarray, "3"]], Float[np.ndarray, "3"]]
 """From time in seconds and the animal's position to the observer's position, world metres"""
-CIRCLE_M = 1.2
-"""Radius of the circle."""
 ROUND_S, TOWARDS_S = 8.0, 4.0
 """Duration of approach and return, and of the approach alone."""
 UNKNOWN_OBSERVER_M = 100.0
@@ -26,11 +24,6 @@ def scripted(script: ObserverScript, *, center: Float[np.ndarray, "3"], speed_m_
             return lambda time_s, animal: center + np.array([UNKNOWN_OBSERVER_M, 0.0, 0.0])
         case "still":
             return lambda time_s, animal: center
-        case "circle":
-            rate = speed_m_s / CIRCLE_M
-            return lambda time_s, animal: (
-                center + CIRCLE_M * np.array([np.cos(rate * time_s), 0.0, np.sin(rate * time_s)])
-            )
         case "approach":
             return ApproachingObserver(center, speed_m_s)
         case _:

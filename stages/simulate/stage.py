@@ -10,13 +10,13 @@ from stages.simulate.inputs import Inputs
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "cpu") -> None:
-    """Make one take, or one of each animal of a home. Raises SIM-002, SIM-004, SIM-005, SIM-006, SIM-010,
-    SIM-011, SIM-013, ART-003, ART-007.
+    """Make one take, or one of each animal of a home. Raises SIM-002, SIM-004, SIM-006, SIM-010, SIM-011,
+    SIM-013, ART-003, ART-007.
     """
     subgoals = None if inputs.subgoals is None else subgoal_file.read(inputs.subgoals)
-    of_behavior = not config.serve and config.recording is None and subgoals is None
+    of_behavior = not config.serve and subgoals is None
     if inputs.home is not None and not (of_behavior and config.places == "none"):
-        what = "sub-goals, recordings and the live view have the animal's own home"
+        what = "sub-goals and the live view have the animal's own home"
         raise InputError("SIM-011", what, str(inputs.home), "leave them out, or the other home")
     if inputs.animals is None and (config.absent or config.replayed):
         what = "animals can be left out or replayed in a home of several alone"
@@ -25,8 +25,6 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
         take = takes.of_home(inputs, inputs.animals, config, device)
     elif config.serve:
         take = takes.live(inputs, config, device)
-    elif config.recording is not None:
-        take = takes.of_recording(inputs, config, config.recording)
     elif of_behavior and config.places == "none":
         take = takes.of_behavior(inputs, config, device)
     else:

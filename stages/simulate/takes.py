@@ -23,7 +23,7 @@ from pipeline.longterm.bodies import load_body
 from pipeline.longterm.config import MotionOptimizationConfig
 from pipeline.longterm.journeys import LongTermWorld
 from pipeline.longterm.motion_synthesis import LongTerm
-from pipeline.longterm.short_motions import RATE_HZ, BodyMotion, stretches
+from pipeline.longterm.short_motions import BodyMotion
 from pipeline.longterm.subgoals import Subgoal, move_into_scene, sample_visited_subgoals
 from pipeline.longterm.surroundings import MotionScene
 from stages.simulate import journey_files
@@ -142,23 +142,6 @@ def of_home(inputs: Inputs, animals: Path, c: Config, device: str) -> FinishedTa
     return FinishedTake(summary, lambda folder: write_takes(folder, takes, scene))
 
 
-def of_recording(inputs: Inputs, c: Config, recording: str) -> FinishedTake:
-    """Optimise reconstructed motion: the longest stretch of a session, cut to the length of a take."""
-    data = BehaviorData.load(_required(inputs, "behavior_data"))
-    if recording not in data.trajectories:
-        what, known = f"there is no motion of {recording!r}", f"known: {', '.join(data.videos)}"
-        raise InputError("SIM-005", what, str(inputs.behavior_data), known)
-    found = stretches(data.trajectories[recording], shortest_s=0.5)
-    if not found:
-        what = f"{recording} holds no uninterrupted motion"
-        raise InputError("SIM-005", what, str(inputs.behavior_data), "take another session")
-    world, raw = _world(inputs, data), max(found, key=len)[: round(c.seconds * RATE_HZ) + 1]
-    made = journeys.refine_motion(world, raw, MotionOptimizationConfig() if c.optimise else None)
-    before_mm, after_mm = 1000 * made.before.penetration_m, 1000 * made.after.penetration_m
-    summary = f"{recording}: {made.timestamp_s[-1]:.1f} s; penetration {before_mm:.2f} -> {after_mm:.2f} mm"
-    return FinishedTake(summary, lambda folder: journey_files.write_journey(folder, made, world.body))
-
-
 def live(inputs: Inputs, c: Config, device: str) -> FinishedTake:
     """Let the animal live in a browser until interrupted."""
     data, shown = BehaviorData.load(_required(inputs, "behavior_data")), _required(inputs, "simulator")
@@ -222,13 +205,7 @@ def _simulator(
     architecture, nets, scaling, schedule, _ = behavior.load(_required(inputs, "behavior"))
     behavior.refuse_unplayable(architecture, str(inputs.behavior))
     sampling = PlanSamplingConfig(
-        goal_steps=c.goal_steps,
-        sequence_steps=c.sequence_steps,
-        guidance=c.guidance,
-        scene="scene" not in c.without,
-        observer="observer" not in c.without,
-        past="past" not in c.without,
-        goal="goal" not in c.without,
+        goal_steps=c.goal_steps, sequence_steps=c.sequence_steps, guidance=c.guidance
     )
     sampler = Sampler(TorchNetworks(nets, device), schedule, scaling, architecture.guided)
     return Simulator(sampler, data, scenes, architecture.ego, sampling=sampling, chaining=chaining)

@@ -28,15 +28,11 @@ class Config:
     """Session (from 1) filmed in the evening; 0 = none."""
     sideways_session: int = 4
     """Session (from 1) filmed with the phone held sideways; 0 = none."""
-    harsh_session: int = 0
-    """Session (from 1) in low red sun from one side, overexposed, with another white balance; 0 = none."""
     foreign_sessions: int = 0
     """Additional sessions, each filmed in another home: registration is to refuse them."""
     species: Species = "cat"
     """The animal that lives here: its body, coat and gait; where it goes and why is the same for all."""
     companion: Literal["none", "dog"] = "none"
     """A second animal of another species: it follows the first, plays with it and avoids it."""
-    alone_session: int = 0
-    """Session (from 1) in which the second animal is not at home; 0 = none."""
     visitor_sessions: tuple[int, ...] = ()
     """Sessions (from 1) in which another person walks about the room."""

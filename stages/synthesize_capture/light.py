@@ -19,7 +19,7 @@ from stages.synthesize_capture.sheets import Sheet, triangles
 LIGHT_CELL_M = 0.09
 AMBIENT_REACH_M = 1.1
 Rgb = Float[np.ndarray, "3"]
-Hour = Literal["day", "evening", "sunset"]
+Hour = Literal["day", "evening"]
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Light:
 
 
 def light_of_session(rng: np.random.Generator, hour: Hour) -> Light:
-    """Draw a light: by day the window rules, in the evening the lamp, at sunset one low red sun."""
+    """Draw a light: by day the window rules, in the evening the lamp."""
     warm, cool = np.array([1.0, 0.82, 0.6]), np.array([0.9, 0.98, 1.08])
     if hour == "evening":
         window, lamp, ambient = 0.10 * cool, rng.uniform(0.75, 0.95) * warm, 0.16 * np.array([1.0, 0.9, 0.78])
@@ -43,10 +43,6 @@ def light_of_session(rng: np.random.Generator, hour: Hour) -> Light:
         lamp = rng.uniform(0.0, 0.25) * warm
         ambient = rng.uniform(0.42, 0.55) * (1.0 + rng.uniform(-0.05, 0.05, 3))
     sun = np.array([1.0, rng.uniform(0.3, 0.7), rng.uniform(-0.8, 0.8)])
-    if hour == "sunset":  # as many random draws as by day, so that behaviour stays the same
-        red = np.array([1.3, 0.7, 0.4])
-        window, lamp, ambient = 3.0 * window * red, 0.0 * warm, 0.4 * ambient * red
-        sun[1:] *= (0.2, 1.5)
     return Light(window, lamp, ambient, sun / np.linalg.norm(sun))
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from skimage.graph import route_through_array
 
+from pipeline.geometry import rigid
 from stages.synthesize_capture.room import DEPTH_M, WIDTH_M, Standing
 
 CELL_M = 0.1
@@ -44,14 +45,14 @@ class Floor:
         return centers[np.argmin(((centers - point) ** 2).sum(-1))]
 
     def route(
-        self, start: Ground, goal: Ground, *, avoid: Ground | None = None, avoid_m: float = 1.0
+        self, start: Ground, goal: Ground, *, avoid: Ground | None = None
     ) -> Float[np.ndarray, "waypoint 2"]:
         """Return a shortest path that avoids ``avoid``; blocked cells are crossed as a last resort."""
         cost = np.where(self.free, 1.0, 60.0)
         if avoid is not None:
             x = (np.arange(self.free.shape[0]) + 0.5) * CELL_M - WIDTH_M / 2 - avoid[0]
             z = (np.arange(self.free.shape[1]) + 0.5) * CELL_M - DEPTH_M / 2 - avoid[1]
-            cost = cost * (1 + 8 * np.exp(-(x[:, None] ** 2 + z[None, :] ** 2) / (0.5 * avoid_m) ** 2))
+            cost = cost * (1 + 8 * np.exp(-(x[:, None] ** 2 + z[None, :] ** 2) / 0.5**2))
         cells, _ = route_through_array(
             cost, self.cell(start), self.cell(goal), fully_connected=True, geometric=True
         )
@@ -110,10 +111,10 @@ class Walker:
             target_speed = min(
                 desired_speed, np.sqrt(2 * 0.8 * self.acceleration * max(left - 0.03, 0.0)) + 0.08
             )
-        error = wrapped((heading if face is None else face) - self.yaw)
+        error = rigid.wrap((heading if face is None else face) - self.yaw)
         self.yaw += float(np.clip(error, -self.turn_rate * seconds, self.turn_rate * seconds))
         if face is None:
-            target_speed *= max(np.cos(wrapped(heading - self.yaw)), 0.0) ** 2
+            target_speed *= max(np.cos(rigid.wrap(heading - self.yaw)), 0.0) ** 2
             heading = self.yaw
         change = self.acceleration * seconds
         self.speed += float(np.clip(target_speed - self.speed, -1.6 * change, change))
@@ -129,8 +130,3 @@ class Walker:
                 self.position = along_axis
                 return
         self.speed *= 0.5
-
-
-def wrapped(angle: float) -> float:
-    """Wrap an angle to -pi..pi, radians."""
-    return float((angle + np.pi) % (2 * np.pi) - np.pi)

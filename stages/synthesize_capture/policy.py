@@ -11,7 +11,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from stages.synthesize_capture.navigation import Floor, Ground, Walker, wrapped
+from pipeline.geometry import rigid
+from stages.synthesize_capture.navigation import Floor, Ground, Walker
 from stages.synthesize_capture.room import Place
 
 STEP_S = 1.0 / 30.0
@@ -216,7 +217,7 @@ class Policy:
         straight = leap.start[1] + course * (leap.end[1] - leap.start[1])
         self.height = float(straight + 4 * 0.16 * share * (1 - share))
         toward = (leap.end - leap.start)[[0, 2]]
-        error = wrapped(np.arctan2(toward[0], toward[1]) - self.walker.yaw)
+        error = rigid.wrap(np.arctan2(toward[0], toward[1]) - self.walker.yaw)
         self.walker.yaw += float(np.clip(error, -9 * seconds, 9 * seconds))
         if share >= 1.0:
             self.height, self.leap = float(leap.end[1]), None

@@ -95,16 +95,16 @@ def _sessions(
     config: Config, room: Room, phone: PhoneFormat, streams: Iterator[np.random.Generator]
 ) -> Iterator[Script]:
     """Write the sessions of this home, and the second phone of one."""
-    hours: dict[int, Hour] = {config.dim_session: "evening", config.harsh_session: "sunset"}
+    with_dog = config.companion != "none"
     for number in range(1, config.session_count + 1):
-        rng, name, hour = next(streams), f"session-{number}", hours.get(number, "day")
+        rng, name = next(streams), f"session-{number}"
+        hour: Hour = "evening" if number == config.dim_session else "day"
         seconds = config.test_session_s if number == config.session_count else config.session_s
         arranged = room.arranged(rng)
         lit = light.light_of_session(rng, hour)
-        together = config.companion != "none" and number != config.alone_session
         visited = number in config.visitor_sessions
         visitors = np.random.default_rng([config.seed, 5, number]) if visited else None
-        lived = session.simulate_session(arranged, rng, seconds, with_dog=together, visitors=visitors)
+        lived = session.simulate_session(arranged, rng, seconds, with_dog=with_dog, visitors=visitors)
         path, turns = camera_motion.filming(lived, rng), int(number == config.sideways_session)
         seen = {"course": lived.animal, "companion": lived.companion, "visitor": lived.visitor}
         seen |= {"hour": hour, "species": config.species}

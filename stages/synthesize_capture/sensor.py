@@ -31,11 +31,9 @@ class Exposure:
 
 
 def exposure_of_recording(rng: np.random.Generator, hour: Hour) -> Exposure:
-    """Draw an exposure; the evening stays darker, noisier and more blurred, the sunset is overexposed."""
+    """Draw an exposure; the evening stays darker, noisier and more blurred."""
     balance = 1.0 + rng.uniform(-0.07, 0.07, 3)
     balance[1] = 1.0
-    if hour == "sunset":
-        return Exposure(rng.uniform(1.35, 1.55), 0.16, balance * np.array([1.12, 1.0, 0.86]), 0.016, 1 / 110)
     if hour == "evening":
         return Exposure(rng.uniform(0.95, 1.15), 0.06, balance, 0.03, 1 / 45)
     return Exposure(rng.uniform(0.85, 1.12), 0.10, balance, 0.012, 1 / 110)

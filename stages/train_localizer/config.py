@@ -34,24 +34,18 @@ class AgentConfig:
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Size and training of the networks."""
+    """Size and training of the pose regressor."""
 
     steps: int = 2500
     """Steps of AdamW."""
     rate: float = 2e-3
     """Initial learning rate; cosine decay to a hundredth."""
-    coordinate_width: int = 384
-    """Coordinates: hidden units ..."""
-    coordinate_layers: int = 4
-    """... and hidden layers."""
-    batch_patches: int = 2048
-    """Coordinates: patches per step."""
     pose_width: int = 32
-    """Regression: channels of the first of four stages; 64 is the paper's ResNet-18."""
+    """Channels of the first of four stages; 64 is the paper's ResNet-18."""
     batch_views: int = 64
-    """Regression: views per step."""
+    """Views per step."""
     fresh_views: int = 0
-    """Regression: new views rendered per step, each replacing the oldest; 0: a fixed set."""
+    """New views rendered per step, each replacing the oldest; 0: a fixed set."""
 
 
 @dataclass(frozen=True)
@@ -60,14 +54,14 @@ class Config:
 
     target: Literal["scene", "agent"] = "scene"
     """Target of localization: the room or the animal."""
-    kind: Literal["bank", "coordinates", "regression"] = "bank"
-    """bank: nearest neighbours among patches of rendered views; coordinates: a network regresses each patch's
-    point of the map; regression: a network regresses the pose, as in the paper."""
+    kind: Literal["bank", "regression"] = "bank"
+    """bank: nearest neighbours among patches of rendered views; regression: a network regresses the pose, as
+    in the paper."""
     scene: SceneConfig = field(default_factory=SceneConfig)
     """Views of the room."""
     agent: AgentConfig = field(default_factory=AgentConfig)
     """Views of the animal."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
-    """Network localizers."""
+    """The pose regressor."""
     seed: int = 0
     """Seed of views, noise and RANSAC."""

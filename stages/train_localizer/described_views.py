@@ -19,6 +19,7 @@ from pipeline.localization.patches import (
     extract_patches,
     fit_pca,
 )
+from pipeline.metrics.pose_errors import pose_errors
 from stages.train_localizer.views import RenderedView
 
 POSE_TOLERANCE: dict[Target, tuple[float, float]] = {"scene": (2.0, 0.05), "agent": (15.0, 0.08)}
@@ -108,7 +109,8 @@ def evaluate(localizer: localizers.Localizer, draw: Callable[[], RenderedView], 
         if hypotheses:
             poses = np.stack([hypotheses[0].map_from_camera, view.map_from_camera])
             estimate, truth = rigid.inverse(poses) if localizer.sampling.target == "agent" else poses
-            rotation[index], translation[index] = localizers.errors(estimate, truth)
+            error = pose_errors(estimate[None], truth[None])
+            rotation[index], translation[index] = error.degrees[0], error.meters[0]
             ratio[index] = hypotheses[0].inlier_ratio
     tolerance = POSE_TOLERANCE[localizer.sampling.target]
     good = (rotation <= tolerance[0]) & (translation <= tolerance[1])

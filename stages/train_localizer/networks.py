@@ -1,4 +1,4 @@
-"""Train the neural localizers, on a fixed set of views or on newly rendered ones.
+"""Train the pose regressor, on a fixed set of views or on newly rendered ones.
 
 Several processes (`pipeline.core.distributed`) share each batch."""
 
@@ -12,13 +12,7 @@ from torch import Tensor
 
 from pipeline.core import distributed
 from pipeline.core.training import fit
-from pipeline.localization.networks import (
-    PoseRegressor,
-    SceneCoordinateNet,
-    coordinate_loss,
-    on_grid,
-    pose_loss,
-)
+from pipeline.localization.networks import PoseRegressor, on_grid, pose_loss
 from pipeline.localization.patches import Patches, PcaBasis, Target
 from stages.train_localizer.config import NetworkConfig
 from stages.train_localizer.described_views import DescribedViews
@@ -34,25 +28,6 @@ WARM_UP_SHARE, MIN_RATE = 0.02, 0.01
 
 DrawPatches = Callable[[np.random.Generator], tuple[Patches, np.ndarray]]
 """Draws a new view: its patches and ``map_from_camera``."""
-
-
-def train_coordinates(described: DescribedViews, config: NetworkConfig, seed: int) -> SceneCoordinateNet:
-    """Train a scene-coordinate network on all patches."""
-    torch.manual_seed(seed)
-    net = SceneCoordinateNet(
-        described.descriptors.shape[1], config.coordinate_width, config.coordinate_layers
-    )
-    descriptors, points = torch.from_numpy(described.descriptors), torch.from_numpy(described.points_map)
-    _set_map_extent(net, points)
-
-    def loss(_: int, generator: torch.Generator):
-        chosen = torch.randint(
-            len(descriptors), (distributed.share(config.batch_patches),), generator=generator
-        )
-        predicted, log_m = net(descriptors[chosen])
-        return coordinate_loss(predicted, log_m, points[chosen]).mean()
-
-    return _train(net, loss, config, seed)
 
 
 @dataclass
@@ -92,7 +67,9 @@ def train_regressor(
     torch.manual_seed(seed)
     net = PoseRegressor(described.descriptors.shape[1], config.pose_width)
     samples = _samples(described, target)
-    _set_map_extent(net, samples.position)
+    net.middle.copy_(samples.position.mean(0))  # so that the raw outputs are of order one
+    net.extent.copy_(samples.position.std(0).norm())
+    optimizer = torch.optim.AdamW(net.parameters(), config.rate, weight_decay=WEIGHT_DECAY)
 
     def loss(step: int, generator: torch.Generator):
         if draw is not None:
@@ -110,27 +87,6 @@ def train_regressor(
         )
         return {"error": error.mean(), "uncertainty": UNCERTAINTY_WEIGHT * likelihood.mean()}
 
-    return _train(net, loss, config, seed)
-
-
-def _samples(described: DescribedViews, target: Target) -> PoseSamples:
-    parts = np.split(described.descriptors, np.cumsum(described.counts)[:-1])
-    poses = described.map_from_camera[described.view]
-    views = zip(parts, described.patches, poses, strict=True)
-    columns = zip(*(_sample(*view, target) for view in views), strict=True)
-    grids, rotation, position = (torch.from_numpy(np.stack(column)) for column in columns)
-    return PoseSamples(grids, rotation, position)
-
-
-def _set_map_extent(net, points):
-    """Set a network's map centre and scale, so that its raw outputs are of order one."""
-    net.middle.copy_(points.mean(0))
-    net.extent.copy_(points.std(0).norm())
-
-
-def _train(net, loss, config, seed):
-    optimizer = torch.optim.AdamW(net.parameters(), config.rate, weight_decay=WEIGHT_DECAY)
-
     def schedule(done: float) -> float:
         warm_up = min(1.0, done / WARM_UP_SHARE + WARM_UP_SHARE)
         return warm_up * (MIN_RATE + (1 - MIN_RATE) * (0.5 + 0.5 * np.cos(np.pi * done)))
@@ -140,3 +96,12 @@ def _train(net, loss, config, seed):
         label="localizer", clip_norm=CLIP_NORM, schedule=schedule, shared=True,
     )  # fmt: skip
     return net.eval()
+
+
+def _samples(described: DescribedViews, target: Target) -> PoseSamples:
+    parts = np.split(described.descriptors, np.cumsum(described.counts)[:-1])
+    poses = described.map_from_camera[described.view]
+    views = zip(parts, described.patches, poses, strict=True)
+    columns = zip(*(_sample(*view, target) for view in views), strict=True)
+    grids, rotation, position = (torch.from_numpy(np.stack(column)) for column in columns)
+    return PoseSamples(grids, rotation, position)

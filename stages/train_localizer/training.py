@@ -129,8 +129,6 @@ def train(
     match config.kind:
         case "bank":
             model = described.bank()
-        case "coordinates":
-            model = networks.train_coordinates(described, config.network, int(rng.integers(MAX_SEED)))
         case "regression":
             draw = _fresh_patches(data, describe) if config.network.fresh_views else None
             seed = int(rng.integers(MAX_SEED))

@@ -65,7 +65,7 @@ def train_networks(
     pose = initialized(lambda: PoseNet(sizes, with_scene=config.scene), config)
     records = {
         "static": training.fit_body(static, stills, dataset, contacts, trainer, config.body),
-        "route": training.fit_route(route, clips, trainer, config.route),
+        "route": training.fit_stages(route, clips, trainer, config.route),
         "pose": training.fit_pose(pose, training.smoothed_true_routes(clips), clips, trainer, config.pose),
     }
     scenes = [dataset.scenes[index] for index in dataset.scene_of]
@@ -84,11 +84,11 @@ def train_ablations(
         spec = longterm_networks.ABLATIONS[name]
         made = initialized(lambda spec=spec: longterm_networks.build(spec, sizes), config)
         if made.base is not None:
-            training.fit_base(made.base, clips, trainer, config.pose, name)
+            training.fit_stages(made.base, clips, trainer, config.pose, name)
         elif made.route is not None and made.pose is not None:
             key = (spec.with_scene, spec.route_turns, spec.paper)
             if key not in routes:
-                training.fit_route(made.route, clips, trainer, config.route, f"{name}_route")
+                training.fit_stages(made.route, clips, trainer, config.route, f"{name}_route")
                 routes[key] = made.route
             made.route.load_state_dict(routes[key].state_dict())
             if spec.paper:

@@ -105,22 +105,28 @@ class NetworkTrainer:
         return record
 
 
-def fit_route(
-    net: RouteNet,
+def fit_stages(
+    net: RouteNet | BaseNet,
     clips: Clips,
     trainer: NetworkTrainer,
     optimizer_config: LongTermOptimizerConfig,
     name: str = "route",
 ) -> FitRecord:
-    """Fit a RouteNet (Eq. 3); all its stages have the same loss."""
-    w = trainer.weights
+    """Fit a RouteNet (Eq. 3), or a BaseNet, which predicts poses too; all its stages have the same loss."""
+    w, basis_m = trainer.weights, objectives.metric_basis(trainer.poses)
 
     def loss(index: Tensor) -> dict[str, Tensor]:
         truth = clips.channels[index]
         made = net.stages(truth[:, 0], truth[:, -1], clips.seen[index])
         shift, turn = _summed_route_errors(made, truth)
         terms = {"translation": w.translation * shift}
-        return terms | ({"rotation": w.rotation * turn} if net.predicts_rotation else {})
+        if isinstance(net, BaseNet) or net.predicts_rotation:
+            terms["rotation"] = w.rotation * turn
+        if isinstance(net, BaseNet):
+            bodies = (each[..., ROOT_CHANNELS:] for each in made)
+            errors = [objectives.pose_error(each, truth[..., ROOT_CHANNELS:], basis_m) for each in bodies]
+            terms["pose"] = w.pose * sum(errors, start=torch.zeros(()))
+        return terms
 
     return trainer.train(name, net, optimizer_config, loss, len(clips))
 
@@ -169,30 +175,6 @@ def fit_pose(
         if net.predicts_rotation:
             terms["rotation"] = w.rotation * objectives.route_error(made, truth)[1]
         return terms
-
-    return trainer.train(name, net, optimizer_config, loss, len(clips))
-
-
-def fit_base(
-    net: BaseNet,
-    clips: Clips,
-    trainer: NetworkTrainer,
-    optimizer_config: LongTermOptimizerConfig,
-    name: str = "base",
-) -> FitRecord:
-    """Fit a BaseNet; all its stages have the same loss."""
-    w, basis_m = trainer.weights, objectives.metric_basis(trainer.poses)
-
-    def loss(index: Tensor) -> dict[str, Tensor]:
-        truth = clips.channels[index]
-        made = net.stages(truth[:, 0], truth[:, -1], clips.seen[index])
-        shift, turn = _summed_route_errors(made, truth)
-        errors = [
-            objectives.pose_error(each[..., ROOT_CHANNELS:], truth[..., ROOT_CHANNELS:], basis_m)
-            for each in made
-        ]
-        pose = sum(errors, start=torch.zeros(()))
-        return {"translation": w.translation * shift, "rotation": w.rotation * turn, "pose": w.pose * pose}
 
     return trainer.train(name, net, optimizer_config, loss, len(clips))
 

@@ -74,19 +74,16 @@ def test_template_is_metric_without_odometry(kitchen: Kitchen):
 
 
 @pytest.mark.slow
-def test_single_frames_are_placed_better_than_by_sift_or_retrieval(kitchen: Kitchen):
+def test_single_frames_are_placed_better_than_by_sift(kitchen: Kitchen):
     made, walk, clip = kitchen.made, kitchen.walk.clip, kitchen.session.clip
     localizer = _trained(made, walk, Config(scene=SceneConfig(held_out=40)), np.random.default_rng(0))
     hide = [np.zeros(clip.color_size, bool)] * len(clip)
     ours = pose_errors(localizing.placed_by_localizer(localizer, clip, FRAMES, hide)[0], kitchen.truth)
     points = localizing.sift_map(walk, made.world_from_camera, FRAMES)
     sift = pose_errors(localizing.placed_by_sift(points, clip, FRAMES), kitchen.truth)
-    pictures = localizing.gallery(walk, made.world_from_camera, FRAMES)
-    retrieval = pose_errors(localizing.placed_by_retrieval(pictures, clip, FRAMES), kitchen.truth)
     assert np.median(ours.degrees) <= 4.0
     assert np.median(ours.meters) <= 0.06
     assert _near(ours) > _near(sift)
-    assert _near(ours) >= _near(retrieval) + 0.5
 
 
 @pytest.mark.slow

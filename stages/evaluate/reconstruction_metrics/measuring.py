@@ -118,16 +118,13 @@ def _single_frames(
     frames: TruthAlignment,
     config: Config,
 ) -> Metrics:
-    """Place single frames by our localizer and by its rivals."""
+    """Place single frames by our localizer and by its rival."""
     cameras = SceneCameras.open(folders.scene_template)
     known = np.flatnonzero(cameras.registered)
     mapped = known[subsampling.evenly(len(known), MAP_FRAMES)].tolist()
     ours = localizers.load(folders.scene_localizer)
     sift = localizing.sift_map(walkthrough.clip, cameras.world_from_camera, mapped)
-    pictures = localizing.gallery(walkthrough.clip, cameras.world_from_camera, mapped)
-    errors: dict[str, list[PoseErrors]] = {
-        name: [] for name in ("localizer/", "localizer/sift_only_", "localizer/retrieval_only_")
-    }
+    errors: dict[str, list[PoseErrors]] = {"localizer/": [], "localizer/sift_only_": []}
     probabilities = []
     for each in sessions:
         chosen = subsampling.evenly(len(each.clip), config.localizer_frames).tolist()
@@ -138,7 +135,6 @@ def _single_frames(
         placed = {
             "localizer/": answers,
             "localizer/sift_only_": localizing.placed_by_sift(sift, each.clip, chosen),
-            "localizer/retrieval_only_": localizing.placed_by_retrieval(pictures, each.clip, chosen),
         }
         for name, found in placed.items():
             errors[name].append(pose_errors(found, frames.cameras(each.truth)[chosen]))

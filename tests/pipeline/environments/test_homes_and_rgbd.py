@@ -12,11 +12,12 @@ from pipeline.behavior.model import BehaviorNets
 from pipeline.core.errors import InputError
 from pipeline.data import npz, ply
 from pipeline.environments.config import EnvironmentConfig
-from pipeline.environments.homes import settle
+from pipeline.environments.homes import open_homes
 from pipeline.environments.rgbd import FAR_M, INTRINSICS, PITCH_RAD, RgbdCamera
 from pipeline.environments.world import AnimalWorld
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
+from pipeline.longterm.bodies import SkinnedBody
 from stages.train_behavior.export import write_contract
 from tests.pipeline.behavior.wandering import ARCHITECTURE, BONES, REST, wandering
 from tests.pipeline.environments.test_other_home import write
@@ -93,8 +94,8 @@ def test_episodes_begin_in_every_home_and_animals_of_all_plan_together(builds):
 def test_joined_homes_keep_their_own_moments_and_volumes(builds):
     own, other = builds
     data = wandering()
-    alone = settle(own, data, [other])
-    both = settle(own, data, [own, other])
+    alone = open_homes(own, data, [other])
+    both = open_homes(own, data, [own, other])
     assert both.scenes.number(np.arange(len(both.data.videos)), len(both.data.videos)).tolist() == [
         *([0] * len(data.videos)),
         *([1] * len(alone.data.videos)),
@@ -103,7 +104,7 @@ def test_joined_homes_keep_their_own_moments_and_volumes(builds):
     np.testing.assert_array_equal(
         both.data.windows(late[:5])[0].world_from_agent, alone.data.windows(np.arange(5))[0].world_from_agent
     )
-    assert settle(own, data, []).data is data
+    assert open_homes(own, data, []).data is data
 
 
 @pytest.mark.slow
@@ -132,7 +133,7 @@ def test_depth_is_measured_from_the_eyes():
     body, wall = box((0.2, 0.2, 0.2), RED), box((20, 20, 1.0), BLUE, (0, 0, 2.1))
     weights = np.zeros((8, BONES))
     weights[:, 1] = 1
-    camera = RgbdCamera([wall], body, weights, REST)
+    camera = RgbdCamera([wall], SkinnedBody(body, weights, REST, np.zeros(0)))
     level = rigid.make(np.eye(3), np.array([0.0, 0.0, 1.0]))
     eye = np.zeros(3)
     _, depth_m = camera.picture(0, eye, 0.0, rigid.make(np.eye(3), np.array([0.0, 50, 0])), REST)

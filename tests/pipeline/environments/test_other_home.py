@@ -12,7 +12,7 @@ from pipeline.behavior.support import mark_supported
 from pipeline.behavior.trajectories import PAST, TEST, TRAIN
 from pipeline.core.errors import InputError
 from pipeline.data import npz
-from pipeline.environments.other_home import ReconstructedHome, expressed, move_in, share_known
+from pipeline.environments.other_home import ReconstructedHome, change_basis, move_in, share_known
 from tests.pipeline.behavior.wandering import room, wandering
 
 RAW = 40
@@ -63,13 +63,13 @@ def test_features_mean_in_the_other_basis_what_they_meant():
     raw = descriptors(np.random.default_rng(9), 500)
     there, here = written.project(raw), read.project(raw)
     cells = np.moveaxis(there.reshape(5, 10, 10, 16), -1, 0).astype(np.float16)
-    got = np.moveaxis(expressed(cells, written, read), 0, -1).reshape(-1, 16).astype(np.float32)
+    got = np.moveaxis(change_basis(cells, written, read), 0, -1).reshape(-1, 16).astype(np.float32)
     as_they_were = np.median((there * here).sum(1))
     assert np.median((got * here).sum(1)) > 0.95 > as_they_were
     np.testing.assert_allclose(np.linalg.norm(got, axis=1), 1, atol=2e-3)
-    empty = expressed(np.zeros_like(cells), written, read)
+    empty = change_basis(np.zeros_like(cells), written, read)
     assert not empty.any(), "free space stays empty"
-    assert expressed(cells, written, FeatureBasis(**vars(written))) is cells
+    assert change_basis(cells, written, FeatureBasis(**vars(written))) is cells
 
 
 def test_moments_stand_on_the_other_floor_in_free_space():

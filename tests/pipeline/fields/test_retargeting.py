@@ -3,7 +3,7 @@
 import numpy as np
 
 from pipeline.fields import retargeting
-from pipeline.fields.retargeting import SkinnedShape
+from pipeline.fields.skinning import SkinnedShape
 from pipeline.geometry import rigid
 from tests.stages.export_simulator import small_world
 
@@ -44,7 +44,7 @@ def test_a_bigger_body_moves_as_much_more_and_stands_higher() -> None:
     )
     np.testing.assert_allclose(own, 2 * steps, rtol=1e-6)
     feet, own_feet = (
-        root[:, 1, 3] + shape.extent[0, 1]
+        root[:, 1, 3] + retargeting.extent(shape)[0, 1]
         for root, shape in ((TRACK.world_from_agent, small), (moved.world_from_agent, big))
     )
     np.testing.assert_allclose(own_feet, feet, atol=1e-9)  # metres: on the same floor

@@ -17,8 +17,8 @@ def body(bones: int = 6, points: int = 200):
 def test_weights_are_softmax_of_scaled_distances():
     _, rest, scale, cloud = body()
     local = rigid_torch.apply(rigid_torch.inverse(rest), cloud[None]) / scale[:, None]
-    expected = (-local.square().sum(-1).T / 0.7).softmax(-1)
-    torch.testing.assert_close(skinning.skinning_weights(cloud, rest, scale, temperature=0.7), expected)
+    expected = (-local.square().sum(-1).T).softmax(-1)
+    torch.testing.assert_close(skinning.skinning_weights(cloud, rest, scale), expected)
 
 
 def test_rest_pose_moves_nothing_and_a_shared_motion_moves_everything_rigidly():

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from pipeline.backends.descriptors import Describer
-from pipeline.geometry import rigid
 from pipeline.geometry.meshes import RayCaster
 from pipeline.localization import localizer as model
+from pipeline.metrics.pose_errors import pose_errors
 from stages.train_localizer import training
 from stages.train_localizer.config import Config, SceneConfig
 from tests.stages.textured_room import INTRINSICS, SIZE, MemoryClip, textured_room, walk
@@ -28,9 +28,9 @@ def test_bank_answers_for_new_views(scene):
     fresh = MemoryClip(clip.caster, walk(12, seed=5), None)
     answers = [localizer.localize(fresh.color(i), fresh.depth(i), INTRINSICS, INTRINSICS) for i in range(12)]
     found = np.stack([answer[0].map_from_camera for answer in answers])
-    rotation, distance = model.errors(found, fresh.truth)
-    assert np.median(rotation) < 1.5, "degrees"
-    assert np.median(distance) < 0.05, "metres"
+    errors = pose_errors(found, fresh.truth)
+    assert np.median(errors.degrees) < 1.5
+    assert np.median(errors.meters) < 0.05
     assert held.good.mean() > 0.5
     assert answers[0][0].probability > 0.5
 
@@ -65,10 +65,3 @@ def test_separable_scores_stay_finite():
     fitted = model.calibrate(np.array([0.1, 0.2, 0.8, 0.9]), np.array([False, False, True, True]))
     assert np.isfinite([fitted.bias, fitted.slope]).all()
     assert fitted.probability(0.9) > 0.7 > 0.3 > fitted.probability(0.1)
-
-
-def test_pose_errors():
-    turned = rigid.exp(np.array([0, np.deg2rad(3.0), 0, 0.0, 0.4, 0]))
-    rotation, distance = model.errors(turned[None], np.eye(4)[None])
-    assert rotation[0] == pytest.approx(3.0)
-    assert distance[0] == pytest.approx(0.4)

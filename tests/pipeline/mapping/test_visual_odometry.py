@@ -4,8 +4,8 @@ import numpy as np
 
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import RayCaster
-from pipeline.localization.localizer import errors
 from pipeline.mapping.visual_odometry import chain_motions, prepare_frame
+from pipeline.metrics.pose_errors import pose_errors
 from tests.stages.textured_room import INTRINSICS, MemoryClip, textured_room, walk
 
 
@@ -19,9 +19,9 @@ def test_motion_is_chained_and_a_blind_frame_is_a_jump():
 
     found = chain_motions(map(view, range(len(truth))), np.random.default_rng(0))
     assert np.flatnonzero(found.jumps).tolist() == [4, 5]
-    rotation, distance = errors(found.relative_poses.first_from_second, rigid.inverse(truth[:-1]) @ truth[1:])
-    assert rotation[~found.jumps[1:]].max() < 0.5, "degrees, steps of 3 degrees"
-    assert distance[~found.jumps[1:]].max() < 0.02, "metres, steps of 5 cm"
+    errors = pose_errors(found.relative_poses.first_from_second, rigid.inverse(truth[:-1]) @ truth[1:])
+    assert errors.degrees[~found.jumps[1:]].max() < 0.5, "degrees, steps of 3 degrees"
+    assert errors.meters[~found.jumps[1:]].max() < 0.02, "metres, steps of 5 cm"
     assert found.relative_poses.sigma_m[3] > 10 * found.relative_poses.sigma_m[0]
 
 
@@ -35,6 +35,6 @@ def test_a_phone_that_is_swung_about_is_followed():
     )
     found = chain_motions(views, np.random.default_rng(0))
     assert not found.jumps.any()
-    rotation, distance = errors(found.relative_poses.first_from_second, rigid.inverse(truth[:-1]) @ truth[1:])
-    assert rotation.max() < 1.0, "degrees, one step of 120"
-    assert distance.max() < 0.03, "metres"
+    errors = pose_errors(found.relative_poses.first_from_second, rigid.inverse(truth[:-1]) @ truth[1:])
+    assert errors.degrees.max() < 1.0, "degrees, one step of 120"
+    assert errors.meters.max() < 0.03, "metres"

@@ -576,15 +576,6 @@ def test_pictures_and_depth_of_one_shape_may_be_rounded(color, depth):
         extraction._refuse_other_shape(color, depth[::-1], "a")
 
 
-def test_up_may_be_any_axis():
-    turned = extraction._y_up_from((0.0, 0.0, 1.0))
-    np.testing.assert_allclose(turned[:3, :3] @ [0, 0, 1], [0, 1, 0], atol=1e-12)
-    np.testing.assert_allclose(
-        extraction._y_up_from((0.0, -1.0, 0.0))[:3, :3] @ [0, -1, 0], [0, 1, 0], atol=1e-12
-    )
-    assert rigid.rotation_angle(np.eye(3), extraction._y_up_from((0.0, 1.0, 0.0))[:3, :3]) < 1e-12
-
-
 @pytest.mark.parametrize("turns", range(4))
 def test_the_rotation_tag_of_a_video_makes_it_upright(tmp_path, turns):
     """Phones store landscape and write into the track header how players are to turn it."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, Future, Trajectory
+from pipeline.fields.skinning import SkinnedShape
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh, RayCaster
 from pipeline.metrics import scores
@@ -140,13 +141,12 @@ def test_only_what_cameras_see_is_seen():
 def test_tracks_follow_the_skin():
     rng = np.random.default_rng(0)
     rest = poses(2, 1).astype(np.float32)
-    skin = surfaces.SkinnedPoints(rng.normal(size=(50, 3)), np.eye(2)[rng.integers(0, 2, 50)], rest)
-    root, turn = poses(1, 3)[0], poses(1, 4)[0]
-    np.testing.assert_allclose(skin.posed(root, rest), rigid.apply(root, skin.points_agent), atol=1e-4)
-    moved = skin.posed(np.eye(4), turn @ rest)
-    np.testing.assert_allclose(moved, rigid.apply(turn, skin.points_agent), atol=1e-4)
-    moved = (skin.points_agent + 0.3, skin.points_agent[::-1])
-    assert np.array_equal(surfaces.matched_once(skin.points_agent, moved), np.arange(50)[::-1]), (
+    skin = SkinnedShape(rng.normal(size=(50, 3)), np.eye(2)[rng.integers(0, 2, 50)], rest)
+    turn = poses(1, 4)[0]
+    np.testing.assert_allclose(skin.posed(rest), skin.vertices, atol=1e-4)
+    np.testing.assert_allclose(skin.posed(turn @ rest), rigid.apply(turn, skin.vertices), atol=1e-4)
+    moved = (skin.vertices + 0.3, skin.vertices[::-1])
+    assert np.array_equal(surfaces.matched_once(skin.vertices, moved), np.arange(50)[::-1]), (
         "in the frame that fits"
     )
 

@@ -9,8 +9,8 @@ import pytest
 
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import RayCaster, render_view
-from pipeline.localization import localizer as localizers
 from pipeline.mapping.pose_optimization import optimize_poses, residuals
+from pipeline.metrics.pose_errors import pose_errors
 from stages.register_videos import feature_alignment
 from stages.register_videos.feature_alignment import FeatureMap, feature_correspondences
 from tests.stages.textured_room import MemoryClip, NoAgent, textured_room, walk
@@ -43,9 +43,9 @@ def test_features_pull_a_camera_to_its_pose(scene):
     for _ in range(4):
         matches = feature_correspondences(clip, NoAgent(1), features, 0, poses[0])
         poses = optimize_poses(poses, lambda *_, found=matches: found, None, reach_m=(0.3,)).world_from_camera
-    before, after = localizers.errors(moved, truth), localizers.errors(poses[0], truth)
-    assert after[0] < 0.25 * before[0], f"degrees: {before[0]:.2f} to {after[0]:.2f}"
-    assert after[1] < 0.25 * before[1], f"metres: {before[1]:.4f} to {after[1]:.4f}"
+    errors = pose_errors(np.stack([moved, poses[0]]), np.stack([truth, truth]))
+    assert errors.degrees[1] < 0.25 * errors.degrees[0]
+    assert errors.meters[1] < 0.25 * errors.meters[0]
 
 
 def test_the_truth_is_a_fixed_point(scene):

@@ -4,8 +4,8 @@ import numpy as np
 
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import RayCaster
-from pipeline.localization import localizer as model
 from pipeline.mapping.pose_optimization import Correspondences, optimize_poses
+from pipeline.metrics.pose_errors import pose_errors
 from stages.register_videos import point_alignment
 from tests.stages.textured_room import MemoryClip, NoAgent, textured_room, walk
 
@@ -24,7 +24,6 @@ def test_displaced_cameras_return():
     start = truth @ rigid.exp(np.random.default_rng(0).normal(0, 1, (FRAMES, 6)) * ([0.01] * 3 + [0.02] * 3))
     term = point_alignment.WalkthroughTerm(session, NoAgent(FRAMES), start, walked)
     found = optimize_poses(start, lambda *_: NOTHING, None, reach_m=(1.0,) * 8, term=term).world_from_camera
-    before, after = (model.errors(poses, truth) for poses in (start, found))
-    assert np.median(after[1]) < 0.3 * np.median(before[1]) and np.median(after[0]) < 0.3 * np.median(
-        before[0]
-    )
+    before, after = (pose_errors(poses, truth) for poses in (start, found))
+    assert np.median(after.meters) < 0.3 * np.median(before.meters)
+    assert np.median(after.degrees) < 0.3 * np.median(before.degrees)

@@ -10,8 +10,8 @@ import pytest
 from pipeline.backends.descriptors import Describer
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh, RayCaster
-from pipeline.localization import localizer as model
 from pipeline.mapping import depth_scans
+from pipeline.metrics.pose_errors import pose_errors
 from stages.register_videos import alignment, flow_alignment, pictures, registration
 from stages.register_videos import votes as voting
 from stages.register_videos.confidence import appearance_probability, camera_confidence, score_appearance
@@ -45,9 +45,9 @@ def test_recording_is_registered(maps, with_odometry):
     )
     config = RegistrationConfig(alignment=AlignmentConfig(stride_px=9, flow_every_frames=8))
     found = registration.register(clip, NoAgent(40), maps, config, np.random.default_rng(0))
-    rotation, distance = model.errors(found.aligned.world_from_camera, truth)
-    assert np.median(rotation) < (0.3 if with_odometry else 1.0), "degrees"
-    assert np.median(distance) < (0.015 if with_odometry else 0.04), "metres"
+    errors = pose_errors(found.aligned.world_from_camera, truth)
+    assert np.median(errors.degrees) < (0.3 if with_odometry else 1.0), "degrees"
+    assert np.median(errors.meters) < (0.015 if with_odometry else 0.04), "metres"
     assert found.confidence.mean() > 0.8, "all frames are right"
     assert not found.roots.visible.any()
     assert np.isnan(found.roots.world_from_agent).all()
@@ -61,9 +61,9 @@ def test_a_jump_of_the_phones_odometry_displaces_nothing(maps):
     clip = MemoryClip(RayCaster(maps.scene), truth, odometry)
     config = RegistrationConfig(alignment=AlignmentConfig(stride_px=9, flow_every_frames=8))
     found = registration.register(clip, NoAgent(40), maps, config, np.random.default_rng(0))
-    rotation, distance = model.errors(found.aligned.world_from_camera, truth)
-    assert rotation.max() < 1.0, "degrees"
-    assert distance.max() < 0.05, "metres; the jump is 0.6 m"
+    errors = pose_errors(found.aligned.world_from_camera, truth)
+    assert errors.degrees.max() < 1.0, "degrees"
+    assert errors.meters.max() < 0.05, "metres; the jump is 0.6 m"
 
 
 @pytest.mark.slow

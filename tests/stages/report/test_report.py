@@ -12,9 +12,9 @@ import pytest
 
 from pipeline.core.videos import Video
 from pipeline.data import images, qa
-from pipeline.metrics import bars
+from pipeline.metrics import bars, words
 from pipeline.workflow import artifact, dag
-from stages.report import collect, pages, stage
+from stages.report import collect, stage
 from stages.report.chapters import CHAPTERS, WORDS, remedy
 from stages.report.config import Config
 from tests.stages.export_simulator import browser
@@ -120,7 +120,7 @@ def test_a_verdict_is_the_worst_of_its_own_and_of_what_it_stands_on() -> None:
     assert {name: each.light for name, each in judged.items()} == {
         "frames": "ok", "masks": "fail", "reconstruction": "fail", "simulator": "fail", "evaluation": "fail",
     }  # fmt: skip
-    assert judged["simulator"].own_light == "ok"
+    assert judged["simulator"].own_status == "ok"
     assert [cause.artifact for cause in judged["simulator"].causes] == ["masks"], (
         "the root, not what lies between"
     )
@@ -220,7 +220,7 @@ def test_a_rival_must_be_beaten_and_all_videos_reached() -> None:
     ],
 )
 def test_numbers_are_readable(value: float | None, text: str) -> None:
-    assert pages.number(value) == text
+    assert words.number(value) == text
 
 
 def test_a_safe_report_shows_no_view(tmp_path: Path) -> None:

@@ -154,7 +154,7 @@ def test_two_that_pass_each_other_keep_their_masks(network, portraits, together)
         assert np.mean(score) > 0.7, "share; the pictures are 90 pixels wide"
         assert (labels[others] == 255).mean() < 0.03, "of the other's pixels"
         assert (labels[others] == 128).mean() > 0.6, "they are neither the animal nor the room"
-        assert found.strangers < 0.1
+        assert found.unknown_animals < 0.1
 
 
 @pytest.mark.slow

@@ -23,7 +23,6 @@ CONFIG = Config(
     dim_session=0,
     sideways_session=0,
     companion="dog",
-    alone_session=2,
 )
 
 
@@ -66,7 +65,7 @@ def test_each_has_a_truth_of_its_own(tmp_path):
     names = ["walkthrough", "turnaround_cat", "turnaround_dog", "session-1", "session-2"]
     assert [part.name for part in scripts] == names
     assert [part.motions[0] is not None for part in scripts] == [False, True, False, True, True]
-    assert [part.motions[1] is not None for part in scripts] == [False, False, True, True, False]
+    assert [part.motions[1] is not None for part in scripts] == [False, False, True, True, True]
     produce.produce(scripts[2:4], CAT, tmp_path, tmp_path, workers=1, companion=DOG)
     found = {}
     for name in ("cat", "dog"):

@@ -1,4 +1,4 @@
-"""The kinds that are networks: both learn, both are kept by files, certainty ranks errors."""
+"""The pose regressor learns, files keep it, its certainty ranks errors."""
 
 import numpy as np
 import pytest
@@ -8,9 +8,10 @@ from pipeline.geometry import rigid
 from pipeline.localization import localizer as model
 from pipeline.localization.networks import GRID, on_grid, pose_loss
 from pipeline.localization.patches import Patches, PatchSampling, PcaBasis
+from pipeline.metrics.pose_errors import pose_errors
 from stages.train_localizer.config import NetworkConfig
 from stages.train_localizer.described_views import DescribedViews
-from stages.train_localizer.networks import train_coordinates, train_regressor
+from stages.train_localizer.networks import train_regressor
 
 AXES = 16
 
@@ -46,21 +47,8 @@ def asked(net, seen: DescribedViews) -> tuple[np.ndarray, np.ndarray, np.ndarray
     sampling, solver = PatchSampling("scene", 100.0, 0, 8, (6,)), model.RansacSolver(0.15, 0.3, 200, 1)
     localizer = model.Localizer(sampling, seen.basis, net, model.Calibration(0.0, 1.0), solver)
     answers = [localizer.localize_patches(patches)[0] for patches in seen.patches]
-    return *model.errors(
-        np.stack([answer.map_from_camera for answer in answers]), seen.map_from_camera
-    ), np.array([answer.inlier_ratio for answer in answers])
-
-
-def test_coordinates_are_learnt():
-    net = train_coordinates(
-        described(40, 1),
-        NetworkConfig(steps=300, batch_patches=512, coordinate_width=96, coordinate_layers=3),
-        0,
-    )
-    rotation, distance, share = asked(net, described(12, 2))
-    assert np.median(rotation) < 4, "degrees; noise in a tenth of the patches"
-    assert np.median(distance) < 0.15, "metres"
-    assert np.median(share) > 0.5
+    errors = pose_errors(np.stack([answer.map_from_camera for answer in answers]), seen.map_from_camera)
+    return errors.degrees, errors.meters, np.array([answer.inlier_ratio for answer in answers])
 
 
 @pytest.mark.slow
@@ -92,27 +80,16 @@ def test_the_likeliest_prediction_is_the_error_itself():
 
 def test_files_keep_networks(tmp_path):
     seen = described(20, 1)
-    options = NetworkConfig(steps=3, batch_patches=64, batch_views=4, coordinate_width=16, pose_width=8)
-    for name, net in (
-        ("c", train_coordinates(seen, options, 0)),
-        ("r", train_regressor(seen, "agent", options, 0)),
-    ):
-        solver = model.RansacSolver(0.1, 0.2, 50, 1)
-        (tmp_path / name).mkdir()
-        localizer = model.Localizer(
-            PatchSampling("agent", 100.0, 96, 8, (6, 12)),
-            seen.basis,
-            net,
-            model.Calibration(0.1, 2.0),
-            solver,
-        )
-        model.save(tmp_path / name, localizer, {})
-        again = model.load(tmp_path / name)
-        assert again.sampling == localizer.sampling
-        pairs = zip(again.model.state_dict().values(), net.state_dict().values(), strict=True)
-        assert all(torch.equal(first, second) for first, second in pairs)
-        first, second = (each.localize_patches(seen.patches[0]) for each in (localizer, again))
-        assert [a.inlier_ratio for a in first] == [a.inlier_ratio for a in second]
+    net = train_regressor(seen, "agent", NetworkConfig(steps=3, batch_views=4, pose_width=8), 0)
+    sampling, solver = PatchSampling("agent", 100.0, 96, 8, (6, 12)), model.RansacSolver(0.1, 0.2, 50, 1)
+    localizer = model.Localizer(sampling, seen.basis, net, model.Calibration(0.1, 2.0), solver)
+    model.save(tmp_path, localizer, {})
+    again = model.load(tmp_path)
+    assert again.sampling == localizer.sampling
+    pairs = zip(again.model.state_dict().values(), net.state_dict().values(), strict=True)
+    assert all(torch.equal(first, second) for first, second in pairs)
+    first, second = (each.localize_patches(seen.patches[0]) for each in (localizer, again))
+    assert [a.inlier_ratio for a in first] == [a.inlier_ratio for a in second]
 
 
 def test_patches_lie_on_the_grid_once_and_in_order():
