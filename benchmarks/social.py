@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from pipeline.baselines.predictors import Ats, LocationPrior, Samples
 from pipeline.behavior.avoidance import clearance_of
 from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
 from pipeline.behavior.model import ROOT_CHANNELS
@@ -47,7 +48,6 @@ from pipeline.geometry import rigid
 from pipeline.metrics.flight import flees
 from pipeline.metrics.intervals import bootstrapped, episodes
 from pipeline.metrics.scores import goal_energy_score, goal_minde
-from pipeline.rivals.predictors import Ats, LocationPrior, Samples
 from stages.read_trajectories.motion import CLIP_GAP_S, MeasuredMotion
 from stages.slice_behavior import stage as slicing
 from stages.slice_behavior.config import Config as SlicingConfig

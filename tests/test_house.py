@@ -36,7 +36,7 @@ PACKAGES = (
     "fields",
     "behavior",
     "longterm",
-    "rivals",
+    "baselines",
     "metrics",
     "environments",
     "adapters",

@@ -13,6 +13,7 @@ import numpy as np
 
 from benchmarks.real.forecasts import StraightToPrior
 from benchmarks.real.table import Row
+from pipeline.baselines.predictors import Ats, ConstantVelocity, LocationPrior, Samples, StandStill
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData
@@ -20,7 +21,6 @@ from pipeline.core.progress import log
 from pipeline.core.videos import Video
 from pipeline.data import npz
 from pipeline.metrics.scores import SCORES
-from pipeline.rivals.predictors import Ats, ConstantVelocity, LocationPrior, Samples, StandStill
 from stages.read_trajectories import stage as reading
 from stages.read_trajectories.config import Config as ReadingConfig
 from stages.slice_behavior import stage as slicing
@@ -118,8 +118,8 @@ def row(recording: Path, out: Path, *, seeds: int = 1) -> Row:
         method: {name: float(np.mean(values)) for name, values in scores.items()}
         for method, scores in found.items()
     }
-    ours, rivals = mean["ours"], [scores for method, scores in mean.items() if method != "ours"]
-    ahead = all(ours[name] < other[name] for other in rivals for name in ("goal_minde_m", "path_minade_m"))
+    ours, baselines = mean["ours"], [scores for method, scores in mean.items() if method != "ours"]
+    ahead = all(ours[name] < other[name] for other in baselines for name in ("goal_minde_m", "path_minade_m"))
     still = mean["standing still"]["orientation_minade_rad"]
     turning = ours["orientation_minade_rad"] < TURNING_LIMIT * still
     cells = {

@@ -31,7 +31,7 @@ Step = Callable[[int, int], Dense]
 """From a frame and another to the dense flow between them, in pixels"""
 CertainStep = Callable[[int, int], tuple[Dense, Float[np.ndarray, "height width"]]]
 """The same, with confidence, 0..1"""
-RIVALS = ("OpenCV DIS", "OpenCV Farneback")
+BASELINES = ("OpenCV DIS", "OpenCV Farneback")
 """Methods that the bar names"""
 SHARES = (0.2, 0.1, 0.05)
 FARNEBACK = (0.5, 5, 15, 3, 7, 1.5, 0)
@@ -174,7 +174,7 @@ def row(data: Path, out: Path) -> Row:
         name: ", ".join(" / ".join(f"{share:.3f}" for share in values[name]) for values in each.values())
         for name in names
     }
-    met = all(values["ours"][0] > values[rival][0] for values in each.values() for rival in RIVALS)
+    met = all(values["ours"][0] > values[baseline][0] for values in each.values() for baseline in BASELINES)
     return Row(
         "flow",
         f"DAVIS with BADJA joints: {', '.join(each)}",

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from pipeline.baselines.predictors import LocationPrior, Samples
 from pipeline.behavior.trajectories import Context, Future
 from pipeline.geometry import rigid
 from pipeline.metrics import scores
-from pipeline.rivals.predictors import LocationPrior, Samples
 
 COLLISION_M = 0.2
 """Centres nearer than this collide (Kothari et al. 2021)."""

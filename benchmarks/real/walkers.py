@@ -16,12 +16,12 @@ from jaxtyping import Float
 from benchmarks.real.crowds import FUTURE, PAST, STEP_S, Crowd, Walk
 from benchmarks.real.forecasts import TURN_STD_RAD, StraightOn, StraightToPrior, judge
 from benchmarks.real.table import Row
+from pipeline.baselines.predictors import Ats, LocationPrior, Samples
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, Context
 from pipeline.core.progress import log
 from pipeline.core.videos import Video
-from pipeline.rivals.predictors import Ats, LocationPrior, Samples
 from stages.read_trajectories import stage as reading
 from stages.read_trajectories.config import Config as ReadingConfig
 from stages.slice_behavior import stage as slicing

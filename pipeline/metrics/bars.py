@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 Verdict = Literal["ok", "fail", "none"]
-RIVALS = (
+BASELINES = (
     ("location_prior", "the location prior"),
     ("stand_still", "standing still"),
     ("constant_velocity", "constant velocity"),
@@ -32,8 +32,8 @@ class Bar:
     @property
     def sign(self) -> str:
         """Required comparison: strict against a baseline, else with equality."""
-        rival = isinstance(self.limit, str) and self.factor == 1.0
-        return "≥" if self.better == "higher" else "<" if rival else "≤"
+        baseline = isinstance(self.limit, str) and self.factor == 1.0
+        return "≥" if self.better == "higher" else "<" if baseline else "≤"
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ class Judged:
 def beaten(metric: str, words: str) -> list[Bar]:
     """Return bars for our metric to be below that of every simple baseline."""
     return [
-        Bar(metric, f"{words}: below {rival}", "lower", metric.replace("/ats/", f"/{key}/"), "m")
-        for key, rival in RIVALS
+        Bar(metric, f"{words}: below {baseline}", "lower", metric.replace("/ats/", f"/{key}/"), "m")
+        for key, baseline in BASELINES
     ]
 
 

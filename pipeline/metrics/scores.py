@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.baselines.predictors import Samples
 from pipeline.behavior.trajectories import Future
 from pipeline.geometry import rigid
-from pipeline.rivals.predictors import Samples
 
 GOAL_SCORES = ("goal_minde_m", "goal_energy_score_m")
 PLAN_SCORES = ("path_minade_m", "orientation_minade_rad", "joints_minade_rad")

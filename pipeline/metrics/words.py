@@ -126,7 +126,9 @@ def number(value: Any) -> str:
 
 
 def _subject(name: str) -> str:
-    ours, _, rival = name.partition("_minus_")
+    ours, _, baseline = name.partition("_minus_")
     return (
-        f"{SUBJECTS.get(ours, ours)} less {SUBJECTS.get(rival, rival)}" if rival else SUBJECTS.get(name, name)
+        f"{SUBJECTS.get(ours, ours)} less {SUBJECTS.get(baseline, baseline)}"
+        if baseline
+        else SUBJECTS.get(name, name)
     )

@@ -261,7 +261,7 @@ FLOW: tuple[Node, ...] = (
         "longterm_ablations",
         "train_longterm",
         ("reconstruction", "behavior_data"),
-        fixed={"ablations": "rivals"},
+        fixed={"ablations": "baselines"},
         resumable=True,
         on_demand=True,
     ),

@@ -10,12 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData
-from pipeline.geometry import subsampling
-from pipeline.metrics.intervals import Interval, bootstrapped, episodes
-from pipeline.metrics.metrics import Metrics
-from pipeline.metrics.scores import GOAL_SCORES, PLAN_SCORES, SCORES
-from pipeline.rivals.predictors import (
+from pipeline.baselines.predictors import (
     WINDOWS_AT_ONCE,
     Ats,
     ConstantVelocity,
@@ -24,21 +19,26 @@ from pipeline.rivals.predictors import (
     Samples,
     StandStill,
 )
+from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData
+from pipeline.geometry import subsampling
+from pipeline.metrics.intervals import Interval, bootstrapped, episodes
+from pipeline.metrics.metrics import Metrics
+from pipeline.metrics.scores import GOAL_SCORES, PLAN_SCORES, SCORES
 from stages.evaluate.config import Config
 
 OURS = "ats"
-RIVALS = ("location_prior", "stand_still", "constant_velocity")
+BASELINES = ("location_prior", "stand_still", "constant_velocity")
 MOVING_M = 0.1
 """Displacement in 5.6 s above which an animal moves."""
 Scores = dict[str, Float[np.ndarray, "window"]]
 """Scores of one method by the names of `SCORES`"""
 
 
-def rivals(data: BehaviorData) -> dict[str, Predictor]:
+def baselines(data: BehaviorData) -> dict[str, Predictor]:
     """Fit the simple baselines to the training windows."""
     context, future = data.windows(data.indices(TRAIN), bones=False)
     methods = (LocationPrior, StandStill, ConstantVelocity)
-    return {name: method.fit(context, future) for name, method in zip(RIVALS, methods, strict=True)}
+    return {name: method.fit(context, future) for name, method in zip(BASELINES, methods, strict=True)}
 
 
 def behavior_metrics(data: BehaviorData, ours: Predictor, config: Config) -> Metrics:
@@ -49,7 +49,7 @@ def behavior_metrics(data: BehaviorData, ours: Predictor, config: Config) -> Met
     metrics.put("behavior/test_windows", len(test))
     reason = "fewer than two sessions, or none long enough for a window: there is no test video"
     if len(test) == 0 or len(data.indices(TRAIN)) == 0:
-        scores = [f"behavior/{method}/{name}" for method in (OURS, *RIVALS) for name in SCORES]
+        scores = [f"behavior/{method}/{name}" for method in (OURS, *BASELINES) for name in SCORES]
         metrics.skip(["behavior/plan_windows", "behavior/plan_trials", *scores], reason)
         return metrics
     plans = subsampling.evenly(len(test), config.plan_windows)
@@ -58,7 +58,7 @@ def behavior_metrics(data: BehaviorData, ours: Predictor, config: Config) -> Met
     episode = episodes(data.start[test], data.video[test], data.past + data.future)
     judged = {
         name: _scores(method, data, test, test[plans], config)
-        for name, method in ({OURS: ours} | rivals(data)).items()
+        for name, method in ({OURS: ours} | baselines(data)).items()
     }
     episode_of = {name: episode if name in GOAL_SCORES else episode[plans] for name in SCORES}
     _report(metrics, judged, episode_of, config)
@@ -144,8 +144,8 @@ def _report(
                 metrics.put_mean(f"behavior/{method}/{name}", interval(name, of_method[name]))
             else:
                 metrics.skip([f"behavior/{method}/{name}"], "this method predicts goals only")
-    for rival in RIVALS:
+    for baseline in BASELINES:
         for name in SCORES:
-            if name in scores[rival]:
-                difference = interval(name, scores[OURS][name] - scores[rival][name])
-                metrics.put_mean(f"behavior/{OURS}_minus_{rival}/{name}", difference)
+            if name in scores[baseline]:
+                difference = interval(name, scores[OURS][name] - scores[baseline][name])
+                metrics.put_mean(f"behavior/{OURS}_minus_{baseline}/{name}", difference)

@@ -1,6 +1,6 @@
-"""Single frames of real sessions placed on the map without odometry: our localizer and a simple rival.
+"""Single frames of real sessions placed on the map without odometry: our localizer and a simple baseline.
 
-The rival shows that the built-in world is not easy: SIFT points of the walk-through with PnP (colour only).
+It shows that the built-in world is not easy: SIFT points of the walk-through with PnP (colour only).
 """
 
 from collections.abc import Sequence

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.baselines.predictors import Predictor, Samples
 from pipeline.behavior.trajectories import RATE_HZ, TEST, TRAIN, BehaviorData
 from pipeline.geometry import rigid, subsampling
 from pipeline.longterm.bodies import load_body
@@ -18,7 +19,6 @@ from pipeline.longterm.plausibility import PlausibilityMeter
 from pipeline.longterm.short_motions import BodyMotion, resample_motion, stretches
 from pipeline.longterm.surroundings import MotionScene
 from pipeline.metrics.metrics import Metrics, median
-from pipeline.rivals.predictors import Predictor, Samples
 
 WINDOWS = 48
 """Test windows that are scored; of 16, foot skate varies by a quarter from one draw to the next."""

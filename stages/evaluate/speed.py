@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.baselines.predictors import Ats
 from pipeline.behavior.trajectories import BehaviorData
 from pipeline.core import threads
 from pipeline.metrics.metrics import Metrics
-from pipeline.rivals.predictors import Ats
 
 STEPS = {"simulator/plan_50_s": 50, "simulator/plan_few_s": 10}
 """By metric: steps a level of the plans that are timed."""

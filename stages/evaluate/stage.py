@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.baselines.predictors import Ats
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import BehaviorData
 from pipeline.core import devices, progress
 from pipeline.data import qa
 from pipeline.metrics.metrics import Metrics
-from pipeline.rivals.predictors import Ats
 from stages.evaluate import behavior, physical, speed
 from stages.evaluate.config import Config
 
@@ -46,8 +46,8 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
     metrics.write(out, "metrics.json")
     qa.write(
         out,
-        good="all simple rivals clearly worse",
-        bad="a simple rival as good as ours: then the capture is too easy, or the model has learned nothing",
+        good="all simple baselines clearly worse",
+        bad="a simple baseline as good as ours: the capture is too easy, or the model has learned nothing",
         checks=metrics.judged(LIMITS),
     )
     return metrics

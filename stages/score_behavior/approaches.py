@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.baselines.predictors import WINDOWS_AT_ONCE, Ats
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.perception import FeatureVolume, world_from_ego
 from pipeline.behavior.planning import observe
@@ -19,7 +20,6 @@ from pipeline.core.errors import InputError
 from pipeline.data import npz
 from pipeline.geometry import rigid
 from pipeline.metrics.flight import flees
-from pipeline.rivals.predictors import WINDOWS_AT_ONCE, Ats
 
 TRUE = ("true", "true_standing")
 """names of the scores of the true animal, by twin"""

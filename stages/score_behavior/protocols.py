@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
+from pipeline.baselines.predictors import Ats, Samples
 from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
 from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.planning import observe
@@ -17,7 +18,6 @@ from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import TEST, BehaviorData, Context, Future
 from pipeline.geometry import rigid
 from pipeline.metrics.scores import GOAL_SCORES, PLAN_SCORES, SCORES
-from pipeline.rivals.predictors import Ats, Samples
 from stages.score_behavior.config import Config
 
 WINDOWS_AT_ONCE = 32

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.baselines.predictors import Ats
 from pipeline.behavior import model as behavior
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.scenes import Scenes
@@ -10,7 +11,6 @@ from pipeline.behavior.trajectories import TEST, BehaviorData
 from pipeline.core import devices, progress
 from pipeline.core.errors import InputError
 from pipeline.data import npz
-from pipeline.rivals.predictors import Ats
 from stages.score_behavior import approaches, protocols
 from stages.score_behavior.config import Config
 

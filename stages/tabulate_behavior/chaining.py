@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.stats import ks_2samp
 
+from pipeline.baselines.predictors import Ats
 from pipeline.behavior.config import ReplanningConfig
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import AnimalBatch
 from pipeline.behavior.trajectories import TEST, BehaviorData
-from pipeline.rivals.predictors import Ats
 
 REST_M_S = 0.05
 """speed below which an animal rests: it breathes, and reconstructions err by more"""

@@ -5,12 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.baselines.predictors import Ats
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import BehaviorData
 from pipeline.core import devices, progress
 from pipeline.data import npz, qa
-from pipeline.rivals.predictors import Ats
 from stages.tabulate_behavior import chaining, pictures, printing, reading, tables, untrained
 from stages.tabulate_behavior.config import Config
 
@@ -57,7 +57,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
     npz.save(out / "windows.npz", compress=False, **reading.windows(scores))
     qa.write(
         out,
-        good="ours ahead of every rival, intervals apart",
+        good="ours ahead of every baseline, intervals apart",
         bad="curves that still fall: training was too short to compare methods",
         checks=pictures.checks(figures, OURS),
         pictures=pictures.pictures(curves),

@@ -32,13 +32,17 @@ def figures(
             table |= interval(values, window, frames, draws, seed).as_figures(
                 f"behavior/{method}/{_figure(name)}"
             )
-            rival = found[ours].values.get(name)
-            if method != ours and rival is not None and np.array_equal(window, found[ours].windows_of(name)):
-                if min(len(rival), len(values)) > 1:
-                    both = min(len(rival), len(values))
+            baseline = found[ours].values.get(name)
+            if (
+                method != ours
+                and baseline is not None
+                and np.array_equal(window, found[ours].windows_of(name))
+            ):
+                if min(len(baseline), len(values)) > 1:
+                    both = min(len(baseline), len(values))
                 else:
-                    both = max(len(rival), len(values))
-                difference = np.broadcast_to(rival[:both], (both, rival.shape[1])) - np.broadcast_to(
+                    both = max(len(baseline), len(values))
+                difference = np.broadcast_to(baseline[:both], (both, baseline.shape[1])) - np.broadcast_to(
                     values[:both], (both, values.shape[1])
                 )
                 table |= interval(difference, window, frames, draws, seed).as_figures(

@@ -1,18 +1,22 @@
-"""Rivals that need no training, on the very windows that the trained methods are judged on."""
+"""Baselines that need no training, on the very windows that the trained methods are judged on."""
 
 import numpy as np
 
+from pipeline.baselines.predictors import ConstantVelocity, LocationPrior, StandStill
 from pipeline.behavior.trajectories import TRAIN, BehaviorData
 from pipeline.metrics.scores import GOAL_SCORES, PLAN_SCORES, SCORES
-from pipeline.rivals.predictors import ConstantVelocity, LocationPrior, StandStill
 from stages.tabulate_behavior.reading import MethodScores
 
-RIVALS = {"location_prior": LocationPrior, "stand_still": StandStill, "constant_velocity": ConstantVelocity}
+BASELINES = {
+    "location_prior": LocationPrior,
+    "stand_still": StandStill,
+    "constant_velocity": ConstantVelocity,
+}
 
 SAMPLES = 16
 """Samples per window (K), as many as `score_behavior` draws."""
 FIT_STRIDE = 4
-"""Every how many training windows the rivals are fitted to; neighbours are alike."""
+"""Every how many training windows the baselines are fitted to; neighbours are alike."""
 WINDOWS_AT_ONCE = 64
 """Bounds the memory of sampled bones."""
 
@@ -20,11 +24,11 @@ WINDOWS_AT_ONCE = 64
 def scores(
     data: BehaviorData, like: MethodScores, *, trials: int, seed: int, samples: int = SAMPLES
 ) -> dict[str, MethodScores]:
-    """Fit each rival to the training windows and score it on the windows of ``like``."""
+    """Fit each baseline to the training windows and score it on the windows of ``like``."""
     context, future = data.windows(data.indices(TRAIN)[::FIT_STRIDE])
     return {
-        name: _scores(rival.fit(context, future), data, like, samples, trials, seed)
-        for name, rival in RIVALS.items()
+        name: _scores(baseline.fit(context, future), data, like, samples, trials, seed)
+        for name, baseline in BASELINES.items()
     }
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 from pipeline.data.qa import Check
 from stages.tabulate_longterm.methods import WITHOUT_SCENE
 
-RIVALS = ("base", "route_cvae", "nearest")
+BASELINES = ("base", "route_cvae", "nearest")
 OPTIMIZED, SAMPLES, MINUTES = "longterm/ours_opt", "longterm_samples", "longterm_minutes"
 BARS: tuple[tuple[str, str | tuple[str, str], str, float, Literal["lower", "higher"]], ...] = (
     ("non-collision, optimised", f"{OPTIMIZED}/non_collision", "share", 0.995, "higher"),
@@ -59,7 +59,9 @@ def checks(figures: Mapping[str, float | None]) -> list[Check]:
         return None if above is None or not below else above / below
 
     ours = "longterm/ours/mpjpe_mm"
-    compared = [(f"MPJPE against {rival}", (ours, f"longterm/{rival}/mpjpe_mm")) for rival in RIVALS]
+    compared = [
+        (f"MPJPE against {baseline}", (ours, f"longterm/{baseline}/mpjpe_mm")) for baseline in BASELINES
+    ]
     for name, blind in WITHOUT_SCENE.items():
         both = (f"longterm/{name}/translation", f"longterm/{blind}/translation")
         compared.append((f"translation against blind to the scene: {name}", both))

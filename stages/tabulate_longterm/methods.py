@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pipeline.baselines.longterm_networks import AblatedNetworks
 from pipeline.longterm.clip_channels import Clips, decode_clip, encode_places
 from pipeline.longterm.examples import MotionDataset
 from pipeline.longterm.motion_synthesis import LongTerm
 from pipeline.longterm.networks import ROOT_CHANNELS
-from pipeline.rivals.longterm_networks import AblatedNetworks
 
 Method = Callable[[Clips], Float[Tensor, "clip frame channel"]]
 """Predicts all frames of clips from their first and last frames and the scene alone."""

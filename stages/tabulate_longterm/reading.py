@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.baselines import longterm_networks
 from pipeline.behavior.trajectories import BehaviorData
 from pipeline.longterm import simulated_lives
 from pipeline.longterm.examples import DatasetSplit, encode_selection, reconstructed_split, select_clips
 from pipeline.longterm.journeys import LongTermWorld
 from pipeline.longterm.motion_synthesis import LongTerm
-from pipeline.rivals import longterm_networks
 from stages.tabulate_longterm.methods import ComparedModels
 
 

@@ -41,8 +41,8 @@ def run(
     (out / "tables.txt").write_text(text + "\n")
     qa.write(
         out,
-        good="ours ahead of every rival, and physical after the optimisation at little more error",
-        bad="a rival ahead, feet that slide, bodies inside furniture",
+        good="ours ahead of every baseline, and physical after the optimisation at little more error",
+        bad="a baseline ahead, feet that slide, bodies inside furniture",
         checks=bars.checks(figures),
     )
     return figures

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.baselines.samplers import sampler_of
 from pipeline.behavior.config import SceneEncoder
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import Architecture
@@ -13,7 +14,6 @@ from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import BehaviorData
 from pipeline.core import progress
 from pipeline.data import npz, qa
-from pipeline.rivals.samplers import sampler_of
 from stages.train_behavior import export, pictures, reactions
 from stages.train_behavior.config import Config
 from stages.train_behavior.training import TrainedBehavior

@@ -14,6 +14,7 @@ from pipeline.behavior.perception import POSITION
 from pipeline.behavior.pointwise import WaypointUNet
 from pipeline.core import distributed
 from pipeline.core.training import FitRecord, fit
+from stages.train_behavior.baseline_losses import gaussian_losses, one_stage_losses
 from stages.train_behavior.batches import (
     TrainingWindows,
     WindowStatistics,
@@ -25,7 +26,6 @@ from stages.train_behavior.batches import (
 from stages.train_behavior.config import AugmentationConfig, BehaviorOptimizerConfig, BehaviorTrainingConfig
 from stages.train_behavior.homes import TrainingHomes
 from stages.train_behavior.objective import TrainingPhase, losses
-from stages.train_behavior.rival_losses import gaussian_losses, one_stage_losses
 from stages.train_behavior.scene_sampler import SceneSampler
 
 WEIGHT_DECAY = 0.05

@@ -5,7 +5,7 @@ from typing import Literal
 
 from pipeline.longterm.config import LongTermOptimizerConfig
 
-Ablations = Literal["none", "rivals", "all"]
+Ablations = Literal["none", "baselines", "all"]
 
 
 @dataclass(frozen=True)

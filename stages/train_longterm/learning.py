@@ -10,6 +10,8 @@ import torch
 from safetensors.torch import load_file
 from torch import nn
 
+from pipeline.baselines import longterm_networks
+from pipeline.baselines.longterm_networks import AblatedNetworks
 from pipeline.core.errors import InputError
 from pipeline.core.training import FitRecord
 from pipeline.longterm.clip_channels import Clips
@@ -24,8 +26,6 @@ from pipeline.longterm.examples import (
 )
 from pipeline.longterm.motion_synthesis import LongTerm, measure_motion_prior
 from pipeline.longterm.networks import PointNet, PoseNet, RouteNet, StaticBody
-from pipeline.rivals import longterm_networks
-from pipeline.rivals.longterm_networks import AblatedNetworks
 from stages.train_longterm import training
 from stages.train_longterm.config import Config
 from stages.train_longterm.training import LongTermLossWeights, NetworkTrainer
@@ -79,7 +79,7 @@ def train_ablations(
 ) -> dict[str, AblatedNetworks]:
     """Train the ablations of Table 1 that ``config`` names; those with the same RouteNet share it."""
     routes, trained = {(True, True, False): route} if config.scene else {}, {}
-    names = {"none": (), "rivals": longterm_networks.RIVALS, "all": tuple(longterm_networks.ABLATIONS)}
+    names = {"none": (), "baselines": longterm_networks.BASELINES, "all": tuple(longterm_networks.ABLATIONS)}
     for name in names[config.ablations]:
         spec = longterm_networks.ABLATIONS[name]
         made = initialized(lambda spec=spec: longterm_networks.build(spec, sizes), config)

@@ -125,7 +125,7 @@ def test_flow_is_not_below_opencv(dog):
 
         return move
 
-    rivals = {
+    baselines = {
         "ours": chained(lambda frame: _dense(found[1, "fw"][frame].flow, size)),
         "opencv": chained(lambda frame: _opencv_medium(clip, frame, frame + 1)),
         "zero": lambda first, second: np.zeros((*size, 2), np.float32),
@@ -145,13 +145,13 @@ def test_flow_is_not_below_opencv(dog):
 
     known = sorted(joints)
     pairs = list(zip(known[:-1:2], known[1::2], strict=False))
-    hits = {name: _joint_hits(move, joints, masks, pairs) for name, move in rivals.items()}
+    hits = {name: _joint_hits(move, joints, masks, pairs) for name, move in baselines.items()}
     print(
         "DAVIS dog: PCK@0.2",
         {name: round(value, 3) for name, value in hits.items()},
         f"{len(pairs)} pairs, stride {STRIDE_PX}",
     )
-    warps = {name: warped_iou(move) for name, move in rivals.items()}
+    warps = {name: warped_iou(move) for name, move in baselines.items()}
     print("DAVIS dog: 5-frame mask-warp IoU", {name: round(value, 3) for name, value in warps.items()})
     assert warps["ours"] > warps["zero"] + 0.1
     assert warps["ours"] >= warps["opencv"]

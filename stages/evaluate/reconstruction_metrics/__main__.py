@@ -1,4 +1,4 @@
-"""Measure masks, flow, registration, localizer and reconstruction, beside simple rivals.
+"""Measure masks, flow, registration, localizer and reconstruction, beside simple baselines.
 
 Truth is read where it is given (the built-in capture). Elsewhere clicked correspondences (`make annotate`)
 stand for it, and a held-out phone is placed by them or by registration; metrics that need more are left out

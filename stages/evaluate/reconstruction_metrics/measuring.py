@@ -30,7 +30,7 @@ from stages.evaluate.reliability import reliability_metrics
 from stages.evaluate.truth import read_flow
 
 MAP_FRAMES = 60
-"""Walk-through frames that the localizer's rivals may use: one in eight of a minute."""
+"""Walk-through frames that the localizer's baselines may use: one in eight of a minute."""
 NO_TRUTH = "the true poses of this capture are not known"
 NEED_TRUTH = (
     *clicked.NAMES, "localizer/rotation_deg_median", "localizer/translation_m_median", "masks/iou_mean",
@@ -118,7 +118,7 @@ def _single_frames(
     frames: TruthAlignment,
     config: Config,
 ) -> Metrics:
-    """Place single frames by our localizer and by its rival."""
+    """Place single frames by our localizer and by its baseline."""
     cameras = SceneCameras.open(folders.scene_template)
     known = np.flatnonzero(cameras.registered)
     mapped = known[subsampling.evenly(len(known), MAP_FRAMES)].tolist()

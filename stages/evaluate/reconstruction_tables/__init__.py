@@ -1,1 +1,1 @@
-"""Table 3: the reconstruction and its rivals, seen by the held-out phone, side by side."""
+"""Table 3: the reconstruction and its baselines, seen by the held-out phone, side by side."""

@@ -1,4 +1,4 @@
-"""Tabulate the reconstruction against its rivals and ablations, in the shape of the paper's Table 3.
+"""Tabulate the reconstruction against its baselines and ablations, in the shape of the paper's Table 3.
 
 All are rendered from the held-out phone and compared with what it truly saw; the agent's root and surface
 points are followed in the sessions that this phone filmed too. Writes tables.json (flat) and tables.txt (to

@@ -21,7 +21,7 @@ class Inputs(Reconstructed):
     """What the stage reads."""
 
     variants: Mapping[str, Path]
-    """`reconstruction` of every rival and ablation."""
+    """`reconstruction` of every baseline and ablation."""
 
 
 def run(
@@ -42,8 +42,8 @@ def run(
     shown = (table.pictures(metrics) | table.rooms(folders)).items()
     qa.write(
         out,
-        good="ours is ahead of every rival, for the animal and the room",
-        bad="a rival is as good as ours: what it leaves out does nothing",
+        good="ours is ahead of every baseline, for the animal and the room",
+        bad="a baseline is as good as ours: what it leaves out does nothing",
         checks=table.checks(metrics.values, tuple(folders)),
         pictures=[qa.Picture(name, image, caption) for name, (image, caption) in shown],
     )

@@ -175,7 +175,7 @@ def rooms(folders: Mapping[str, Path]) -> dict[str, tuple[UInt8[np.ndarray, "hei
 
 
 def checks(values: Mapping[str, float | None], variants: Sequence[str]) -> list[Check]:
-    """Judge whether ours, or the paper's form, is ahead of its rivals and ablations over all pixels."""
+    """Judge whether ours, or the paper's form, is ahead of its baselines and ablations over all pixels."""
     share = values.get("ours/depth_acc_all")
     found = [Check("DepthAcc of all pixels, ours", share, "share", 0.85, 0.7, "higher")]
     for variant in (each for each in variants if each != "ours"):

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.baselines.predictors import Ats, ConstantVelocity, LocationPrior, StandStill
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import BehaviorNets, Scaling, bones_from_channels, channels_from_bones
@@ -10,7 +11,6 @@ from pipeline.behavior.path_encoding import goal_error
 from pipeline.behavior.planning import SampledPlan, Sampler, TorchNetworks, observe
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData
 from pipeline.geometry import rigid
-from pipeline.rivals.predictors import Ats, ConstantVelocity, LocationPrior, StandStill
 from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
 
 

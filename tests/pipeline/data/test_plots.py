@@ -58,7 +58,7 @@ def test_a_floor_plan_puts_solid_columns_where_they_stand():
 
 def test_charts_have_the_size_that_was_asked_for_and_show_their_curves():
     losses = {
-        "goal": {"ours": np.geomspace(1, 0.1, 200), "rival": np.ones((2, 200))},
+        "goal": {"ours": np.geomspace(1, 0.1, 200), "baseline": np.ones((2, 200))},
         "path": {"ours": np.ones(3)},
     }
     assert plots.loss_curves(losses).shape == (240, 720, 3)

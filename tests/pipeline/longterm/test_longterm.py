@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.baselines import longterm_networks
 from pipeline.core.errors import InputError
 from pipeline.longterm import simulated_lives
 from pipeline.longterm.clip_channels import decode_clip, encode_clips, encode_places, pose_channels
@@ -21,7 +22,6 @@ from pipeline.longterm.motion_synthesis import LongTerm, measure_motion_prior
 from pipeline.longterm.networks import GaitPhase, PointNet, PoseNet, RouteNet, StaticBody, gait_progress
 from pipeline.longterm.short_motions import STEPS
 from pipeline.longterm.subgoals import Subgoal, WalkableFloor, plan_waypoints, sample_visited_subgoals
-from pipeline.rivals import longterm_networks
 from tests.pipeline.longterm import strider
 
 SIZES = LongTermSizes(pose=12, latent=4, scene=16, hidden=8, width=16, points=32)

@@ -16,8 +16,8 @@ def test_every_tick_with_a_frame_gets_its_nearest_one(steps_s, rate_hz):
     tick = np.rint(timestamp_s * rate_hz)
     assert len(chosen) == len(set(tick))
     for index in chosen:
-        rivals = np.abs(timestamp_s[tick == tick[index]] - tick[index] / rate_hz)
-        assert abs(timestamp_s[index] - tick[index] / rate_hz) == rivals.min() <= 0.5 / rate_hz + 1e-9
+        baselines = np.abs(timestamp_s[tick == tick[index]] - tick[index] / rate_hz)
+        assert abs(timestamp_s[index] - tick[index] / rate_hz) == baselines.min() <= 0.5 / rate_hz + 1e-9
 
 
 def test_a_gap_stays_a_gap():

@@ -22,7 +22,7 @@ WITHOUT = (
     "fields",
     "behavior",
     "longterm",
-    "rivals",
+    "baselines",
     "metrics",
 )
 """Packages that the planner and the runner do not need."""

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.baselines.predictors import Samples
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, Context, Future
-from pipeline.rivals.predictors import Samples
 from stages.evaluate import physical
 from tests.stages.export_simulator import small_world
 

@@ -23,7 +23,7 @@ def view(wrong: int) -> HeldoutView:
     return HeldoutView(color, ours, HeldoutShot(np.eye(4), np.eye(3), 0.0, color, true, agent))
 
 
-def test_what_a_rival_lacks_is_told_with_an_interval():
+def test_what_a_baseline_lacks_is_told_with_an_interval():
     right = {
         name: np.array(
             [list(depth_metrics(name, [view(wrong + k % 2)]).values.values()) for k in range(12)], float

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.baselines.predictors import Samples
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, Future, Trajectory
 from pipeline.fields.skinning import SkinnedShape
 from pipeline.geometry import rigid
@@ -15,7 +16,6 @@ from pipeline.metrics.intervals import bootstrapped, episodes
 from pipeline.metrics.metrics import Metrics, median, percentile
 from pipeline.metrics.pose_errors import constant_between, pose_errors
 from pipeline.metrics.surface_distance import TriangleSurface
-from pipeline.rivals.predictors import Samples
 from stages.evaluate import behavior, heldout, registration, surfaces
 from stages.evaluate.config import Config
 from stages.evaluate.heldout import HeldoutShot, HeldoutView
@@ -201,14 +201,14 @@ class Oracle:
 PROTOCOL = Config(samples=8, trials=2, plan_windows=7, seed=0)
 
 
-def test_who_knows_the_future_beats_blind_rivals_and_the_interval_says_so(data):
+def test_who_knows_the_future_beats_blind_baselines_and_the_interval_says_so(data):
     values = behavior.behavior_metrics(data, Oracle(data), PROTOCOL).values
     assert values["behavior/ats/goal_minde_m"] < 0.02
     assert values["behavior/ats/orientation_minade_rad"] == pytest.approx(0, abs=1e-6)
     assert values["behavior/moving_windows_share"] == 1.0
-    for rival in ("location_prior", "stand_still"):
+    for baseline in ("location_prior", "stand_still"):
         for score in behavior.GOAL_SCORES:
-            assert values[f"behavior/ats_minus_{rival}/{score}_ci95_high"] < 0
+            assert values[f"behavior/ats_minus_{baseline}/{score}_ci95_high"] < 0
     assert values["behavior/location_prior/path_minade_m"] is None
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.baselines.predictors import Ats
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import BehaviorData
 from pipeline.metrics.metrics import Metrics
-from pipeline.rivals.predictors import Ats
 from stages.evaluate import speed, stage
 from stages.evaluate.config import Config
 

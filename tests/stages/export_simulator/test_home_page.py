@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
 
+from pipeline.baselines.predictors import Ats
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import as_companions
 from pipeline.behavior.trajectories import BehaviorData, Context
-from pipeline.rivals.predictors import Ats
 from tests.stages.export_simulator import browser, small_world, twins
 from tests.stages.export_simulator.test_page import check_golden
 

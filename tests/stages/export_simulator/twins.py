@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from playwright.sync_api import Page
 
+from pipeline.baselines.predictors import Ats
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import PAST, RATE_HZ, BehaviorData, Context, window_starts
 from pipeline.geometry import rigid
-from pipeline.rivals.predictors import Ats
 from tests.stages.export_simulator.reaction import FAR_M
 
 STEPS = 10

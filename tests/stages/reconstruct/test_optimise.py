@@ -401,7 +401,7 @@ def test_fields_come_back_from_files_as_they_went(solved, tmp_path):
 
 @pytest.mark.slow
 def test_plain_networks_without_codes_learn_and_come_back(tmp_path):
-    """The rivals of Table 3 take the same way: waves of the place instead of grids, one scene for all
+    """The baselines of Table 3 take the same way: waves of the place instead of grids, one scene for all
     videos.
     """
     found, videos = problem(replace(SHAPES, encoding="mlp", code_channels=0))

@@ -195,7 +195,7 @@ def test_a_limit_may_be_met(value: float | None, verdict: str) -> None:
     assert (judged["masks/iou_mean"].reason == "no truth") == (verdict == "none")
 
 
-def test_a_rival_must_be_beaten_and_all_videos_reached() -> None:
+def test_a_baseline_must_be_beaten_and_all_videos_reached() -> None:
     even = {"behavior/ats/goal_minde_m": 0.3, "behavior/stand_still/goal_minde_m": 0.3}
     assert [
         row.verdict for row in bars.judge(even, {}) if row.bar.limit == "behavior/stand_still/goal_minde_m"

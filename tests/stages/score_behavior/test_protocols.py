@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.baselines import samplers
+from pipeline.baselines.predictors import Ats
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.diffusion import STANDARD
 from pipeline.behavior.model import BehaviorNets, Scaling, channels_from_bones
@@ -14,8 +16,6 @@ from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.planning import Observation, Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
 from pipeline.geometry import rigid
-from pipeline.rivals import samplers
-from pipeline.rivals.predictors import Ats
 from stages.score_behavior import approaches, protocols
 from stages.score_behavior.approaches import RecordedApproaches
 from stages.score_behavior.config import Config

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from pipeline.baselines.predictors import Ats
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.planning import SampledPlan
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import FUTURE, RATE_HZ
-from pipeline.rivals.predictors import Ats
 from stages.tabulate_behavior import chaining
 from tests.pipeline.behavior.wandering import REST, room, wandering
 

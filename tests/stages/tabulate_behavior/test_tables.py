@@ -30,12 +30,12 @@ def test_intervals_grow_with_what_seeds_disagree_about():
 def test_a_difference_is_taken_window_by_window():
     rng = np.random.default_rng(1)
     hard = np.repeat(rng.gamma(1, 1, 10), 64)[None] * np.ones((2, 1))
-    found = tables.figures({"ats": scores(hard), "rival": scores(hard + 0.1)}, "ats", draws=300, seed=0)
-    assert found["behavior/ats_minus_rival/goal_minde_m_ci95_high"] == pytest.approx(-0.1, abs=1e-9)
-    assert found["behavior/ats/goal_minde_m_ci95_high"] > found["behavior/rival/goal_minde_m_ci95_low"]
+    found = tables.figures({"ats": scores(hard), "baseline": scores(hard + 0.1)}, "ats", draws=300, seed=0)
+    assert found["behavior/ats_minus_baseline/goal_minde_m_ci95_high"] == pytest.approx(-0.1, abs=1e-9)
+    assert found["behavior/ats/goal_minde_m_ci95_high"] > found["behavior/baseline/goal_minde_m_ci95_low"]
     assert found["behavior/ats/flees_seen"] == 1
-    text = printing.tables(found, ("ats", "rival"))
-    assert f"{found['behavior/rival/goal_minde_m']:.3f}" in text
+    text = printing.tables(found, ("ats", "baseline"))
+    assert f"{found['behavior/baseline/goal_minde_m']:.3f}" in text
 
 
 def test_flight_is_held_against_the_animals_own():
@@ -57,7 +57,7 @@ def test_plateaus_tell_a_flat_curve_from_a_falling_one():
     assert found["behavior/b/goal_loss_still_falls"] > 0.1
 
 
-def test_untrained_rivals_stand_on_the_same_windows():
+def test_untrained_baselines_stand_on_the_same_windows():
     data = wandering()
     test = np.flatnonzero(data.split == 1)[::5]
     like = MethodScores(

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.baselines import longterm_networks
 from pipeline.longterm.config import LongTermSizes, MotionOptimizationConfig
 from pipeline.longterm.contacts import find_contact_vertices
 from pipeline.longterm.examples import DatasetSplit, encode_selection, fit_pose_space, select_clips
 from pipeline.longterm.motion_synthesis import LongTerm, measure_motion_prior
 from pipeline.longterm.networks import PoseNet, RouteNet, StaticBody
 from pipeline.longterm.short_motions import BodyMotion
-from pipeline.rivals import longterm_networks
 from stages.tabulate_longterm import bars, comparison, lengths, methods, scores, tables
 from stages.tabulate_longterm.config import Config
 from stages.tabulate_longterm.methods import ComparedModels

@@ -12,7 +12,7 @@ from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.scenes import Scenes
 from pipeline.core import distributed
 from pipeline.core.training import generator_for
-from stages.train_behavior import objective, rival_losses, training
+from stages.train_behavior import baseline_losses, objective, training
 from stages.train_behavior.config import BehaviorOptimizerConfig, BehaviorTrainingConfig
 from stages.train_behavior.homes import TrainingHomes
 from tests import two_processes
@@ -67,7 +67,7 @@ def alone(family: str, monkeypatch: pytest.MonkeyPatch) -> training.TrainedBehav
     """Train in one process on both processes' halves of each batch."""
     fit, rows = training.fit, BothRows()
     monkeypatch.setattr(objective, "distributed", rows)
-    monkeypatch.setattr(rival_losses, "distributed", rows)
+    monkeypatch.setattr(baseline_losses, "distributed", rows)
 
     def fit_both(*, loss, **rest):
         def of_both(step: int, _: torch.Generator) -> dict[str, torch.Tensor]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.baselines.predictors import Ats, ConstantVelocity
 from pipeline.behavior import model
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule
@@ -13,7 +14,6 @@ from pipeline.behavior.path_encoding import path_from_velocity_channels, velocit
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, frames_from_seconds
 from pipeline.core.errors import InputError
-from pipeline.rivals.predictors import Ats, ConstantVelocity
 from stages.slice_behavior.gridding import ReconstructedMotion, trajectory_from_motion
 from stages.slice_behavior.windows import slice_windows
 from stages.train_behavior import export

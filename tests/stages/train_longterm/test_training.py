@@ -5,11 +5,11 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from pipeline.baselines import longterm_networks
 from pipeline.core.errors import InputError
 from pipeline.longterm.config import LongTermSizes
 from pipeline.longterm.examples import DatasetSplit
 from pipeline.longterm.networks import PointNet
-from pipeline.rivals import longterm_networks
 from stages.train_longterm import learning, objectives, pictures
 from stages.train_longterm.config import Config
 from stages.train_longterm.training import LongTermOptimizerConfig

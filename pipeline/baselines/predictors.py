@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipeline.baselines.samplers import sampler_of
 from pipeline.behavior import model as behavior
 from pipeline.behavior.config import Ego, PlanSamplingConfig
 from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
@@ -20,7 +21,6 @@ from pipeline.behavior.planning import Observation, Sampler, TorchNetworks, obse
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import Context, Future
 from pipeline.geometry import rigid
-from pipeline.rivals.samplers import sampler_of
 
 WINDOWS_AT_ONCE = 32
 """bounds the memory of scene grids and bones"""

@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pipeline.baselines.samplers import LOG_STD_BOUNDS, LOG_STD_STEP, MEAN_STEP
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import BehaviorNets
 from pipeline.behavior.path_encoding import PATH_CHANNELS
 from pipeline.core import distributed
-from pipeline.rivals.samplers import LOG_STD_BOUNDS, LOG_STD_STEP, MEAN_STEP
 from stages.train_behavior.batches import TrainingBatch
 from stages.train_behavior.config import ObjectiveConfig
 from stages.train_behavior.objective import (

@@ -44,7 +44,7 @@ ABLATIONS: dict[str, AblationSpec] = {
     "base_no_scene": AblationSpec(with_scene=False, one=True),
 }
 
-RIVALS = ("ours_no_scene", "base")
+BASELINES = ("ours_no_scene", "base")
 """Ablations of the scene, and of two networks in place of one."""
 
 
