@@ -56,7 +56,7 @@ class GaussianSampler(Sampler):
         towards = self.scaling.goal(self._goal(codes)[0]) if goal is None else goal
         along = path
         if along is None:
-            along = self._positions(self._path(codes, towards, sampling)[0])
+            along = self.scaling.path_of_scaled(self._path(codes, towards, sampling)[0][:, :3])
         goal = self.goals(codes, sampling, rng) if goal is None else goal
         path = self.paths(codes, towards, sampling, rng) if path is None else path
         return SampledPlan(goal, path, self.bodies(codes, along, sampling, rng))
@@ -81,8 +81,8 @@ class GaussianSampler(Sampler):
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw a path towards each goal, metres, ego frame."""
-        path = self._positions(self._sample_gaussian(self._path(codes, goal, sampling), rng))
-        return codes.constrained(path, self.scaling.rate_hz)
+        scaled = self._sample_gaussian(self._path(codes, goal, sampling), rng)
+        return codes.constrained(self.scaling.path_of_scaled(scaled[:, :3]), self.scaling.rate_hz)
 
     def bodies(
         self,
@@ -115,9 +115,6 @@ class GaussianSampler(Sampler):
             self.networks.path(zeros, _step(zeros, t), codes.full, control, keep)
             for t in (MEAN_STEP, LOG_STD_STEP)
         ]
-
-    def _positions(self, scaled: Array) -> Float[np.ndarray, "plan frame 3"]:
-        return np.swapaxes(scaled[:, :3] * self.scaling.path_std, 1, 2)
 
     def _sample_gaussian(self, outputs: list[Array], rng: np.random.Generator) -> Array:
         mean, log_std = outputs

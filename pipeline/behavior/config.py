@@ -35,13 +35,13 @@ class PlanSamplingConfig:
     """How plans are sampled."""
 
     method: SamplingMethod | None = None
-    """Sampler of goals (none: the schedule's, which is always used for paths and bodies). DDPM adds fresh
-    noise at every step; DPM-Solver++ is deterministic given the initial noise."""
+    """Sampler of goals; none: the schedule's. DDPM adds fresh noise at every step; DPM-Solver++ is
+    deterministic given the initial noise."""
     goal_steps: int = 0
     """Denoising steps of the goal; 0: the schedule's own number, 10 of DPM-Solver++, 50 of DDPM."""
     sequence_steps: int = 0
-    """Denoising steps of path and body, 0 as above. Evenly spaced in log-SNR, some coincide: 9 are left of
-    10, 33 of 50."""
+    """Denoising steps of path and body by DPM-Solver++; 0: the schedule's own sampler and number. Evenly
+    spaced in log-SNR, some coincide: 9 are left of 10, 33 of 50."""
     guidance: float = 1.25
     """Scale s of classifier-free guidance, for bodies at most 1. Of 1, 1.25, 1.5, 2 it has the least energy
     score of goals and the right share of flights in left-out sessions of the built-in cat."""
@@ -61,8 +61,8 @@ class PlanSamplingConfig:
     snap_to_goal: bool = True
     """Warp paths to end at the goals that condition them."""
     body_noise_std: float = 0.25
-    """Standard deviation of the initial noise of bodies; at no other is the best of 16 nearer, in none of
-    three sessions left out of training (built-in cat; `docs/behavior.md`)."""
+    """Standard deviation of the initial noise of bodies. Of 0.1 to 1 none brings the best of 16 nearer in any
+    of three sessions left out of training (built-in cat; `docs/behavior.md`)."""
     path_noise_std: float = 1.0
     """Standard deviation of the initial noise of paths. At 0, in one step, a path is the mean of all paths to
     its goal."""

@@ -16,6 +16,9 @@ from pipeline.behavior.config import NoiseCourse, SamplingMethod
 
 Array = TypeVar("Array", np.ndarray, Tensor)
 
+SOLVER_STEPS = 10
+"""sampling steps of DPM-Solver++"""
+
 
 @dataclass(frozen=True)
 class Schedule:
@@ -33,12 +36,12 @@ class Schedule:
     """variances that grow linearly (Ho et al. 2020), or rectified flow (Liu et al. 2023): straight lines (1 -
     s) clean + s noise, scaled to unit variance; train it with `weighting` "flow\""""
     method: SamplingMethod = "dpm_solver"
-    """sampler"""
+    """sampler, unless a caller chooses"""
 
     @property
     def sampled_steps(self) -> int:
-        """Return the number of steps in which is sampled."""
-        return 10 if self.method == "dpm_solver" else self.steps
+        """Return the default number of sampling steps."""
+        return SOLVER_STEPS if self.method == "dpm_solver" else self.steps
 
     @property
     def beta(self) -> Float[np.ndarray, "step"]:

@@ -39,7 +39,7 @@ from pipeline.behavior.denoisers import (
     TrailingLinear,
     UncontrolledUNet,
 )
-from pipeline.behavior.diffusion import STANDARD, Schedule
+from pipeline.behavior.diffusion import SOLVER_STEPS, STANDARD, Schedule
 from pipeline.behavior.goal_denoiser import GoalMLP
 from pipeline.behavior.path_encoding import (
     GOAL_LENGTH_POWER,
@@ -183,6 +183,10 @@ class Scaling:
         """Convert paths in metres to the control of bodies."""
         return (np.swapaxes(path, 1, 2) / self.path_std).astype(np.float32)
 
+    def path_of_scaled(self, scaled: Float[np.ndarray, "plan 3 frame"]) -> Float[np.ndarray, "plan frame 3"]:
+        """Undo `scaled_path`."""
+        return np.swapaxes(scaled * self.path_std, 1, 2)
+
 
 class BehaviorNets(nn.Module):
     """Perception and the three denoisers."""
@@ -282,7 +286,7 @@ def contract(
     """Return the content of `behavior.json`, for samplers in other languages."""
     bone = ["rotation_x", "rotation_y", "rotation_z", "shift_x", "shift_y", "shift_z"]
     root = ["right_x", "right_y", "right_z", "up_x", "up_y", "up_z"]
-    steps = schedule.sampled_steps
+    sampling = PlanSamplingConfig(schedule.method, schedule.sampled_steps, sequence_steps=SOLVER_STEPS)
     return {
         "units": "metres, radians, seconds",
         "up": [0, 1, 0],
@@ -327,7 +331,7 @@ def contract(
         },
         "scaling": {name: np.asarray(value, float).tolist() for name, value in vars(scaling).items()},
         "schedule": {**asdict(schedule), "alpha_bar": schedule.alpha_bar.tolist()},
-        "sampling": asdict(PlanSamplingConfig(schedule.method, goal_steps=steps, sequence_steps=steps)),
+        "sampling": asdict(sampling),
     }
 
 

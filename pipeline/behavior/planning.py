@@ -327,14 +327,16 @@ class Sampler:
         return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
 
     def of_sequences(self, sampling: PlanSamplingConfig) -> tuple[PlanSamplingConfig, int]:
-        """Return the sampler of paths and bodies, which is the schedule's, and its number of steps.
+        """Return the sampler of paths and bodies and its number of steps.
 
-        DDPM, which adds noise at every step, begins with unit variance.
+        A chosen number of steps is taken by DPM-Solver++. DDPM, which adds noise at every step, begins with
+        unit variance.
         """
-        steps, method = sampling.sequence_steps or self.schedule.sampled_steps, self.schedule.method
-        if method == "ddpm":
-            sampling = replace(sampling, path_noise_std=1.0, body_noise_std=1.0)
-        return replace(sampling, method=method), steps
+        if sampling.sequence_steps or self.schedule.method == "dpm_solver":
+            steps = sampling.sequence_steps or self.schedule.sampled_steps
+            return replace(sampling, method="dpm_solver"), steps
+        ancestral = replace(sampling, method=self.schedule.method, path_noise_std=1.0, body_noise_std=1.0)
+        return ancestral, self.schedule.sampled_steps
 
     def paths_out_of_solid(
         self, codes: PlanCondition, scaled: Float[np.ndarray, "plan 4 frame"]

@@ -145,8 +145,10 @@ def test_a_gaussian_draws_what_its_networks_tell():
     np.testing.assert_allclose(path.std(), np.exp(samplers.LOG_STD_BOUNDS[0]), rtol=0.03)
 
 
-@pytest.mark.parametrize(("method", "calls"), [("dpm_solver", 9), ("ddpm", 50)])
-def test_networks_alone_sample_by_the_schedule_and_do_not_snap_to_goals(method, calls):
+@pytest.mark.parametrize(
+    ("method", "steps", "calls"), [("dpm_solver", 0, 9), ("ddpm", 0, 50), ("ddpm", 10, 9)]
+)
+def test_networks_alone_sample_by_the_schedule_and_do_not_snap_to_goals(method, steps, calls):
     class Counted:
         def __init__(self):
             self.calls = 0
@@ -160,7 +162,7 @@ def test_networks_alone_sample_by_the_schedule_and_do_not_snap_to_goals(method, 
 
     scaling, counted = Scaling(np.ones(3), np.ones(4), np.ones((3, 56)), np.zeros(6), np.ones(6)), Counted()
     sampler, goal = Sampler(counted, replace(STANDARD, method=method), scaling), np.full((4, 3), 2.0)
-    snapped = PlanSamplingConfig(guidance=1.0, max_path_draws=1)
+    snapped = PlanSamplingConfig(guidance=1.0, max_path_draws=1, sequence_steps=steps)
     alone, ends = snapped.networks_only(), []
     for sampling in (snapped, alone):
         codes, rng = sampler.codes(behavior_observation(), sampling, 4), np.random.default_rng(0)
