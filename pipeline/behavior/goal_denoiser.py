@@ -134,11 +134,10 @@ class RestLikelihood(nn.Module):
         self, mean: Float[Tensor, "batch 3"], variance: Float[Tensor, "batch 1"]
     ) -> Float[Tensor, "batch 20"]:
         """Return unnormalised likelihoods, their logarithms, and likelihood-weighted posterior means."""
-        log_likelihood = -mean.square().sum(-1, keepdim=True) / (2 * (variance + self.rest_variance))
+        total = variance + self.rest_variance
+        log_likelihood = -mean.square().sum(-1, keepdim=True) / (2 * total)
         likelihood = log_likelihood.exp()
-        shrunk = (
-            mean[:, None] * (likelihood * self.rest_variance / (variance + self.rest_variance))[..., None]
-        )
+        shrunk = mean[:, None] * (likelihood * self.rest_variance / total)[..., None]
         logarithm = (log_likelihood / 5).clamp_min(self.MIN)
         return torch.cat([likelihood, logarithm, shrunk.flatten(1).clamp(-self.MAX, self.MAX)], dim=-1)
 

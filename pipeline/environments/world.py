@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from pipeline.baselines.samplers import sampler_of
 from pipeline.behavior import model as behavior
 from pipeline.behavior.config import Ego, PlanSamplingConfig, ReplanningConfig
 from pipeline.behavior.model import bones_from_channels
@@ -116,7 +117,7 @@ class AnimalWorld:
         architecture, nets, scaling, schedule, _ = behavior.load(build / "behavior")
         behavior.refuse_unplayable(architecture, str(build))
         data = BehaviorData.load(build / "behavior_data")
-        sampler = Sampler(TorchNetworks(nets, device), schedule, scaling, architecture.guided)
+        sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
         habitat = open_homes(build, data, homes)
         camera = RgbdCamera.load(build, homes or (build,)) if "rgbd" in config.observations else None
         return cls(sampler, habitat, architecture.ego, config, camera=camera)

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 SUPPORTERS, TOLERANCE_M = 3, 0.03
-"""neighbours of similar depth on a surface; a flying pixel along a straight edge has two"""
+"""neighbours within this tolerance of depth on a surface; a flying pixel along a straight edge has two"""
 
 
 def supported(depth: Float[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:

@@ -19,6 +19,8 @@ VOXEL_M = 0.1
 LOW_M = (-0.7, -0.4, -1.3)
 SHAPE = (15, 10, 27)
 """The box in the clip's frame, +z from start to end."""
+CLIPS_AT_ONCE = 100
+"""Clips around which distances are sampled at once; bounds the memory."""
 MIN_DISTANCE_M, MAX_DISTANCE_M = -0.15, 0.45
 """Signed distances are truncated to this range."""
 CLEARANCE_M = 0.15
@@ -58,7 +60,7 @@ def distance_fields(
     field = torch.zeros(1, *SHAPE, dtype=torch.half)
     field = field.expand(len(frames), *SHAPE) if not scenes else field.repeat(len(frames), 1, 1, 1)
     for index, each in enumerate(scenes):
-        for rows in torch.from_numpy(np.flatnonzero(np.asarray(scene) == index)).split(100):
+        for rows in torch.from_numpy(np.flatnonzero(np.asarray(scene) == index)).split(CLIPS_AT_ONCE):
             points = voxels @ frames[rows, :3, :3].transpose(1, 2) + frames[rows, None, :3, 3]
             distance = each.distance.at(points).clamp(MIN_DISTANCE_M, MAX_DISTANCE_M)
             field[rows] = distance.unflatten(1, SHAPE).half()

@@ -15,6 +15,8 @@ STEP_M = 0.05
 """difference of neighbouring depths above which they form a step"""
 NEAREST_M = 0.2
 """least distance for the projected size of a sphere"""
+RIM_PX = 8
+"""margin around a sphere's bounding box"""
 
 
 @dataclass(frozen=True)
@@ -64,14 +66,14 @@ def bounding_slices(mask: Bool[np.ndarray, "height width"], margin_px: int) -> t
 def project_sphere(
     clip: Clip, frame: int, world_from_camera: Float[np.ndarray, "4 4"], sphere: Sphere, size: tuple[int, int]
 ) -> tuple[slice, slice]:
-    """Return the rows and columns of a sphere's bounding box, 8 px wider, in a picture of ``size``."""
+    """Return the rows and columns of a sphere's bounding box with a margin, in a picture of ``size``."""
     intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size)
     centre = rigid.apply(rigid.inverse(world_from_camera), sphere.centre_world[None])[0]
     pixel, depth = cameras.project(centre, intrinsics)
     if depth < 0.1:
         return slice(0, 0), slice(0, 0)
     focal_px, radius_m = intrinsics[[0, 1], [0, 1]], sphere.radius_m
-    reach = focal_px * radius_m / max(depth - 0.5 * radius_m, NEAREST_M) + 8
+    reach = focal_px * radius_m / max(depth - 0.5 * radius_m, NEAREST_M) + RIM_PX
     low = np.clip(np.floor(pixel - reach), 0, size[::-1]).astype(int)
     high = np.clip(np.ceil(pixel + reach), 0, size[::-1]).astype(int)
     return slice(low[1], high[1]), slice(low[0], high[0])

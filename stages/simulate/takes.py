@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.baselines.samplers import sampler_of
 from pipeline.behavior import model as behavior
 from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
-from pipeline.behavior.planning import Sampler, TorchNetworks
+from pipeline.behavior.planning import TorchNetworks
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import Simulator
 from pipeline.behavior.trajectories import TRAIN, BehaviorData, Trajectory
@@ -207,7 +208,7 @@ def _simulator(
     sampling = PlanSamplingConfig(
         goal_steps=c.goal_steps, sequence_steps=c.sequence_steps, guidance=c.guidance
     )
-    sampler = Sampler(TorchNetworks(nets, device), schedule, scaling, architecture.guided)
+    sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
     return Simulator(sampler, data, scenes, architecture.ego, sampling=sampling, chaining=chaining)
 
 

@@ -5,11 +5,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipeline.baselines.samplers import sampler_of
 from pipeline.behavior import model as behavior
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
 from pipeline.behavior.perception import world_from_ego
-from pipeline.behavior.planning import Sampler, TorchNetworks, observe
+from pipeline.behavior.planning import TorchNetworks, observe
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import FUTURE, RATE_HZ, TRAIN, BehaviorData
 from pipeline.core import progress
@@ -65,7 +66,7 @@ def rows(
 ) -> Float[np.ndarray, "window 2 4"]:
     """Return `NAMES` of each window's plan before and after optimisation."""
     architecture, nets, scaling, schedule, _ = behavior.load(model)
-    sampler = Sampler(TorchNetworks(nets, device), schedule, scaling, architecture.guided)
+    sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
     context, future = data.windows(windows)
     scenes = Scenes.load(behavior_data, data.videos)
     observation = observe(context, scenes, data.agent_from_bone_rest, architecture.ego)
