@@ -133,7 +133,6 @@ OF_HOMES = (
     *(Need(name, option="homes", homes="other", flow="recordings") for name in HOME_ARTIFACTS),
 )
 FLOW: tuple[Node, ...] = (
-    # Make starts the first job that is ready: first what the longest chains of jobs wait for.
     Node("synthetic_capture", "synthesize_capture", threads=2),
     Node("frames", "extract_frames", (RECORDING,), roles=(*VIEWED, "heldout"), seconds_per_frame=0.006),
     Node(

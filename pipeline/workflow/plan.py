@@ -220,7 +220,7 @@ def _rules(plan: Plan, all_jobs: list[Job], after: Mapping[str, Sequence[str]]) 
         lines += [f".PHONY: {target} {target}.redo", f"{target}: {' '.join(made)}"]
         lines += [f"{target}.redo:", f"\t@$(PLAN) redo {home} {node}", f"\t@$(MAKE) $(NESTING) {target}"]
     if not home.tables:
-        wanted = [job.stamp for job in all_jobs if not dag.NODES[job.artifact].on_demand]
+        wanted = [job.stamp for job in _start_order(plan, all_jobs) if not dag.NODES[job.artifact].on_demand]
         pages = dict.fromkeys(
             f"{each.home_of(node).folder}/{node}/index.html"
             for each in plan.animals or (plan,)
@@ -233,6 +233,33 @@ def _rules(plan: Plan, all_jobs: list[Job], after: Mapping[str, Sequence[str]]) 
         lines += [f"\t@echo '  {page}'" for page in pages]
         lines += [f"\t@echo 'Next: {following}, make new AGENT=<name>, make help'"]
     return "\n".join(lines) + "\n"
+
+
+def _start_order(plan: Plan, all_jobs: Sequence[Job]) -> list[Job]:
+    """Return the jobs in the order in which Make starts those that are ready.
+
+    Make goes through its targets, waits for a free core at the first one that is ready, and starts over only at
+    the end. What the templates are made from precedes the sessions, which wait for them. Flow of sessions comes
+    after masks, as whose dependency Make starts it. Long recordings precede short ones; of the built-in
+    sessions, which have no files yet, the test session is the longest.
+    """
+    place = {node.artifact: i for i, node in enumerate(dag.FLOW)}
+    folder = Path("captures", plan.home.agent)
+    sizes = {video.id: sources.recording_size(folder / video.file) for video in plan.videos}
+    tests = {video.id for video in plan.videos if video.split == "test"}
+    sessions = {video.id for video in plan.videos if video.role == "session"}
+
+    def key(job: Job) -> tuple[int, int, int, bool]:
+        phase = 2
+        if place[job.artifact] < place["feature_basis"]:
+            phase = 0
+        elif job.artifact in ("masks", "flow"):
+            phase = {"masks": 3, "flow": 4}[job.artifact] if job.video in sessions else 1
+        elif place[job.artifact] >= place["video_poses"]:
+            phase = 5
+        return phase, place[job.artifact], -sizes.get(job.video, 0), job.video not in tests
+
+    return sorted(all_jobs, key=key)
 
 
 def _json(value: Any) -> str:

@@ -144,8 +144,16 @@ def recording_digest(path: Path, digest_of: Callable[[Path], str] = artifact.dig
     """Return the hash of a recording: of the file, or of all files of a folder except hidden ones."""
     if path.is_file():
         return digest_of(path)
-    files = sorted(file for file in path.rglob("[!.]*") if file.is_file())
-    return artifact.digest_of({file.relative_to(path).as_posix(): digest_of(file) for file in files})
+    return artifact.digest_of({f.relative_to(path).as_posix(): digest_of(f) for f in _files_of(path)})
+
+
+def recording_size(path: Path) -> int:
+    """Return the bytes of a recording's files; 0 if there is none."""
+    return sum(file.stat().st_size for file in ([path] if path.is_file() else _files_of(path)))
+
+
+def _files_of(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.rglob("[!.]*") if file.is_file())
 
 
 def _read(path: Path) -> dict[str, Any]:

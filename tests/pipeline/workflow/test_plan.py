@@ -453,3 +453,18 @@ def test_a_session_without_depth_is_read_through_what_stands_in_for_its_frames(h
     assert "estimated_frames/v002" in read["masks.v002"] and "frames/v003" in read["masks.v003"]
     assert not any(name.startswith("estimated") for name in read["feature_basis"]), "the map needs features"
     assert {"frames/v000", "estimated_frames/v001", "estimated_frames/v002"} <= read["reconstruction"]
+
+
+def test_make_starts_what_templates_need_first_and_long_recordings_before_short_ones(house):
+    for name, size in {"walkthrough": 1, "turnaround": 1, "a": 10, "b": 30, "c": 20}.items():
+        house.write(f"captures/toy/{name}.r3d", "x" * size)
+    assert house.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
+    rules = (house.folder / "build/toy/plan/rules.mk").read_text()
+    listed = re.search(r"^toy: (.*)$", rules, re.MULTILINE)[1].replace("/.ok", "").split()
+    order = [path.removeprefix("build/toy/") for path in listed]
+    sessions = ["v003", "v004", "v002"]  # ids follow the names; b, c, a by size
+    assert [name for name in order if name.startswith("video_poses/")] == [f"video_poses/{v}" for v in sessions]
+    place = {name: i for i, name in enumerate(order)}
+    assert place["flow/v001"] < place["feature_basis"] < place["scene_localizer"] < place["masks/v003"]
+    assert place["masks/v002"] < place["flow/v003"]
+    assert len(place) == len(order)
