@@ -195,14 +195,14 @@ class MapAttention(nn.Module):
         query = self.query(code_channels).unflatten(-1, (self.HEADS, -1))
         bias = torch.cat([torch.zeros_like(mean * precision), mean * precision, -precision / 2], dim=-1)
         position = query[..., MAP_KEY_CHANNELS:] + nn.functional.pad(bias, (0, 0, 0, self.HEADS - self.LOCAL))
-        content, position = (
-            part.reshape(part.shape[0], -1, draws * self.HEADS, part.shape[-1])
-            for part in (query[..., :MAP_KEY_CHANNELS] * MAP_KEY_CHANNELS**-0.5, position)
-        )
-        weight = (content @ key + position @ cells.transpose(-1, -2)).softmax(-1)
-        read, attended = (
-            (weight @ rows).flatten(1, 2).unflatten(1, (-1, self.HEADS))
-            for rows in (value.transpose(-1, -2), scaled)
-        )
+        content = query[..., :MAP_KEY_CHANNELS] * MAP_KEY_CHANNELS**-0.5
+        query = torch.cat([content, position], dim=-1)
+        query = query.reshape(len(query), -1, draws * self.HEADS, query.shape[-1])
+        keys = torch.cat([key.transpose(-1, -2), cells.expand(*key.shape[:2], -1, -1)], dim=-1)
+        values = torch.cat([value.transpose(-1, -2), scaled.expand(*key.shape[:2], -1, -1)], dim=-1)
+        width = values.shape[-1]  # fused attention wants values as wide as keys
+        values = nn.functional.pad(values, (0, keys.shape[-1] - width))
+        read = nn.functional.scaled_dot_product_attention(query, keys, values, scale=1.0)[..., :width]
+        read, attended = read.flatten(1, 2).unflatten(1, (-1, self.HEADS)).split([width - 2, 2], dim=-1)
         offset = attended[:, :, : self.LOCAL] - mean
         return torch.cat([read.flatten(2), attended.flatten(2), offset.flatten(2)], dim=-1)
