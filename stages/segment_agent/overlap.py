@@ -17,6 +17,8 @@ from stages.segment_agent.free_space import References
 Subject = Literal["moving", "resting", "one of several"]
 """what masks are of: a moving animal; one that may rest all the time, so that unseen space is right; one of
 several. Only the first has false negatives"""
+EVERY = 2
+"""every how many frames are evaluated: masks of consecutive frames err alike"""
 
 
 def estimate(
@@ -26,22 +28,27 @@ def estimate(
     masks: Masks,
     animal: AnimalConfig,
     shown: Subject,
-) -> Float[np.ndarray, "frame"]:
-    """Return the estimated intersection over union of each frame; NaN where nothing is seen or missed."""
+) -> Float[np.ndarray, "evaluated_frame"]:
+    """Return the estimated IoU of every `EVERY`-th frame; NaN where nothing is seen or missed."""
     room = free_space.masked(references, lambda frame: masks[frame] != 0)
-    intersection_m2, union_m2, missing = np.zeros(len(clip)), np.zeros(len(clip)), []
-    for frame, pose in enumerate(world_from_camera):
+    intersection_m2, union_m2, missing = [], [], []
+    evaluated = range(0, len(clip), EVERY)
+    for frame in evaluated:
+        pose = world_from_camera[frame]
         inner = free_space.interior_depth(clip, frame)
         points, area_m2, chosen = free_space.sample(clip, frame, pose, inner, locate.COARSE_PX)
         labels = locate.sample_nearest(masks[frame], clip.depth_size, chosen)
         votes = free_space.vote(room, points, frame)
         inside, right = labels == 255, movers.moving(votes)
         right |= (shown == "resting") & (votes.occupied == 0)
-        intersection_m2[frame], union_m2[frame] = (area_m2[own].sum() for own in (inside & right, inside))
+        intersection_m2.append(area_m2[inside & right].sum())
+        union_m2.append(area_m2[inside].sum())
         outside = locate.opened_motion(votes, movers.SURE_SHARES[0]) & (labels == 0) & (shown == "moving")
         missing.append(movers.candidates(outside, right, points, area_m2, animal))
-    choice = movers.track(missing, clip.timestamp_s, animal)
+    time_s = clip.timestamp_s[::EVERY]
+    choice = movers.track(missing, time_s, animal)
     chosen = [group[index] if index >= 0 else None for group, index in zip(missing, choice, strict=True)]
-    self_moving = movers.self_moving(chosen, clip.timestamp_s, animal)
-    union_m2 += [each.area_m2 if each and own else 0 for each, own in zip(chosen, self_moving, strict=True)]
-    return np.where(union_m2 < movers.MIN_AREA_M2, np.nan, intersection_m2 / np.maximum(union_m2, 1e-9))
+    self_moving = movers.self_moving(chosen, time_s, animal)
+    missed_m2 = [each.area_m2 if each and own else 0 for each, own in zip(chosen, self_moving, strict=True)]
+    union = np.array(union_m2) + missed_m2
+    return np.where(union < movers.MIN_AREA_M2, np.nan, np.array(intersection_m2) / np.maximum(union, 1e-9))
