@@ -184,14 +184,13 @@ def correlation(first: PosedPicture, second: PosedPicture, reading: Reading) -> 
     grid = np.mgrid[step // 2 : depth_size[0] : step, step // 2 : depth_size[1] : step]
     row, column = grid.reshape(2, -1)
     row, column = row[depth[row, column] > 0], column[depth[row, column] > 0]
-    centre = np.stack([column + 0.5, row + 0.5], axis=-1)
+    centre = cameras.pixel_centres(row, column)
     rays = cameras.unproject(centre, _intrinsics(first.depth_intrinsics, depth_size, reading))
     points = rigid.apply(_second_from_first(first, second, reading), rays * depth[row, column, None])
     pixel, z = cameras.project(points, _intrinsics(second.intrinsics, size, reading))
     inside = (z > NEAREST_M) & (pixel >= 1).all(-1) & (pixel < np.array(size[::-1]) - 1).all(-1)
     pixel, z, centre = pixel[inside], z[inside], centre[inside]
-    at = np.floor(pixel * np.array(depth_size[::-1]) / size[::-1]).astype(int)
-    measured = seen_depth[at[:, 1], at[:, 0]]
+    measured = seen_depth[cameras.pixel_index(pixel * np.array(depth_size[::-1]) / size[::-1])]
     shown = (measured == 0) | (z < measured * (1 + OCCLUDED_SHARE) + OCCLUDED_M)
     if shown.sum() < MIN_POINTS:
         return np.nan
