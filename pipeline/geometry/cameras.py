@@ -6,8 +6,9 @@ pixels or points work on NumPy arrays and on torch tensors alike.
 
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import cv2
 import numpy as np
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Int, Num, Shaped
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -82,6 +83,14 @@ def sample_nearest(
     inside = in_picture(pixel, np.ones(pixel.shape[:-1]), image.shape)
     values = image[pixel_index(np.where(inside[..., None], pixel, 0))]
     return np.where(inside, values, image.dtype.type(0))
+
+
+def sample_bilinear(
+    image: Num[np.ndarray, "height width *channel"], pixel: Float[np.ndarray, "rows columns 2"]
+) -> Num[np.ndarray, "rows columns *channel"]:
+    """Return the values of an image at pixels (x, y) by bilinear interpolation; 0 outside."""
+    x, y = np.moveaxis((pixel - 0.5).astype(np.float32), -1, 0)
+    return cv2.remap(np.ascontiguousarray(image), x, y, cv2.INTER_LINEAR)
 
 
 def lookup_depth(

@@ -195,8 +195,8 @@ def correlation(first: PosedPicture, second: PosedPicture, reading: Reading) -> 
     if shown.sum() < MIN_POINTS:
         return np.nan
     own = centre[shown] * np.array(size[::-1]) / depth_size[::-1]
-    values = [_sampled(gray, at) for gray, at in zip(grays, (own, pixel[shown]), strict=True)]
-    return correlated(*values)
+    pairs = zip(grays, (own, pixel[shown]), strict=True)
+    return correlated(*(cameras.sample_bilinear(gray, at[:, None])[:, 0] for gray, at in pairs))
 
 
 def _depth(picture: PosedPicture, reading: Reading) -> Float[np.ndarray, "height width"]:
@@ -220,14 +220,6 @@ def _second_from_first(
     world_from_first, world_from_second = poses
     turn = rigid.rotation_from_vector(np.radians([*reading.turn_deg, 0.0]))
     return rigid.make(turn, np.zeros(3)) @ rigid.inverse(world_from_second) @ world_from_first
-
-
-def _sampled(
-    picture: Float[np.ndarray, "height width"], pixel: Float[np.ndarray, "point 2"]
-) -> Float[np.ndarray, "point"]:
-    """Interpolate a picture at pixels whose centres lie at +0.5."""
-    x, y = (pixel - 0.5).astype(np.float32).T
-    return cv2.remap(np.ascontiguousarray(picture), x[:, None], y[:, None], cv2.INTER_LINEAR)[:, 0]
 
 
 def correlated(first: Float[np.ndarray, "point"], second: Float[np.ndarray, "point"]) -> float:

@@ -135,7 +135,7 @@ def _flow_targets(first, second, guess, row, column):
     far = FAR_M * cameras.ray_directions(first.intrinsics, *first.gray.shape)
     moved = rigid.apply(rigid.inverse(guess), np.where(z > 0, first.points_camera, far))
     projected = cameras.project(moved, second.intrinsics)[0].astype(np.float32)
-    warped = cv2.remap(second.gray, projected[..., 0] - 0.5, projected[..., 1] - 0.5, cv2.INTER_LINEAR)
+    warped = cameras.sample_bilinear(second.gray, projected)
     clahe = cv2.createCLAHE(CLAHE_CLIP, CLAHE_TILES)
     start = np.zeros((*first.gray.shape, 2), np.float32)
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(

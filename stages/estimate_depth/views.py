@@ -88,7 +88,7 @@ def flow_matches(target: View, source: View) -> Matches:
     warped = warp(target, source)
     if warped.known.mean() < MIN_KNOWN:
         return Matches(np.zeros((0, 2)), np.zeros((0, 3)))
-    shown = cv2.remap(source.gray, warped.there[..., 0] - 0.5, warped.there[..., 1] - 0.5, cv2.INTER_LINEAR)
+    shown = cameras.sample_bilinear(source.gray, warped.there)
     shown = np.where(warped.known, shown, target.gray)
     dense = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow = dense.calc(shown, target.gray, np.zeros(0, np.float32))
