@@ -1,7 +1,7 @@
 """Pinhole cameras in OpenCV axes: x right, y down, z forward; pixel centres at +0.5; depth is z.
 
-This file owns the pixel-centre rule, the OpenGL flip and the quarter turns. Functions that take
-pixels or points work on NumPy arrays and on torch tensors alike.
+This file owns the pixel-centre rule, the OpenGL flip and the quarter turns. Projection works on NumPy arrays
+and on torch tensors alike, lookups in images on NumPy arrays.
 """
 
 from typing import TYPE_CHECKING, Any, TypeVar
