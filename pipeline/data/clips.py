@@ -12,6 +12,7 @@ from jaxtyping import Float, Int, UInt8
 
 from pipeline.data import images
 from pipeline.data.schema import FileSchema
+from pipeline.geometry import cameras
 
 FRAMES = FileSchema.of(
     "frames/frames.npz",
@@ -179,6 +180,15 @@ def usable_depth(
         low = cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), around)
         usable &= cv2.dilate(depth, around) - low < STEP_SHARE * depth
     return np.where(usable, depth, 0).astype(np.float32)
+
+
+def back_project_pixels(
+    clip: Clip, frame: int, pixel: Float[np.ndarray, "point 2"], depth: Float[np.ndarray, "height width"]
+) -> Float[np.ndarray, "point 3"]:
+    """Back-project colour pixels to the camera frame by the frame's ``depth``; NaN where there is none."""
+    z = cameras.sample_nearest(depth, pixel * np.divide(depth.shape, clip.color_size)[::-1])
+    points = cameras.unproject(pixel, clip.intrinsics[frame]) * z[:, None]
+    return np.where((z > 0)[:, None], points, np.nan)
 
 
 def read_source_index(frames: Path) -> Int[np.ndarray, "frame"]:

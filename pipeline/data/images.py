@@ -4,8 +4,7 @@ The only file that decodes OpenEXR and OpenCV images. Sizes are checked before p
 a few hundred bytes can ask for gigabytes.
 """
 
-import contextlib
-import errno
+import io
 import struct
 import zlib
 from pathlib import Path
@@ -23,14 +22,13 @@ SRGB_SLOPE, SRGB_OFFSET, SRGB_GAMMA, SRGB_KNEE = 12.92, 0.055, 2.4, 0.0031308
 """The transfer curve of sRGB (IEC 61966-2-1); the knee in linear intensity."""
 MAX_DEPTH_M = 1000.0
 """maximum plausible depth, metres"""
-MAX_EXR_HEADER_BYTES = 1 << 16
+MAX_EXR_BYTES = 4 * MAX_PIXELS + (1 << 16)
+"""limit for a depth picture's file: uncompressed floats and a header"""
 PNG_CHUNK_BYTES = 12
 """Length, type and checksum around a chunk's data."""
 STARTS_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """JPEG start of frame markers, which precede the size of the picture."""
 EXPORT_AGAIN = "export the recording again"
-_EXR_DEEP, _EXR_MULTIPART, _EXR_CHANNEL_BYTES, _EXR_ZIP_ROWS = 0x800, 0x1000, 16, 16
-"""flags of OpenEXR's version field, bytes after a channel's name, rows of a ZIP block"""
 
 
 def decode_color(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
@@ -95,27 +93,10 @@ def read_depth(path: Path, channel: str | None = "Z") -> Float[np.ndarray, "heig
 def write_depth(path: Path, depth: Float[np.ndarray, "height width"]) -> None:
     """Write z-depth in metres (0 = unknown) as one HALF channel ``Z``, ZIP compressed."""
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    stream = io.BytesIO()  # OpenEXR ignores a full disk when it closes a file
     with OpenEXR.File(header, {"Z": np.ascontiguousarray(depth, np.float16)}) as file:
-        with contextlib.suppress(RuntimeError):
-            file.write(str(path))
-    if not _is_complete(Path(path)):  # OpenEXR ignores a full disk when it closes the file
-        Path(path).write_bytes(bytes(max(depth.nbytes, MAX_EXR_HEADER_BYTES)))  # raises the actual disk error
-        raise OSError(errno.ENOSPC, "there is room again by now", str(path))
-
-
-def _is_complete(path: Path) -> bool:
-    """Return whether a ZIP-compressed scan-line EXR is complete up to its last block."""
-    with open(path, "rb") as file:
-        try:
-            attributes, table = _exr_attributes(file.read(MAX_EXR_HEADER_BYTES))
-            _, y0, _, y1 = struct.unpack("<4i", attributes["dataWindow"])
-            file.seek(table + 8 * ((y1 - y0) // _EXR_ZIP_ROWS))
-            (last,) = struct.unpack("<Q", file.read(8))
-            file.seek(last)
-            _, length = struct.unpack("<2i", file.read(8))
-        except (struct.error, ValueError, KeyError):
-            return False
-    return path.stat().st_size == last + 8 + length
+        file.write(stream)
+    Path(path).write_bytes(stream.getvalue())
 
 
 def decoded(data: bytes, flags: int) -> Shaped[np.ndarray, "height width *channel"] | None:
@@ -155,42 +136,17 @@ def _declared_pixels(data: bytes) -> int:
 def _check_exr_size(path: Path) -> None:
     """Check size and channels in the header before pixels are decoded."""
     try:
-        with open(path, "rb") as file:
-            head = file.read(MAX_EXR_HEADER_BYTES)
-        attributes, _ = _exr_attributes(head)
-        x0, y0, x1, y1 = struct.unpack("<4i", attributes["dataWindow"])
-        channels = _exr_channels(attributes["channels"])
-        good = x1 >= x0 and y1 >= y0 and (x1 - x0 + 1) * (y1 - y0 + 1) * channels <= MAX_PIXELS
-    except (OSError, struct.error, ValueError, KeyError):
+        if good := path.stat().st_size <= MAX_EXR_BYTES:
+            with OpenEXR.File(str(path), header_only=True) as file:
+                (part,) = file.parts
+                width, height = np.diff(np.array(part.header["dataWindow"], int), axis=0)[0].tolist()
+                pixels = (width + 1) * (height + 1) * len(part.header["channels"])
+                flat = part.type() in (OpenEXR.scanlineimage, OpenEXR.tiledimage)
+                good = flat and min(width, height) >= 0 and pixels <= MAX_PIXELS
+    except (OSError, RuntimeError, ValueError, KeyError):
         good = False
     if not good:
         raise InputError("CAP-022", "not an EXR picture of a sensible size", str(path), EXPORT_AGAIN)
-
-
-def _exr_attributes(head: bytes) -> tuple[dict[str, bytes], int]:
-    """Return a flat EXR's attributes by name, and its header's length. Raises ValueError for others."""
-    version = struct.unpack_from("<I", head, 4)[0] if head[:4] == b"\x76\x2f\x31\x01" else 0
-    if version & 0xFF != 2 or version & (_EXR_DEEP | _EXR_MULTIPART):
-        raise ValueError("no single flat picture")
-    attributes: dict[str, bytes] = {}
-    at = 8
-    while head[at : at + 1] != b"\0":
-        name, kind = head.index(b"\0", at), head.index(b"\0", head.index(b"\0", at) + 1)
-        size, start = struct.unpack_from("<I", head, kind + 1)[0], kind + 5
-        if start + size > len(head):
-            raise ValueError("the header is too long")
-        attributes.setdefault(head[at:name].decode("latin-1"), head[start : start + size])
-        at = start + size
-    return attributes, at + 1
-
-
-def _exr_channels(listed: bytes) -> int:
-    """Count the channels of a channel list: names followed by 16 bytes each, up to an empty one."""
-    count, at = 0, 0
-    while listed[at : at + 1] not in (b"\0", b""):
-        at = listed.index(b"\0", at) + 1 + _EXR_CHANNEL_BYTES
-        count += 1
-    return count
 
 
 def linear_from_srgb(srgb: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:

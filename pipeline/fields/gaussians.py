@@ -17,7 +17,7 @@ from torch.nn import functional
 from pipeline.data import gaussian_ply, npz
 from pipeline.fields import rasterize, skinning
 from pipeline.geometry import rigid_torch
-from pipeline.geometry.meshes import Mesh
+from pipeline.geometry.meshes import Mesh, area_normals
 
 BAND0 = 0.28209479177387814
 """value of the spherical harmonic of degree 0"""
@@ -113,7 +113,7 @@ def sample_surface(mesh: Mesh, number: int, rng: np.random.Generator) -> Surface
     """Sample a colored surface uniformly by area (stratified)."""
     assert mesh.color is not None, "the surface has no colors"
     triangle = mesh.vertices[mesh.faces].astype(np.float64)
-    normal = np.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
+    normal = area_normals(triangle)
     area = 0.5 * np.linalg.norm(normal, axis=-1)
     cdf = np.cumsum(area) / area.sum()
     face = np.searchsorted(cdf, (np.arange(number) + rng.random()) / number).clip(0, len(area) - 1)

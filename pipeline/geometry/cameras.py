@@ -1,13 +1,14 @@
 """Pinhole cameras in OpenCV axes: x right, y down, z forward; pixel centres at +0.5; depth is z.
 
-This file owns the pixel-centre rule, the OpenGL flip and the quarter turns. Functions that take
-pixels or points work on NumPy arrays and on torch tensors alike.
+This file owns the pixel-centre rule, the OpenGL flip and the quarter turns. Projection works on NumPy arrays
+and on torch tensors alike, lookups in images on NumPy arrays.
 """
 
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import cv2
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Int, Num, Shaped
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -20,8 +21,22 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 def pixel_grid(height: int, width: int) -> Float[np.ndarray, "height width 2"]:
     """Return the pixel centres (x, y) of an image."""
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    return np.stack([x, y], axis=-1)
+    return pixel_centres(*np.indices((height, width)))
+
+
+def pixel_centres(
+    row: Int[np.ndarray, "*batch"], column: Int[np.ndarray, "*batch"]
+) -> Float[np.ndarray, "*batch 2"]:
+    """Return the centres (x, y) of pixels given by row and column."""
+    return np.stack([column, row], axis=-1) + 0.5
+
+
+def pixel_index(
+    pixel: Float[np.ndarray, "*batch 2"],
+) -> tuple[Int[np.ndarray, "*batch"], Int[np.ndarray, "*batch"]]:
+    """Return row and column of the pixels that contain finite positions (x, y), also beyond an image."""
+    column, row = np.moveaxis(np.floor(pixel).astype(int), -1, 0)
+    return row, column
 
 
 def ray_directions(
@@ -61,17 +76,44 @@ def in_picture(pixel: Array, z: Array, size: tuple[int, int], nearest_m: float =
     return (z > nearest_m) & (x >= 0) & (y >= 0) & (x < size[1]) & (y < size[0])
 
 
-def read_depth(
+def sample_nearest(
+    image: Shaped[np.ndarray, "height width"], pixel: Float[np.ndarray, "*batch 2"]
+) -> Shaped[np.ndarray, "*batch"]:
+    """Return the values of an image at pixels (x, y) by nearest-neighbour lookup; 0 outside."""
+    inside = in_picture(pixel, np.ones(pixel.shape[:-1]), image.shape)
+    values = image[pixel_index(np.where(inside[..., None], pixel, 0))]
+    return np.where(inside, values, image.dtype.type(0))
+
+
+def sample_bilinear(
+    image: Num[np.ndarray, "height width *channel"], pixel: Float[np.ndarray, "rows columns 2"]
+) -> Num[np.ndarray, "rows columns *channel"]:
+    """Return the values of an image at pixels (x, y) by bilinear interpolation; 0 outside."""
+    x, y = np.moveaxis((pixel - 0.5).astype(np.float32), -1, 0)
+    return cv2.remap(np.ascontiguousarray(image), x, y, cv2.INTER_LINEAR)
+
+
+def lookup_depth(
+    depth: Float[np.ndarray, "height width"],
+    intrinsics: Float[np.ndarray, "3 3"],
+    points_camera: Float[np.ndarray, "*batch 3"],
+    nearest_m: float = 0.0,
+) -> Float[np.ndarray, "*batch"]:
+    """Return the depth (metres) measured where points project; 0 where it is unknown or the point is out of
+    view or not farther than ``nearest_m``. Points may also be rays, in the depth camera's axes."""
+    pixel, z = project(points_camera, intrinsics)
+    return np.where(z > nearest_m, sample_nearest(depth, pixel), 0)
+
+
+def back_project_pixels(
+    pixel: Float[np.ndarray, "*batch 2"],
+    intrinsics: Float[np.ndarray, "3 3"],
     depth: Float[np.ndarray, "depth_height depth_width"],
     depth_intrinsics: Float[np.ndarray, "3 3"],
-    rays: Float[np.ndarray, "*batch 3"],
-) -> Float[np.ndarray, "*batch"]:
-    """Return the depth (metres) that rays of the same camera centre and axes meet; 0 outside the image."""
-    pixel, _ = project(rays, depth_intrinsics)
-    column, row = np.moveaxis(np.floor(pixel).astype(int), -1, 0)
-    inside = (row >= 0) & (column >= 0) & (row < depth.shape[0]) & (column < depth.shape[1])
-    last_row, last_column = depth.shape[0] - 1, depth.shape[1] - 1
-    return np.where(inside, depth[np.clip(row, 0, last_row), np.clip(column, 0, last_column)], 0)
+) -> Float[np.ndarray, "*batch 3"]:
+    """Back-project pixels by a depth image of the same camera centre and axes; zero where it is unknown."""
+    ray = unproject(pixel, intrinsics)
+    return ray * lookup_depth(depth, depth_intrinsics, ray)[..., None]
 
 
 def scale_intrinsics(

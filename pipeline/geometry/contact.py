@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.geometry import cameras
-from pipeline.geometry.meshes import RayCaster
+from pipeline.geometry.meshes import RayCaster, area_normals
 
 LOWEST_SHARE = 0.03
 """Share of a mask's lowest pixels that is ignored as shadow or soft outline."""
@@ -46,7 +46,7 @@ def find(
     if hit.face[0] < 0:
         return None
     corner = caster.mesh.vertices[caster.mesh.faces[hit.face[0]]]
-    normal = np.cross(corner[1] - corner[0], corner[2] - corner[0])
+    normal = area_normals(corner)
     level = abs(normal[1]) > LEVEL_COSINE * max(float(np.linalg.norm(normal)), 1e-12)
     inside = rows.max() < mask.shape[0] - BORDER_PX
     return Contact(world_from_camera[:3, 3] + ray * hit.distance[0], bool(level and inside))
@@ -63,9 +63,7 @@ def depth_of(
     and where rays miss the body. Metres, world +y up."""
     rows, columns = np.nonzero(mask)
     eye = world_from_camera[:3, 3]
-    rays = (
-        cameras.unproject(np.stack([columns, rows], axis=1) + 0.5, intrinsics) @ world_from_camera[:3, :3].T
-    )
+    rays = cameras.unproject(cameras.pixel_centres(rows, columns), intrinsics) @ world_from_camera[:3, :3].T
     towards = (eye - point_world) * [1, 0, 1]
     towards /= max(float(np.linalg.norm(towards)), 1e-6)
     facing = rays @ towards

@@ -20,7 +20,7 @@ class Mesh:
 
     def face_areas(self) -> Float[np.ndarray, "face"]:
         """Return the area of each face, square metres."""
-        return np.linalg.norm(_doubled_areas(self.vertices[self.faces].astype(np.float64)), axis=-1) / 2
+        return np.linalg.norm(area_normals(self.vertices[self.faces].astype(np.float64)), axis=-1) / 2
 
     @property
     def area_m2(self) -> float:
@@ -29,21 +29,21 @@ class Mesh:
 
     def face_normals(self) -> Float[np.ndarray, "face 3"]:
         """Return unit normals; zero for degenerate faces."""
-        normal = _doubled_areas(self.vertices[self.faces])
+        normal = area_normals(self.vertices[self.faces])
         return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
 
     def vertex_normals(self) -> Float[np.ndarray, "vertex 3"]:
         """Return unit normals, the area-weighted mean of the faces around each vertex."""
-        area_normal = _doubled_areas(self.vertices[self.faces])
+        weighted = area_normals(self.vertices[self.faces])
         normal = np.zeros_like(self.vertices, dtype=np.float64)
         for index in range(3):
-            np.add.at(normal, self.faces[:, index], area_normal)
+            np.add.at(normal, self.faces[:, index], weighted)
         return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
 
 
-def _doubled_areas(corner: Float[np.ndarray, "face 3 3"]) -> Float[np.ndarray, "face 3"]:
-    """Return triangle normals with length twice the area."""
-    return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+def area_normals(corner: Float[np.ndarray, "*face 3 3"]) -> Float[np.ndarray, "*face 3"]:
+    """Return normals of triangles given by their corners, with length twice the area."""
+    return np.cross(corner[..., 1, :] - corner[..., 0, :], corner[..., 2, :] - corner[..., 0, :])
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import functional
 
-from pipeline.geometry.meshes import Mesh, RayCaster
+from pipeline.geometry.meshes import Mesh, RayCaster, area_normals
 
 R2_SEQUENCE = (0.7548776662466927, 0.5698402909980532)
 """1 / g and 1 / g^2 of the plastic number g: multiples of them, modulo 1, are even and repeatable"""
@@ -62,7 +62,7 @@ class SurfacePoints:
 def surface_points(mesh: Mesh, spacing_m: float) -> SurfacePoints:
     """Spread points over all faces, about one per square of ``spacing_m``, the same for the same mesh."""
     corner = np.asarray(mesh.vertices, np.float64)[mesh.faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = area_normals(corner)
     twice_area = np.linalg.norm(normal, axis=1)
     wanted = twice_area / 2 / spacing_m**2
     ends = np.floor(np.cumsum(wanted) + 0.5).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Even subsampling of frames and other sequences, and tests for short gaps in them."""
+"""Even subsampling of frames and other sequences, and the runs and short gaps in them."""
 
 import itertools
 
@@ -33,6 +33,11 @@ def farthest_points(
         distance = np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(1))
         chosen.append(int(distance.argmax()))
     return np.sort(np.array(chosen))
+
+
+def runs(good: Bool[np.ndarray, "frame"]) -> Int[np.ndarray, "run 2"]:
+    """Return start and end (exclusive) of each run of consecutive true values."""
+    return np.flatnonzero(np.diff(np.pad(good, 1).astype(np.int8))).reshape(-1, 2)
 
 
 def within_short_gaps(

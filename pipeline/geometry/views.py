@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
+from pipeline.geometry.subsampling import runs
 
 EXTENT, MARGIN_M = (0.002, 0.998), 0.2
 """quantiles of vertices that span a picture, without stray ones, and the margin around them"""
@@ -33,10 +34,8 @@ class Overview:
     ) -> None:
         """Draw a path into the picture; NaN points break it."""
         pixel = self.pixel(points_world)
-        known = np.isfinite(pixel).all(1)
-        starts = np.flatnonzero(np.diff(known.astype(int), prepend=0) == 1)
-        ends = np.flatnonzero(np.diff(known.astype(int), append=0) == -1) + 1
-        for start, end in zip(starts, ends, strict=True):
+        known = np.asarray(np.isfinite(pixel).all(1))
+        for start, end in runs(known):
             line = np.round(pixel[start:end] * 8).astype(np.int32)
             cv2.polylines(self.image, [line[:, None]], False, color, thickness, cv2.LINE_AA, shift=3)
 

@@ -189,11 +189,10 @@ def extract_patches(
     )
     cell = (pixel[:, ::-1] / sampling.stride_px).astype(int)
     pixel = pixel / scale + origin
-    points = _lift(pixel, depth, depth_intrinsics, intrinsics)
+    points = cameras.back_project_pixels(pixel, intrinsics, depth, depth_intrinsics)
     valid = points[:, 2] > MIN_DEPTH_M
     if mask is not None:
-        column, row = np.clip(pixel.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
-        valid &= mask[row, column] & (pixel >= 0).all(1) & (pixel < mask.shape[::-1]).all(1)
+        valid &= cameras.sample_nearest(mask, pixel)
     enough = valid.sum() >= MIN_PATCHES
     return Patches(descriptors[valid], points[valid], cell[valid]) if enough else None
 
@@ -203,8 +202,8 @@ def _crop(color, depth, depth_intrinsics, intrinsics, mask, sampling):
     row, column = np.nonzero(mask)
     if len(row) < MIN_MASK_PX:
         return None
-    sample = np.stack([column, row], 1)[:: max(1, len(row) // DEPTH_SAMPLES)] + 0.5
-    points = _lift(sample, depth, depth_intrinsics, intrinsics)
+    sample = cameras.pixel_centres(row, column)[:: max(1, len(row) // DEPTH_SAMPLES)]
+    points = cameras.back_project_pixels(sample, intrinsics, depth, depth_intrinsics)
     valid = points[:, 2] > MIN_DEPTH_M
     if valid.sum() < MIN_DEPTH_PX:
         return None
@@ -216,9 +215,3 @@ def _crop(color, depth, depth_intrinsics, intrinsics, mask, sampling):
     filled = np.where(mask[..., None], color, np.uint8(GREY))
     crop = cv2.warpAffine(filled, warp, size, flags=cv2.INTER_LINEAR, borderValue=(GREY, GREY, GREY))
     return crop, origin, scale
-
-
-def _lift(pixel, depth, depth_intrinsics, intrinsics):
-    """Back-project colour pixels to the camera frame by depth; z = 0 where unknown."""
-    ray = cameras.unproject(pixel, intrinsics)
-    return ray * cameras.read_depth(depth, depth_intrinsics, ray)[:, None]

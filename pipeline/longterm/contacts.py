@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from pipeline.geometry.signed_distance import SignedDistance
+from pipeline.geometry.subsampling import runs
 from pipeline.longterm.bodies import PosedSurface, SkinnedBody
 from pipeline.longterm.short_motions import RATE_HZ, BodyMotion
 
@@ -163,8 +164,7 @@ def _split_phases(
     stance: Bool[np.ndarray, "frame"], centres: Float[np.ndarray, "frame 3"]
 ) -> Iterator[range]:
     """Yield the frames of each stance phase, split where the foot slides too far."""
-    edges = np.flatnonzero(np.diff(np.pad(stance.astype(np.int8), 1)))
-    for start, end in zip(edges[::2], edges[1::2], strict=True):
+    for start, end in runs(stance):
         skate = np.linalg.norm(np.diff(centres[start:end], axis=0), axis=1).sum()
         count = max(1, min(int(np.ceil(skate / STRIDE_M)), (end - start) // SHORTEST_PHASE_FRAMES))
         cuts = np.linspace(start, end, count + 1).round().astype(int).tolist()

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from pipeline.behavior.trajectories import Trajectory
 from pipeline.geometry import rigid
+from pipeline.geometry.subsampling import runs
 
 RATE_HZ = 30
 STEPS = 60
@@ -105,9 +106,8 @@ def resample_motion(timestamp_s: Float[np.ndarray, "frame"], motion: BodyMotion)
 
 def stretches(trajectory: Trajectory) -> list[BodyMotion]:
     """Return the uninterrupted stretches of a trajectory that hold a whole short motion, at 30 fps."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], trajectory.valid, [False]]).astype(np.int8)))
     found = []
-    for start, end in zip(edges[::2], edges[1::2], strict=True):
+    for start, end in runs(trajectory.valid):
         when = trajectory.timestamp_s[start:end]
         if len(when) > 2 and when[-1] - when[0] >= STEPS / RATE_HZ - 1e-6:
             motion = BodyMotion(trajectory.world_from_agent[start:end], trajectory.agent_from_bone[start:end])

@@ -184,20 +184,19 @@ def correlation(first: PosedPicture, second: PosedPicture, reading: Reading) -> 
     grid = np.mgrid[step // 2 : depth_size[0] : step, step // 2 : depth_size[1] : step]
     row, column = grid.reshape(2, -1)
     row, column = row[depth[row, column] > 0], column[depth[row, column] > 0]
-    centre = np.stack([column + 0.5, row + 0.5], axis=-1)
+    centre = cameras.pixel_centres(row, column)
     rays = cameras.unproject(centre, _intrinsics(first.depth_intrinsics, depth_size, reading))
     points = rigid.apply(_second_from_first(first, second, reading), rays * depth[row, column, None])
     pixel, z = cameras.project(points, _intrinsics(second.intrinsics, size, reading))
     inside = (z > NEAREST_M) & (pixel >= 1).all(-1) & (pixel < np.array(size[::-1]) - 1).all(-1)
     pixel, z, centre = pixel[inside], z[inside], centre[inside]
-    at = np.floor(pixel * np.array(depth_size[::-1]) / size[::-1]).astype(int)
-    measured = seen_depth[at[:, 1], at[:, 0]]
+    measured = seen_depth[cameras.pixel_index(pixel * np.array(depth_size[::-1]) / size[::-1])]
     shown = (measured == 0) | (z < measured * (1 + OCCLUDED_SHARE) + OCCLUDED_M)
     if shown.sum() < MIN_POINTS:
         return np.nan
     own = centre[shown] * np.array(size[::-1]) / depth_size[::-1]
-    values = [_sampled(gray, at) for gray, at in zip(grays, (own, pixel[shown]), strict=True)]
-    return correlated(*values)
+    pairs = zip(grays, (own, pixel[shown]), strict=True)
+    return correlated(*(cameras.sample_bilinear(gray, at[:, None])[:, 0] for gray, at in pairs))
 
 
 def _depth(picture: PosedPicture, reading: Reading) -> Float[np.ndarray, "height width"]:
@@ -221,14 +220,6 @@ def _second_from_first(
     world_from_first, world_from_second = poses
     turn = rigid.rotation_from_vector(np.radians([*reading.turn_deg, 0.0]))
     return rigid.make(turn, np.zeros(3)) @ rigid.inverse(world_from_second) @ world_from_first
-
-
-def _sampled(
-    picture: Float[np.ndarray, "height width"], pixel: Float[np.ndarray, "point 2"]
-) -> Float[np.ndarray, "point"]:
-    """Interpolate a picture at pixels whose centres lie at +0.5."""
-    x, y = (pixel - 0.5).astype(np.float32).T
-    return cv2.remap(np.ascontiguousarray(picture), x[:, None], y[:, None], cv2.INTER_LINEAR)[:, 0]
 
 
 def correlated(first: Float[np.ndarray, "point"], second: Float[np.ndarray, "point"]) -> float:

@@ -200,9 +200,7 @@ def agreement(
     count = np.zeros(depth.size, np.uint8)
     for other_depth, other in others:
         points_other = rigid.apply(rigid.inverse(other.world_from_camera), points_world)
-        pixel, z = cameras.project(points_other, other.intrinsics)
-        inside = np.flatnonzero((depth.ravel() > 0) & cameras.in_picture(pixel, z, other_depth.shape))
-        column, row = np.floor(pixel[inside]).astype(int).T
-        measured = other_depth[row, column]
-        count[inside] += (measured > 0) & (np.abs(measured - z[inside]) < MAX_RELATIVE_ERROR * z[inside])
-    return count.reshape(depth.shape)
+        measured = cameras.lookup_depth(other_depth, other.intrinsics, points_other)
+        off = np.abs(measured - points_other[:, 2])
+        count += (measured > 0) & (off < MAX_RELATIVE_ERROR * points_other[:, 2])
+    return np.where(depth > 0, count.reshape(depth.shape), np.uint8(0))

@@ -56,9 +56,9 @@ def lift(
     depth_intrinsics: Float[np.ndarray, "3 3"],
 ) -> SiftPoints:
     """Back-project the keypoints that have depth (metres) to the camera frame."""
-    ray = cameras.unproject(keypoints.pixel, intrinsics)
-    z = cameras.read_depth(depth, depth_intrinsics, ray)
-    return SiftPoints(keypoints.descriptors[z > 0], (ray * z[:, None])[z > 0])
+    points = cameras.back_project_pixels(keypoints.pixel, intrinsics, depth, depth_intrinsics)
+    known = points[:, 2] > 0
+    return SiftPoints(keypoints.descriptors[known], points[known])
 
 
 def matches(

@@ -77,10 +77,9 @@ def prepare_frame(
     size = (round(color.shape[0] * scale), round(color.shape[1] * scale))
     gray = cv2.resize(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), size[::-1], interpolation=cv2.INTER_AREA)
     scaled = cameras.scale_intrinsics(intrinsics, color.shape[:2], size)
-    rays = cameras.ray_directions(scaled, *size)
-    z = cameras.read_depth(depth, depth_intrinsics, rays)
+    points = cameras.back_project_pixels(cameras.pixel_grid(*size), scaled, depth, depth_intrinsics)
     keep = cv2.resize(usable.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST) > 0
-    return FlowFrame(gray, rays * np.where(keep, z, 0)[..., None], scaled)
+    return FlowFrame(gray, points * keep[..., None], scaled)
 
 
 def relative_motion(
@@ -136,7 +135,7 @@ def _flow_targets(first, second, guess, row, column):
     far = FAR_M * cameras.ray_directions(first.intrinsics, *first.gray.shape)
     moved = rigid.apply(rigid.inverse(guess), np.where(z > 0, first.points_camera, far))
     projected = cameras.project(moved, second.intrinsics)[0].astype(np.float32)
-    warped = cv2.remap(second.gray, projected[..., 0] - 0.5, projected[..., 1] - 0.5, cv2.INTER_LINEAR)
+    warped = cameras.sample_bilinear(second.gray, projected)
     clahe = cv2.createCLAHE(CLAHE_CLIP, CLAHE_TILES)
     start = np.zeros((*first.gray.shape, 2), np.float32)
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(

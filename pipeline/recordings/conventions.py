@@ -194,12 +194,9 @@ def compare(
     stride = max(STRIDE_PX, max(first.depth.shape) // POINTS_A_SIDE)
     every = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     points_first = cameras.back_project(first.depth, first.intrinsics)[every][first.depth[every] > 0]
-    pixel, depth = cameras.project(rigid.apply(second_from_first, points_first), second.intrinsics)
-    height, width = second.depth.shape
-    inside = (depth > NEAREST_M) & (pixel >= 0).all(-1) & (pixel[:, 0] < width) & (pixel[:, 1] < height)
-    column, row = np.floor(pixel[inside]).astype(int).T
-    measured = second.depth[row, column]
-    difference = np.abs(depth[inside] - measured)[measured > 0]
+    points_second = rigid.apply(second_from_first, points_first)
+    measured = cameras.lookup_depth(second.depth, second.intrinsics, points_second, NEAREST_M)
+    difference = np.abs(points_second[:, 2] - measured)[measured > 0]
     if len(difference) < MIN_COMPARED:
         return np.inf, 0.0, TOLERANCE_M
     typical_m = float(np.median(measured[measured > 0]))

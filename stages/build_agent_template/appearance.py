@@ -37,9 +37,7 @@ def visibility(
         rendered, _ = render_view(caster, pose, cameras.scale_intrinsics(k, size, coarse), *coarse)
         pixel, depth = cameras.project(rigid.apply(rigid.inverse(pose), vertices), k)
         at = pixel * [coarse[1] / size[1], coarse[0] / size[0]]
-        inside = cameras.in_picture(at, depth, coarse, NEAREST_M)
-        column, row = np.floor(np.where(inside[:, None], at, 0)).astype(int).T
-        seen = inside & (np.abs(rendered[row, column] - depth) < tolerance_m)
+        seen = (depth > NEAREST_M) & (np.abs(cameras.sample_nearest(rendered, at) - depth) < tolerance_m)
         toward = pose[:3, 3] - vertices
         facing = (normals * toward).sum(1) / np.linalg.norm(toward, axis=1)
         weights.append(np.where(seen, np.clip(facing, 0, 1) ** 2, 0))
@@ -51,9 +49,7 @@ def on_mask(
     pixel: Float[np.ndarray, "vertex 2"], labels: UInt8[np.ndarray, "height width"]
 ) -> Bool[np.ndarray, "vertex"]:
     """Return which vertices project onto the mask (255); a moved limb shows the background instead."""
-    inside = cameras.in_picture(pixel, np.ones(len(pixel)), labels.shape)
-    column, row = np.floor(np.where(inside[:, None], pixel, 0)).astype(int).T
-    return inside & (labels[row, column] == 255)
+    return cameras.sample_nearest(labels, pixel) == 255
 
 
 def average_views(

@@ -14,7 +14,7 @@ from pipeline.geometry import align, cameras, ground, rigid
 from pipeline.mapping.bundle_adjustment import MAD_TO_SIGMA
 from pipeline.mapping.colmap import SparseModel
 from stages.build_scene_template.refine import Keyframe
-from stages.build_scene_template.sfm import lift_pixels
+from stages.build_scene_template.sfm import back_project
 
 MIN_REGISTERED = 0.6
 """Least share of the keyframes in the largest model; with less, odometry is more complete."""
@@ -54,7 +54,7 @@ def metric_scale(sparse: SparseModel, clip: Clip) -> tuple[float, float] | None:
     ratios = []
     for view, frame in enumerate(sparse.frame):
         row = np.flatnonzero(sparse.observed_key == view)
-        measured = lift_pixels(clip, int(frame), sparse.observed_pixel[row])[:, 2]
+        measured = back_project(clip, int(frame), sparse.observed_pixel[row])[:, 2]
         camera_from_model = rigid.inverse(sparse.model_from_camera[view])
         model = rigid.apply(camera_from_model, sparse.points_model[sparse.observed_point[row]])[:, 2]
         ratios.append((measured / model)[np.isfinite(measured) & (model > 0)])
@@ -73,11 +73,8 @@ def depth_gap(keyframes: list[Keyframe], world_from_camera: Float[np.ndarray, "k
             target = keyframes[first + hop]
             target_from_first = rigid.inverse(world_from_camera[first + hop]) @ world_from_camera[first]
             moved = rigid.apply(target_from_first, keyframes[first].scan.points_camera)
-            pixel, z = cameras.project(moved, target.intrinsics)
-            inside = cameras.in_picture(pixel, z, target.depth.shape, MIN_DEPTH_M)
-            column, row = np.floor(pixel[inside]).astype(int).T
-            measured = target.depth[row, column]
-            gap = np.abs(measured - z[inside])[measured > 0]
+            measured = cameras.lookup_depth(target.depth, target.intrinsics, moved, MIN_DEPTH_M)
+            gap = np.abs(measured - moved[:, 2])[measured > 0]
             gaps.append(np.quantile(gap, GAP_QUANTILE) if len(gap) > MIN_OVERLAP else np.nan)
     return float(np.nanmean(gaps)) if np.isfinite(gaps).any() else np.inf
 

@@ -134,12 +134,10 @@ def vertex_features(
     for frame in subsampling.evenly(len(clip), frames):
         local = rigid.apply(rigid.inverse(world_from_camera[frame]), mesh.vertices.astype(float))
         pixel, z = cameras.project(local, clip.intrinsics[frame])
-        inside = np.flatnonzero(cameras.in_picture(pixel, z, clip.color_size, MIN_DEPTH_M))
-        depth, size = clip.depth(int(frame)), clip.color_size[::-1]
-        scale = np.array(depth.shape[::-1]) / size
-        column, row = np.minimum((pixel[inside] * scale).astype(int), np.array(depth.shape[::-1]) - 1).T
-        inside = inside[np.abs(depth[row, column] - z[inside]) < SEEN_WITHIN_M]
-        cells = np.array(features.shape[2:0:-1])
-        column, row = np.minimum(pixel[inside] * cells / size, cells - 1).astype(int).T
+        depth, size = clip.depth(int(frame)), clip.color_size
+        measured = cameras.sample_nearest(depth, pixel * np.divide(depth.shape, size)[::-1])
+        inside = cameras.in_picture(pixel, z, size, MIN_DEPTH_M) & (np.abs(measured - z) < SEEN_WITHIN_M)
+        inside, cells = np.flatnonzero(inside), np.array(features.shape[2:0:-1])
+        column, row = np.minimum(pixel[inside] * cells / size[::-1], cells - 1).astype(int).T
         total[inside] += np.asarray(features[frame][row, column], float) / z[inside, None]
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)

@@ -93,14 +93,11 @@ def seen_and_colored(
     for frame in subsampling.evenly(len(clip), COLOR_VIEWS):
         local = rigid.apply(rigid.inverse(world_from_camera[frame]), mesh.vertices.astype(float))
         depth, color = clip.depth(int(frame)), clip.color(int(frame))
-        in_depth, z = cameras.project(local, clip.depth_intrinsics[frame])
-        in_color, _ = cameras.project(local, clip.intrinsics[frame])
-        inside = cameras.in_picture(in_depth, z, depth.shape, MIN_DEPTH_M)
-        inside = np.flatnonzero(inside & cameras.in_picture(in_color, z, color.shape[:2]))
-        column, row = np.floor(in_depth[inside]).astype(int).T
-        inside = inside[np.abs(depth[row, column] - z[inside]) < SEEN_WITHIN_M]
-        column, row = np.floor(in_color[inside]).astype(int).T
-        total[inside] += color[row, column] / z[inside, None]
+        measured = cameras.lookup_depth(depth, clip.depth_intrinsics[frame], local)
+        pixel, z = cameras.project(local, clip.intrinsics[frame])
+        inside = cameras.in_picture(pixel, z, color.shape[:2], MIN_DEPTH_M)
+        inside = np.flatnonzero(inside & (np.abs(measured - z) < SEEN_WITHIN_M))
+        total[inside] += color[cameras.pixel_index(pixel[inside])] / z[inside, None]
         weight[inside] += 1 / z[inside]
     mean = total / np.maximum(weight, 1e-9)[:, None]
     return weight > 0, np.where(weight[:, None] > 0, mean.round(), 128).astype(np.uint8)

@@ -75,9 +75,9 @@ def _pair_correspondences(keyframes, first, second, world_from_camera, reach_m):
     moved = rigid.apply(second_from_first, source.points_camera)
     pixel, z = cameras.project(moved, target.intrinsics)
     inside = np.flatnonzero(cameras.in_picture(pixel, z, target.depth.shape, MIN_DEPTH_M))
-    column, row = np.floor(pixel[inside]).astype(int).T
-    hit = cameras.unproject(pixel[inside], target.intrinsics) * target.depth[row, column, None]
-    normal = target.normals[row, column]
+    at = cameras.pixel_index(pixel[inside])
+    hit = cameras.unproject(pixel[inside], target.intrinsics) * target.depth[at][:, None]
+    normal = target.normals[at]
     gap = np.abs(np.einsum("ci,ci->c", moved[inside] - hit, normal))
     own = keyframes[first].normals.reshape(-1, 3)[source.pixel_index[inside]] @ second_from_first[:3, :3].T
     good = (np.einsum("ci,ci->c", own, normal) > MIN_COSINE) & (gap < CANDIDATE_RATIO * reach_m)

@@ -12,8 +12,8 @@ import pycolmap
 from jaxtyping import Float, Int, Num
 
 from pipeline.core.progress import log
-from pipeline.data.clips import Clip
-from pipeline.geometry import align, cameras, rigid, subsampling
+from pipeline.data.clips import Clip, back_project_pixels, usable_depth
+from pipeline.geometry import align, rigid, subsampling
 from pipeline.mapping import colmap
 from pipeline.mapping.bundle_adjustment import TrackedPoints, build_tracks
 from pipeline.mapping.colmap import SparseModel, read_sparse_model
@@ -99,17 +99,11 @@ def reconstruct(clip: Clip, config: SfmConfig, workspace: Path, seed: int) -> Sp
     return read_sparse_model(largest) if largest.num_reg_images() >= MIN_KEYFRAMES else None
 
 
-def lift_pixels(
+def back_project(
     clip: Clip, frame: int, pixel: Float[np.ndarray, "sample 2"]
 ) -> Float[np.ndarray, "sample 3"]:
     """Back-project colour pixels to the camera frame; NaN where depth is unknown or of low confidence."""
-    depth, confidence = clip.depth(frame), clip.confidence(frame)
-    limit = np.array(clip.depth_size[::-1])
-    depth_pixel = np.floor(pixel * limit / np.array(clip.color_size[::-1])).astype(int)
-    column, row = np.clip(depth_pixel, 0, limit - 1).T
-    z = np.where(confidence[row, column] >= 1, depth[row, column], 0)
-    points = cameras.unproject(pixel, clip.intrinsics[frame]) * z[:, None]
-    return np.where((z > MIN_DEPTH_M)[:, None], points, np.nan)
+    return back_project_pixels(clip, frame, pixel, usable_depth(clip, frame, nearest_m=MIN_DEPTH_M))
 
 
 def verify_matches(clip: Clip, database: Path, rng: np.random.Generator) -> tuple[int, int]:
@@ -117,7 +111,7 @@ def verify_matches(clip: Clip, database: Path, rng: np.random.Generator) -> tupl
     with pycolmap.Database.open(database) as table:
         frames = {image.image_id: int(image.name[:6]) for image in table.read_all_images()}
         points = {
-            key: lift_pixels(clip, frame, table.read_keypoints(key)[:, :2].astype(float))
+            key: back_project(clip, frame, table.read_keypoints(key)[:, :2].astype(float))
             for key, frame in frames.items()
         }
         pairs = sorted(pycolmap.pair_id_to_image_pair(pair) for pair in table.read_two_view_geometries()[0])
@@ -144,7 +138,7 @@ def tracked_points(clip: Clip, database: Path, keyframes: Int[np.ndarray, "key"]
     index_of = {image.image_id: index for index, image in enumerate(images)}
     links = [(index_of[a], index_of[b], found) for (a, b), found in matches.items()]
     depths = [
-        lift_pixels(clip, int(frame), pixel)[:, 2] for frame, pixel in zip(keyframes, pixels, strict=True)
+        back_project(clip, int(frame), pixel)[:, 2] for frame, pixel in zip(keyframes, pixels, strict=True)
     ]
     return build_tracks(pixels, depths, clip.intrinsics[keyframes], np.zeros(len(pixels), int), links)
 

@@ -49,25 +49,20 @@ def _moved(shot: SampledFrame, others: Sequence[SampledFrame]) -> Bool[np.ndarra
     free, occupied = np.zeros(len(points), int), np.zeros(len(points), int)
     for other in (each for each in others if each is not shot):
         points_other = rigid.apply(other.camera_from_odometry, points)
-        pixel, depth = cameras.project(points_other, other.depth_intrinsics)
-        height, width = other.depth.shape
-        inside = (depth > 0.1) & (pixel >= 1).all(-1) & (pixel[:, 0] < width - 1) & (pixel[:, 1] < height - 1)
-        column, row = np.floor(pixel[inside]).astype(int).T
-        low, high = _range_around(other.depth)
-        margin = MARGIN_M + MARGIN_SHARE * depth[inside]
-        measured = low[row, column]
-        beyond = measured > depth[inside] + margin
-        before = high[row, column] <= depth[inside] - margin
-        free[inside] += beyond & (measured > 0)
-        occupied[inside] += ~before & (measured < depth[inside] + margin) & (measured > 0)
+        pixel, z = cameras.project(points_other, other.depth_intrinsics)
+        low, high = (cameras.sample_nearest(each, pixel) for each in _range_around(other.depth))
+        known, margin = (low > 0) & (z > 0.1), MARGIN_M + MARGIN_SHARE * z
+        free += known & (low > z + margin)
+        occupied += known & (low < z + margin) & (high > z - margin)
     marked = ((free >= VOTES) & (free > occupied)).reshape(shot.depth.shape) & (shot.depth > 0)
     return cv2.morphologyEx(marked.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
 
 
 def _range_around(depth: Float[np.ndarray, "height width"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the minimum and maximum depth in 3 x 3 pixels; an unknown pixel makes the minimum 0."""
+    """Return the range of depth in 3 x 3 pixels; the minimum is 0 beside unknown pixels and the border."""
     ones = np.ones((3, 3), np.uint8)
-    return cv2.erode(depth, ones), cv2.dilate(depth, ones)
+    low = cv2.erode(depth, ones, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return low, cv2.dilate(depth, ones)
 
 
 def _clusters(shot: SampledFrame, marked: Bool[np.ndarray, "height width"]) -> list[Float[np.ndarray, "3"]]:

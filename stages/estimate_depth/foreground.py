@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from pipeline.geometry import cameras
 from stages.estimate_depth import views
 from stages.estimate_depth.views import View
 
@@ -50,7 +51,7 @@ def difference(
 ) -> tuple[Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
     """Return the colour difference to a source, beyond the slack, and where the source sees the surface."""
     warped = views.warp(target.view, source.view)
-    shown = cv2.remap(source.lab, warped.there[..., 0] - 0.5, warped.there[..., 1] - 0.5, cv2.INTER_LINEAR)
+    shown = cameras.sample_bilinear(source.lab, warped.there)
     known = warped.known
     if known.sum() < MIN_SEEN:
         return np.zeros(known.shape, np.float32), np.zeros(known.shape, bool)

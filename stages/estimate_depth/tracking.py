@@ -168,15 +168,14 @@ def walk_views(target: View, room: MapViews) -> list[View]:
     rows, columns = np.nonzero(target.depth > 0)
     chosen = np.linspace(0, len(rows) - 1, PROBES).astype(int) if len(rows) else np.zeros(0, int)
     z = target.depth[rows[chosen], columns[chosen]]
-    pixel = np.stack([columns, rows], axis=1)[chosen] + 0.5
+    pixel = cameras.pixel_centres(rows, columns)[chosen]
     points = rigid.apply(target.world_from_camera, cameras.unproject(pixel, target.intrinsics) * z[:, None])
     scores = np.zeros(len(room.walk))
     for number, each in enumerate(room.walk):
         points_camera = rigid.apply(rigid.inverse(each.world_from_camera), points)
         there, theirs = cameras.project(points_camera, each.intrinsics)
-        at = np.floor(there).astype(int)
-        inside = (theirs > 0.1) & ((at >= 0) & (at < each.gray.shape[::-1])).all(1)
-        seen = each.depth[at[inside, 1], at[inside, 0]]
+        inside = cameras.in_picture(there, theirs, each.gray.shape, 0.1)
+        seen = each.depth[cameras.pixel_index(there[inside])]
         same = np.abs(seen - theirs[inside]) < views.OCCLUDED_M + views.OCCLUDED_SHARE * theirs[inside]
         scale = theirs[inside] / each.intrinsics[0, 0] / (z[inside] / target.intrinsics[0, 0])
         scores[number] = (same * np.minimum(scale, 1 / np.maximum(scale, 1e-6))).sum()

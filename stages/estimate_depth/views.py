@@ -88,13 +88,13 @@ def flow_matches(target: View, source: View) -> Matches:
     warped = warp(target, source)
     if warped.known.mean() < MIN_KNOWN:
         return Matches(np.zeros((0, 2)), np.zeros((0, 3)))
-    shown = cv2.remap(source.gray, warped.there[..., 0] - 0.5, warped.there[..., 1] - 0.5, cv2.INTER_LINEAR)
+    shown = cameras.sample_bilinear(source.gray, warped.there)
     shown = np.where(warped.known, shown, target.gray)
     dense = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow = dense.calc(shown, target.gray, np.zeros(0, np.float32))
     inner = tuple(slice(MARGIN_PX, side - MARGIN_PX, STRIDE_PX) for side in shown.shape)
     rows, columns = np.mgrid[inner].reshape(2, -1)
-    start, moved = np.stack([columns, rows], axis=-1) + 0.5, flow[rows, columns]
+    start, moved = cameras.pixel_centres(rows, columns), flow[rows, columns]
     good = warped.known[rows, columns] & (np.abs(moved).max(1) < MAX_FLOW_PX)
     rays = cameras.unproject(start[good], target.intrinsics) * target.depth[rows, columns][good, None]
     return Matches(start[good] + moved[good], rigid.apply(target.world_from_camera, rays))

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.data.glb import Action
 from pipeline.geometry import rigid
+from pipeline.geometry.subsampling import runs
 
 
 @dataclass(frozen=True)
@@ -24,12 +25,7 @@ class SessionClip:
 
 def longest_run(valid: Bool[np.ndarray, " frame"]) -> slice:
     """Return the longest stretch of true frames (the first of equals; empty when there is none)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], valid, [False]]).astype(np.int8)))
-    starts, ends = edges[::2], edges[1::2]
-    if len(starts) == 0:
-        return slice(0, 0)
-    longest = int(np.argmax(ends - starts))
-    return slice(int(starts[longest]), int(ends[longest]))
+    return slice(*max(runs(valid).tolist(), key=lambda run: run[1] - run[0], default=(0, 0)))
 
 
 def cut(motion: SessionClip, frames: slice) -> SessionClip:

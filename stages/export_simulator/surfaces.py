@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from pipeline.geometry.meshes import Mesh
+from pipeline.geometry.meshes import Mesh, area_normals
 
 _SPLAT_ROW = np.dtype(
     [("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
@@ -36,7 +36,8 @@ def extent(mesh: Mesh, agent_positions_world: Float[np.ndarray, "frame 3"]) -> R
 
 def floor_height_m(mesh: Mesh, agent_positions_world: Float[np.ndarray, "frame 3"]) -> float:
     """Find the height of the floor: the lowest level with a fair share of the upward area below the agent."""
-    corners, normals = _corners_normals(mesh)
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    normals = area_normals(corners)
     area = np.linalg.norm(normals, axis=1)
     height = corners[..., 1].mean(1)
     level = (normals[:, 1] > _UPRIGHT * area) & (height < np.median(agent_positions_world[:, 1]))
@@ -51,17 +52,12 @@ def floor_height_m(mesh: Mesh, agent_positions_world: Float[np.ndarray, "frame 3
 
 def orient_towards(mesh: Mesh, inside: Float[np.ndarray, "3"]) -> Mesh:
     """Turn all faces so that most of the area faces a point inside: walls then vanish from behind."""
-    corners, normals = _corners_normals(mesh)
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    normals = area_normals(corners)
     towards = np.einsum("fi,fi->f", normals, inside - corners.mean(1))
     if np.linalg.norm(normals, axis=1) @ np.sign(towards) >= 0:
         return mesh
     return Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]), mesh.color)
-
-
-def _corners_normals(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of each face, and its normal with length twice the area."""
-    corners = mesh.vertices[mesh.faces].astype(np.float64)
-    return corners, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 @dataclass(frozen=True)

@@ -164,7 +164,7 @@ class TemplateSurface:
     ) -> "TemplateSurface":
         """Sample a mesh; distances are to the nearest of many surface samples, signed by their normals."""
         corner = mesh.vertices[mesh.faces].astype(np.float64)
-        area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=-1)
+        area = mesh.face_areas()
         face = rng.choice(len(mesh.faces), 8 * ON_SURFACE, p=area / area.sum())
         barycentric = rng.dirichlet(np.ones(3), len(face))
         points = np.einsum("pk,pkd->pd", barycentric, corner[face])

@@ -349,7 +349,7 @@ def _outside_share(observation, model, world_from_agent):
     facing = (normals * points).sum(-1) < 0
     pixel, z = cameras.project(points, observation.intrinsics)
     height, width = observation.mask.shape
-    inside = (pixel >= 0).all(-1) & (pixel[..., 0] < width) & (pixel[..., 1] < height) & (z > MIN_DEPTH_M)
+    inside = cameras.in_picture(pixel, z, (height, width), MIN_DEPTH_M)
     column = np.clip(pixel[..., 0], 0, width - 1).astype(int)
     row = np.clip(pixel[..., 1], 0, height - 1).astype(int)
     scale = np.array(observation.depth.shape) / (height, width)

@@ -55,7 +55,7 @@ def feature_correspondences(
     norm = np.linalg.norm(rendered, axis=-1, keepdims=True)
     rendered = rendered / np.maximum(norm, MIN_NORM)
     rays = cameras.ray_directions(intrinsics, rows, columns)
-    measured = cameras.read_depth(clip.depth(frame), clip.depth_intrinsics[frame], rays)
+    measured = cameras.lookup_depth(clip.depth(frame), clip.depth_intrinsics[frame], rays)
     free = cv2.erode((masks[frame] == 0).astype(np.uint8), np.ones((2 * STRIDE_PX + 1,) * 2, np.uint8))
     corner = STRIDE_PX // 2
     free = free[corner::STRIDE_PX, corner::STRIDE_PX][:rows, :columns] > 0

@@ -39,10 +39,11 @@ def flow_correspondences(
     )
     inner = tuple(slice(MARGIN_PX, size - MARGIN_PX, STRIDE_PX) for size in known.shape)
     rows, columns = np.mgrid[inner].reshape(2, -1)
-    start = np.stack([columns, rows], axis=-1) + 0.5
-    ray = cameras.unproject(start + flow[rows, columns], intrinsics)
-    z = cameras.read_depth(clip.depth(frame), clip.depth_intrinsics[frame], ray)
-    template_z = pair.depth[rows, columns]
+    start = cameras.pixel_centres(rows, columns)
+    points_camera = cameras.back_project_pixels(
+        start + flow[rows, columns], intrinsics, clip.depth(frame), clip.depth_intrinsics[frame]
+    )
+    z, template_z = points_camera[:, 2], pair.depth[rows, columns]
     good = (
         known[rows, columns]
         & (z > 0)
@@ -55,12 +56,11 @@ def flow_correspondences(
     points_map = rigid.apply(
         world_from_camera, cameras.unproject(start[good], intrinsics) * template_z[good, None]
     )
-    points_camera = ray[good] * z[good, None]
     count, sigma = int(good.sum()), SIGMA_PX / intrinsics[0, 0] * z[good]
     first, second = np.full(count, frame), np.full(count, MAP)
     axes = [np.broadcast_to(world_from_camera[:3, i], (count, 3)) for i in (0, 1)]
     return Correspondences.join(
-        *(Correspondences(first, second, points_camera, points_map, axis, sigma) for axis in axes)
+        *(Correspondences(first, second, points_camera[good], points_map, axis, sigma) for axis in axes)
     )
 
 

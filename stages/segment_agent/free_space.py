@@ -152,13 +152,11 @@ def measure_noise(
         inner = cv2.erode((depth[first] > 0).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         chosen = np.flatnonzero(inner)[:: max(1, int(inner.sum()) // probes)]
         rows, columns = np.unravel_index(chosen, inner.shape)
-        pixel = np.stack([columns, rows], axis=1) + 0.5
-        points = cameras.unproject(pixel, intrinsics[first]) * depth[first][rows, columns][:, None]
+        rays = cameras.unproject(cameras.pixel_centres(rows, columns), intrinsics[first])
+        points = rays * depth[first][rows, columns][:, None]
         relative = camera_from_world[second] @ rigid.inverse(camera_from_world[first])
-        at, z = cameras.project(rigid.apply(relative, points), intrinsics[second])
-        inside = cameras.in_picture(at, z, inner.shape, NEAREST_M)
-        (column, row), z = at[inside].astype(int).T, z[inside]
-        measured = depth[second][row, column]
+        points = rigid.apply(relative, points)
+        measured, z = cameras.lookup_depth(depth[second], intrinsics[second], points, NEAREST_M), points[:, 2]
         near = (measured > 0) & (np.abs(measured - z) < MAX_NOISE_M)
         ranges.append(z[near])
         errors.append(np.abs(measured - z)[near])

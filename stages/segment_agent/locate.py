@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from pipeline.data.clips import Clip
+from pipeline.geometry import cameras
 from stages.segment_agent import free_space, identity, movers
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.free_space import References, Votes
@@ -100,7 +101,7 @@ def _candidates(
     whole = free_space.interior_depth(clip, frame) if appearance is None else supported_depth(clip, frame)
     points, area, chosen = free_space.sample(clip, frame, world_from_camera, whole, wanted_px)
     if appearance is not None:
-        log_ratio = sample_nearest(appearance(frame), clip.depth_size, chosen)
+        log_ratio = resample_nearest(appearance(frame), clip.depth_size, chosen)
         area = np.where(log_ratio > -movers.CLEAR_MOTION, area, 0)
         points[area == 0] = np.nan
     votes = free_space.vote(references, points, frame)
@@ -108,7 +109,7 @@ def _candidates(
         moving = opened_motion(votes, share)
         if margin_of is None:
             return movers.candidates(moving, np.ones(area.shape), points, area, animal)
-        margins = sample_nearest(margin_of(frame), clip.depth_size, chosen)
+        margins = resample_nearest(margin_of(frame), clip.depth_size, chosen)
         own, probability = identity.select_animal(moving, margins)
         return movers.candidates(own, probability, points, area, animal)
     motion = movers.motion_log_odds(votes)
@@ -116,7 +117,7 @@ def _candidates(
     limited = np.clip(log_ratio, -movers.APPEARANCE_LIMIT, movers.APPEARANCE_LIMIT)
     both = limited + motion - movers.STATIC_PENALTY * static
     if margin_of is not None:
-        both += np.minimum(sample_nearest(margin_of(frame), clip.depth_size, chosen), 0)
+        both += np.minimum(resample_nearest(margin_of(frame), clip.depth_size, chosen), 0)
     both[area == 0] = -movers.APPEARANCE_LIMIT
     return movers.candidates(both > 0, 1 / (1 + np.exp(-both)), points, area, animal)
 
@@ -128,10 +129,9 @@ def opened_motion(votes: Votes, share: float) -> Bool[np.ndarray, "row column"]:
     return reliable & (opened > 0)
 
 
-def sample_nearest(
+def resample_nearest(
     picture: Shaped[np.ndarray, "height width"], size: tuple[int, int], chosen: tuple[slice, slice]
 ) -> Shaped[np.ndarray, "row column"]:
     """Sample a picture at chosen pixels of a grid of another ``size`` (height, width), nearest neighbour."""
-    sides = zip(size, picture.shape, chosen, strict=True)
-    at = (((np.arange(side)[part] + 0.5) * (own / side)).astype(int) for side, own, part in sides)
-    return picture[np.ix_(*at)]
+    pixel = cameras.pixel_grid(*size)[chosen] * np.divide(picture.shape, size)[::-1]
+    return cameras.sample_nearest(picture, pixel)

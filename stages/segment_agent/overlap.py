@@ -37,7 +37,7 @@ def estimate(
         pose = world_from_camera[frame]
         inner = free_space.interior_depth(clip, frame)
         points, area_m2, chosen = free_space.sample(clip, frame, pose, inner, locate.COARSE_PX)
-        labels = locate.sample_nearest(masks[frame], clip.depth_size, chosen)
+        labels = locate.resample_nearest(masks[frame], clip.depth_size, chosen)
         votes = free_space.vote(room, points, frame)
         inside, right = labels == 255, movers.moving(votes)
         right |= (shown == "resting") & (votes.occupied == 0)

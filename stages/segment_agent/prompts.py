@@ -70,7 +70,7 @@ def position(
 ) -> Float[np.ndarray, "3"]:
     """Return a near surface point in the box's middle third, in the world. Raises InputError MSK-002."""
     x0, y0, x1, y1 = prompt.box_px
-    scale = np.array([clip.depth_size[1] / clip.color_size[1], clip.depth_size[0] / clip.color_size[0]])
+    scale = np.divide(clip.depth_size, clip.color_size)[::-1]
     centre = np.array([x0 + x1, y0 + y1]) / 2 * scale
     half = np.maximum(np.array([x1 - x0, y1 - y0]) / 6 * scale, 2)
     low, high = np.maximum(np.floor(centre - half), 0).astype(int), np.ceil(centre + half).astype(int)

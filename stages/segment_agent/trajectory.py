@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.data.clips import Clip
+from pipeline.data.clips import Clip, back_project_pixels
 from pipeline.data.flow import STRIDE_PX, open_flow
 from pipeline.geometry import cameras
 from pipeline.geometry.align import ransac_rigid
@@ -50,22 +50,12 @@ def motion_from_flow(
     """Return ``first_from_second`` of a frame and the next, by RANSAC on flow and depth."""
     height, width = flow.shape[:2]
     pixel = cameras.pixel_grid(height, width) * STRIDE_PX
-    first = _lift(clip, frame, pixel.reshape(-1, 2))
-    second = _lift(clip, frame + 1, (pixel + flow).reshape(-1, 2))
+    first, second = (
+        back_project_pixels(clip, row, at.reshape(-1, 2), clean_depth(clip, row))
+        for row, at in ((frame, pixel), (frame + 1, pixel + flow))
+    )
     known = np.isfinite(first[:, 0]) & np.isfinite(second[:, 0])
     first_from_second, _ = ransac_rigid(
         second[known], first[known], threshold_m=INLIER_M, iterations=ITERATIONS, rng=rng
     )
     return first_from_second
-
-
-def _lift(clip: Clip, frame: int, pixel: Float[np.ndarray, "point 2"]) -> Float[np.ndarray, "point 3"]:
-    """Back-project colour pixels by the depth there; NaN where it is unknown or the pixel is out of view."""
-    depth = clean_depth(clip, frame)
-    at = pixel * [clip.depth_size[1] / clip.color_size[1], clip.depth_size[0] / clip.color_size[0]]
-    inside = cameras.in_picture(at, np.ones(len(at)), clip.depth_size)
-    column, row = np.floor(np.where(inside[:, None], at, 0)).astype(int).T
-    z = np.where(inside, depth[row, column], 0)
-    points = cameras.unproject(pixel, clip.intrinsics[frame]) * z[:, None]
-    points[z == 0] = np.nan
-    return points

@@ -93,9 +93,9 @@ def crop_window(
     if min(rows.stop - rows.start, columns.stop - columns.start) < 4:
         return None
     grid = cameras.pixel_grid(*size)[rows, columns]
-    at = np.floor(grid * [clip.depth_size[1] / size[1], clip.depth_size[0] / size[0]]).astype(int)
-    z = snap_depth_steps(clip.depth(frame))[at[..., 1], at[..., 0]]
-    trusted = clean_depth(clip, frame)[at[..., 1], at[..., 0]] > 0
+    at = grid * np.divide(clip.depth_size, size)[::-1]
+    z = cameras.sample_nearest(snap_depth_steps(clip.depth(frame)), at)
+    trusted = cameras.sample_nearest(clean_depth(clip, frame), at) > 0
     points_camera = cameras.unproject(grid, intrinsics) * z[..., None]
     points = rigid.apply(world_from_camera, points_camera.reshape(-1, 3)).reshape(*z.shape, 3)
     points[z == 0] = np.nan

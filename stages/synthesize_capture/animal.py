@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from numba import njit
 from skimage.measure import marching_cubes
 
+from pipeline.geometry.meshes import area_normals
 from stages.synthesize_capture.anatomy import Anatomy, Bone, Flesh
 from stages.synthesize_capture.cat import CAT
 from stages.synthesize_capture.config import Species
@@ -120,6 +121,6 @@ def normals_of(
 ) -> Float[np.ndarray, "vertex 3"]:
     """Return unit vertex normals of a closed surface."""
     corner, vertex = points[faces], faces.ravel()
-    normal = np.repeat(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), 3, axis=0)
+    normal = np.repeat(area_normals(corner), 3, axis=0)
     out = np.stack([np.bincount(vertex, part, len(points)) for part in normal.T], axis=-1)
     return out / np.maximum(np.linalg.norm(out, axis=-1, keepdims=True), 1e-12)

@@ -151,10 +151,9 @@ def true_flow(
     moved = rigid.apply(upright_from_world[1], np.einsum("hwi,hwij->hwj", share, corners).reshape(-1, 3))
     pixel, depth = cameras.project(moved.reshape(*cells, 3), lenses[1])
     flow = (pixel - (cameras.pixel_grid(*cells) * stride)).astype(np.float32)
-    inside = (pixel >= 0).all(-1) & (pixel < [width, height]).all(-1) & (depth > 0.05) & (view.face >= 0)
+    inside = cameras.in_picture(pixel, depth, (height, width), 0.05) & (view.face >= 0)
     seen = raster.rasterize(rigid.apply(upright_from_world[1], there[0]), there[1], lenses[1], height, width)
-    at = np.clip(np.nan_to_num(pixel), 0, [width - 1, height - 1]).astype(int)
-    nearest = seen.inverse_depth[at[..., 1], at[..., 0]]
+    nearest = cameras.sample_nearest(seen.inverse_depth, pixel)
     hidden = depth > 1.0 / np.maximum(nearest, 1e-3) + 0.02 + 0.01 * depth
     flow[~inside | hidden] = np.nan
     return flow

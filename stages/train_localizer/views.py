@@ -13,7 +13,7 @@ from kornia.enhance import adjust_gamma
 from kornia.filters import gaussian_blur2d
 
 from pipeline.geometry import cameras, rigid
-from pipeline.geometry.meshes import RayCaster, render_view
+from pipeline.geometry.meshes import RayCaster, area_normals, render_view
 from pipeline.mapping.depth_scans import depth_noise
 
 UP = np.array([0.0, 1.0, 0.0])
@@ -129,7 +129,7 @@ def plausible(view: RenderedView, caster: RayCaster) -> bool:
     )
     face = caster.cast(view.map_from_camera[:3, 3], directions).face
     corner = caster.mesh.vertices[caster.mesh.faces[face[face >= 0]]]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = area_normals(corner)
     return bool((np.einsum("ri,ri->r", normal, directions[face >= 0]) < 0).mean() > MIN_FRONT_SHARE)
 
 

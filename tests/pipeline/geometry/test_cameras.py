@@ -18,6 +18,25 @@ def test_projection_undoes_back_projection():
     assert np.allclose(pixel_torch.numpy(), pixel)
 
 
+def test_lookups_return_what_was_back_projected_and_nothing_out_of_view():
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(0.3, 5, (320, 240)).astype(np.float32)
+    points = cameras.back_project(depth, INTRINSICS)
+    assert np.array_equal(cameras.lookup_depth(depth, INTRINSICS, points), depth)
+    assert not cameras.lookup_depth(depth, INTRINSICS, -points).any()
+    assert not cameras.lookup_depth(depth, INTRINSICS, points, nearest_m=5.0).any()
+    pixel = rng.uniform([0, 0], [240, 320], (500, 2))
+    row, column = cameras.pixel_index(pixel)
+    assert np.array_equal(cameras.sample_nearest(depth, pixel), depth[row, column])
+    assert np.abs(cameras.pixel_centres(row, column) - pixel).max() <= 0.5
+    assert not cameras.sample_nearest(depth, pixel + np.array([240, 0])).any()
+    at_centres = cameras.sample_bilinear(depth, cameras.pixel_grid(320, 240))
+    assert np.array_equal(at_centres, depth)
+    small = cameras.scale_intrinsics(INTRINSICS, (320, 240), (640, 480))
+    own = cameras.back_project_pixels(cameras.pixel_grid(640, 480), small, depth, INTRINSICS)
+    assert np.array_equal(own[..., 2], depth.repeat(2, 0).repeat(2, 1))
+
+
 def test_resizing_moves_pixels_in_proportion():
     point = np.array([[0.2, -0.1, 1.5]])
     pixel, _ = cameras.project(point, INTRINSICS)

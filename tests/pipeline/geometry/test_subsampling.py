@@ -1,5 +1,6 @@
 """Even subsampling."""
 
+import numpy as np
 import pytest
 
 from pipeline.geometry import subsampling
@@ -10,3 +11,10 @@ from pipeline.geometry import subsampling
 )
 def test_a_choice_is_even_and_never_more_than_there_is(count, most, chosen):
     assert subsampling.evenly(count, most).tolist() == chosen
+
+
+@pytest.mark.parametrize(
+    ("good", "found"), [([1, 1, 0, 1, 0, 0], [[0, 2], [3, 4]]), ([0, 1], [[1, 2]]), ([0, 0], []), ([], [])]
+)
+def test_runs_are_maximal_and_end_before_their_end(good, found):
+    assert subsampling.runs(np.array(good, bool)).tolist() == found

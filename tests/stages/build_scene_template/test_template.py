@@ -75,7 +75,7 @@ def test_wrong_structure_is_refuted_by_depth(clip):
     rows = np.arange(len(frames) * 40)
     key, pixel = rows % len(frames), np.random.default_rng(0).uniform(20, 100, (len(rows), 2))
     points = np.stack(
-        [sfm.lift_pixels(clip, int(frames[k]), p[None])[0] for k, p in zip(key, pixel, strict=True)]
+        [sfm.back_project(clip, int(frames[k]), p[None])[0] for k, p in zip(key, pixel, strict=True)]
     )
     world = np.stack([rigid.apply(bent[k], p[None])[0] for k, p in zip(key, points, strict=True)])
     sparse = SparseModel(frames, bent, world, rows, key, pixel, 0.5, None)
