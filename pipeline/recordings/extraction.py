@@ -69,6 +69,8 @@ class ExtractionPlan:
     pose_check: PoseCheck
     scale: str = MEASURED
     """`measured` by its own depth, `relative`, or the id of the recording that supplied it"""
+    incomplete: float = 0.0
+    """share (0..1) of listed frames that were left out since a file of them is missing"""
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,7 @@ def understand(
         gravity_known=gravity_known,
         quarter_turns=turns,
         pose_check=check,
+        incomplete=recording.incomplete,
     )
 
 
@@ -371,8 +374,7 @@ def summary(recording: Recording, plan: ExtractionPlan) -> str:
     seen = f"{seconds:.1f} s, {count} frames {width} x {height}, {chosen} kept, {turned}"
     check = plan.pose_check
     measured = f" ({1000 * check.residual_m:.1f} mm)" if np.isfinite(check.residual_m) else ""
-    remarks = "".join(f"; {remark}" for remark in recording.remarks)
-    return f"{recording.where}: {recording.kind}, {seen}; {check.reason}{measured}{remarks}"
+    return f"{recording.where}: {recording.kind}, {seen}; {check.reason}{measured}"
 
 
 def choose_frames(timestamp_s: Float[np.ndarray, "frame"], rate_hz: float) -> Int[np.ndarray, "chosen"]:

@@ -38,6 +38,9 @@ MAX_ASPECT = 2.0
 """maximum pixel aspect ratio; a larger one is a broken header"""
 HDR = (ColorTrc.ARIB_STD_B67, ColorTrc.SMPTE2084)
 """transfer curves of video with a high dynamic range: HLG (iPhone, also Dolby Vision), PQ (HDR10, HDR10+)"""
+MIN_CUT_S, MIN_TIMES = 0.5, 2
+"""least difference between a file's declared duration and its end that counts as a copy that was cut off, and
+least number of frames whose rate is known"""
 UNSPECIFIED, HD_ROWS = 2, 720
 """code of an unnamed color matrix (ITU-T H.273), and the height from which such video is read by the matrix
 of BT.709, as players do; below it, and in MJPEG, by that of BT.601"""
@@ -50,10 +53,13 @@ class Movie:
         self.where = str(path)
         self._path = path
         with self._opened() as (container, stream):
-            times = sorted(_cut_off(stream, path.stat().st_size).union(_packet_times(container, stream)))
+            times, end_s = _packet_times(container, stream)
             if not times or stream.time_base is None:
                 raise no_frames(self.where, "the video is empty")
-            self._pts = np.array(times)
+            missing = _cut_off(stream, path.stat().st_size) | _undelivered(container, stream, times, end_s)
+            self._pts = np.array(sorted(times | missing))
+            self.complete = np.flatnonzero(~np.isin(self._pts, sorted(missing)))
+            self.remarks = self._cut_off_remarks(float(stream.time_base))
             shown_s = (self._pts - self._pts[0]) * float(stream.time_base)
             self.timestamp_s = shown_s / _slowdown(shown_s, container.metadata.get(CAPTURE_RATE, ""))
             aspect = float(stream.sample_aspect_ratio or 1) if square_pixels else 1.0
@@ -84,6 +90,17 @@ class Movie:
             return None if frame.is_corrupt else self._rgb(frame)
         self._decoder = iter(())
         return None
+
+    def _cut_off_remarks(self, unit_s: float) -> tuple[str, ...]:
+        """Say which frames a copy that was cut off lacks. Raises CAP-001 if these are most."""
+        lost, declared_s = len(self) - len(self.complete), unit_s * (self._pts[-1] - self._pts[0])
+        if not lost:
+            return ()
+        end_s = unit_s * (self._pts[self.complete[-1]] - self._pts[0]) if len(self.complete) else 0.0
+        if lost > len(self.complete):
+            raise damaged(self.where, f"the pictures end after {end_s:.1f} of {declared_s:.1f} s")
+        ends = f"its pictures end after {end_s:.1f} of {declared_s:.1f} s"
+        return (f"the copy was cut off, {ends}: {lost} of {len(self)} are missing; copy it again",)
 
     def _rgb(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "height width 3"]:
         """Convert to 8 bits; HDR to sRGB, clipped above diffuse white (203 cd/m2, ITU-R BT.2408)."""
@@ -121,20 +138,12 @@ class Movie:
 
     def _decoded_from_key_frame(self, number: int) -> Iterator[av.VideoFrame]:
         """Yield decoded frames from the key frame at or before ``number``, skipping damaged packets."""
-        with self._opened() as (container, stream):
+        with self._opened() as (container, stream), contextlib.suppress(av.error.FFmpegError):
             if number:
                 container.seek(int(self._pts[number]), stream=stream, backward=True)
-            packets = container.demux(stream)
-            while True:
-                try:
-                    packet = next(packets, None)
-                    if packet is None:
-                        return
+            for packet in container.demux(stream):
+                with contextlib.suppress(av.error.FFmpegError):
                     yield from packet.decode()
-                except av.error.EOFError:
-                    return
-                except av.error.FFmpegError:
-                    continue
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
@@ -175,6 +184,26 @@ def _cut_off(stream: av.VideoStream, size_bytes: int) -> set[int]:
     return {entry.timestamp for entry in listed if entry.pos + entry.size > size_bytes}
 
 
+def _undelivered(
+    container: av.container.InputContainer, stream: av.VideoStream, times: set[int], end_s: float
+) -> set[int]:
+    """Return about the times of frames that Matroska declares beyond the end of its last packet.
+
+    Its index stands at the end of the file. A duration that FFmpeg only estimates is the streams' own too.
+    """
+    declared = container.format.name.startswith("matroska") and container.duration and stream.time_base
+    if not declared or len(times) < MIN_TIMES:
+        return set()
+    shown = np.array(sorted(times))
+    step_s = float(np.median(np.diff(shown)) * stream.time_base)
+    missing_s = container.duration / av.time_base - end_s
+    if stream.duration is not None or missing_s < MIN_CUT_S + step_s:
+        return set()
+    count = min(round(missing_s / step_s), len(shown) + 1)
+    step = missing_s / count / float(stream.time_base)
+    return {round(shown[-1] + step * (1 + number)) for number in range(count)}
+
+
 def _slowdown(shown_s: Float[np.ndarray, "frame"], capture_rate: str) -> float:
     """Return a video's slow-motion factor by its metadata tag; 1 without a tag."""
     try:
@@ -184,15 +213,16 @@ def _slowdown(shown_s: Float[np.ndarray, "frame"], capture_rate: str) -> float:
     return slowdown if MIN_SLOWDOWN <= max(slowdown, 1 / max(slowdown, 1e-9)) < np.inf else 1.0
 
 
-def _packet_times(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[int]:
-    """Yield the PTS of all frames except those hidden by an edit list, which only serve as references."""
-    packets = container.demux(stream)
-    while True:
-        try:
-            packet = next(packets, None)
-        except av.error.FFmpegError:
-            return
-        if packet is None:
-            return
-        if packet.pts is not None and packet.size and not packet.is_discard:
-            yield packet.pts
+def _packet_times(container: av.container.InputContainer, stream: av.VideoStream) -> tuple[set[int], float]:
+    """Return the PTS of all frames except those hidden by an edit list, which only serve as references, and
+    the end of the last packet of any stream, seconds.
+    """
+    times, end_s = set(), 0.0
+    with contextlib.suppress(av.error.FFmpegError):
+        for packet in container.demux():
+            if packet.pts is None or packet.time_base is None or not packet.size:
+                continue
+            end_s = max(end_s, float((packet.pts + (packet.duration or 0)) * packet.time_base))
+            if packet.stream is stream and not packet.is_discard:
+                times.add(packet.pts)
+    return times, end_s

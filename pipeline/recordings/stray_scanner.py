@@ -58,7 +58,8 @@ def open_recording(path: Path) -> Recording:
     depth = container.numbered("depth")
     if not depth:
         raise no_depth(container.where, "the folder depth/ is empty")
-    valid = np.array([number < len(movie) and int(number) in depth for number in rows.frame], bool)
+    complete = depth.keys() & set(movie.complete.tolist())
+    valid = np.array([int(number) in complete for number in rows.frame], bool)
     if not valid.any():
         raise no_frames(container.where, "none has colour, depth and odometry")
     index = rows.frame[valid]
@@ -84,6 +85,8 @@ def open_recording(path: Path) -> Recording:
         read_confidence=confident if confidence else None,
         convention=OPENCV,
         up=Y_UP,
+        remarks=movie.remarks,
+        listed=max(len(movie), len(rows.frame)),
     )
 
 

@@ -78,6 +78,7 @@ def open_recording(path: Path) -> Recording:
         convention=OPENCV,
         depth_camera=camera,
         remarks=remarks + scale_remarks + camera_remarks,
+        listed=len(present),
     )
 
 

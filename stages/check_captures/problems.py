@@ -38,6 +38,7 @@ class CaptureMeasurements:
 
 SHORTEST_S: dict[Role, float] = {"walkthrough": 30.0, "turnaround": 8.0, "session": 15.0, "heldout": 5.0}
 MAX_DARK, MAX_BLURRED, MIN_DEPTH, MAX_BEYOND, MAX_DAMAGED = 0.2, 0.25, 0.5, 0.2, 0.0
+MAX_INCOMPLETE = 0.02
 MAX_DRIFT_M = 0.10
 MIN_PLACED = 0.05
 MIN_SEEN = 0.25
@@ -77,8 +78,11 @@ def problems(seen: CaptureMeasurements, role: Role) -> list[CaptureProblem]:
 
 def _of_pictures(sample: RecordingSample, role: Role) -> dict[str, str]:
     found = {}
-    if sample.damaged > MAX_DAMAGED:
-        found["CAP-030"] = f"{sample.damaged:.0%} of the pictures are damaged"
+    if sample.recording.incomplete > MAX_INCOMPLETE:
+        complete = f"{len(sample.recording.index)} of {sample.recording.listed} frames"
+        found["CAP-030"] = f"only {complete} have their picture, depth and metadata: files are missing"
+    elif sample.damaged > MAX_DAMAGED:
+        found["CAP-030"] = f"{sample.damaged:.0%} of the pictures are damaged or missing"
     if sample.duration_s < SHORTEST_S[role]:
         found["CAP-031"] = f"only {sample.duration_s:.0f} s long"
     if sample.dark > MAX_DARK:

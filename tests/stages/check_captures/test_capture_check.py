@@ -141,6 +141,11 @@ def test_damaged_pictures_and_missing_depth_are_told(tmp_path):
     data[middle - 20_000 : middle + 20_000] = bytes(40_000)
     (tmp_path / "a.mp4").write_bytes(data)
     assert "CAP-030" in _codes(tmp_path / "a.mp4")
+    made_formats.write_movie(tmp_path / "a.mkv", [made.color(i) for i in range(60)], rate=15)
+    data = (tmp_path / "a.mkv").read_bytes()
+    assert "CAP-030" not in _codes(tmp_path / "a.mkv")
+    (tmp_path / "a.mkv").write_bytes(data[: len(data) * 2 // 3])
+    assert "CAP-030" in _codes(tmp_path / "a.mkv")
 
 
 def _shots(
@@ -164,7 +169,7 @@ def _shots(
         small = depth[1::3, 1::3].astype(np.float32)
         depth_intrinsics = cameras.scale_intrinsics(intrinsics, size, small.shape)
         found.append(
-            SampledFrame(float(frame), gray, intrinsics, small, depth_intrinsics, odometry, 20.0, 0.5, 0.0)
+            SampledFrame(float(frame), gray, 20.0, 0.5, intrinsics, small, depth_intrinsics, odometry)
         )
     return found
 
@@ -288,7 +293,7 @@ def _layers(near_step_px: int) -> list[SampledFrame]:
 
     Per picture the far one moves by 4 pixels, the near one by its own step.
     """
-    rng, nothing = np.random.default_rng(0), np.zeros((0, 0), np.float32)
+    rng = np.random.default_rng(0)
     far, near = (
         cv2.normalize(cv2.GaussianBlur(rng.normal(size=(240, 600)), (0, 0), 3), None, 0, 255, cv2.NORM_MINMAX)
         for _ in range(2)
@@ -297,11 +302,7 @@ def _layers(near_step_px: int) -> list[SampledFrame]:
     for number in range(8):
         picture = far[:, 4 * number : 4 * number + 320].copy()
         picture[120:] = near[120:, near_step_px * number : near_step_px * number + 320]
-        shots.append(
-            SampledFrame(
-                float(number), picture.astype(np.uint8), np.eye(3), nothing, np.eye(3), None, 20.0, 0.5, 0.0
-            )
-        )
+        shots.append(SampledFrame(float(number), picture.astype(np.uint8), 20.0, 0.5))
     return shots
 
 
