@@ -38,6 +38,8 @@ MAX_ASPECT = 2.0
 """maximum pixel aspect ratio; a larger one is a broken header"""
 HDR = (ColorTrc.ARIB_STD_B67, ColorTrc.SMPTE2084)
 """transfer curves of video with a high dynamic range: HLG (iPhone, also Dolby Vision), PQ (HDR10, HDR10+)"""
+WIDE = (ColorPrimaries.SMPTE432, ColorPrimaries.SMPTE431, ColorPrimaries.BT2020)
+"""primaries of wider gamuts than sRGB's: Display P3, DCI-P3 and BT.2020"""
 MIN_CUT_S, MIN_TIMES = 0.5, 2
 """least difference between a file's declared duration and its end that counts as a copy that was cut off, and
 least number of frames whose rate is known"""
@@ -103,18 +105,20 @@ class Movie:
         return (f"the copy was cut off, {ends}: {lost} of {len(self)} are missing; copy it again",)
 
     def _rgb(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "height width 3"]:
-        """Convert to 8 bits; HDR to sRGB, clipped above diffuse white (203 cd/m2, ITU-R BT.2408)."""
+        """Convert to 8 bits and sRGB, clipped above diffuse white (203 cd/m2, ITU-R BT.2408)."""
         (height, width), hdr = self.size, frame.color_trc in HDR
         if self._hd and frame.colorspace == UNSPECIFIED:
             frame.colorspace = Colorspace.ITU709
-        kind = "gbrp16le" if hdr else "rgb24"  # FFmpeg 8 mixes the channels of rgb48le where widths are odd
+        converted = hdr or frame.color_primaries in WIDE
+        kind = "gbrp16le" if converted else "rgb24"  # FFmpeg 8 mixes channels of rgb48le where widths are odd
         rgb = frame.to_ndarray(format=kind, width=width, height=height)
-        if not hdr:
-            return rgb
-        plain = av.VideoFrame.from_ndarray(rgb, format=kind)  # without its peak, which would become white
-        plain.color_trc, plain.color_primaries = frame.color_trc, frame.color_primaries
-        target = {"dst_color_trc": ColorTrc.IEC61966_2_1, "dst_color_primaries": ColorPrimaries.BT709}
-        return self._tone_mapper.reformat(plain, format="rgb24", **target).to_ndarray()
+        if converted:
+            plain = av.VideoFrame.from_ndarray(rgb, format=kind)  # without its peak, which would become white
+            plain.color_trc = frame.color_trc if hdr else ColorTrc.IEC61966_2_1
+            plain.color_primaries = frame.color_primaries
+            target = {"dst_color_trc": ColorTrc.IEC61966_2_1, "dst_color_primaries": ColorPrimaries.BT709}
+            rgb = self._tone_mapper.reformat(plain, format="rgb24", **target).to_ndarray()
+        return rgb
 
     def _first(self) -> av.VideoFrame:
         frame = next((frame for frame in self._decoded_from(0)), None)

@@ -1,13 +1,16 @@
-"""Recordings in odd but real forms: copies that were cut off, missing files, varying times."""
+"""Recordings in odd but real forms: cut off, wide colours, missing files, varying times."""
 
 from fractions import Fraction
 
 import av
 import numpy as np
 import pytest
+from av.video.reformatter import ColorPrimaries, ColorTrc
 
 from pipeline.core.errors import InputError
+from pipeline.data import images
 from pipeline.recordings.formats import open_recording
+from pipeline.recordings.movies import Movie
 from tests.pipeline.recordings import made_formats
 from tests.stages.extract_frames.made_recordings import walk
 
@@ -53,6 +56,35 @@ def test_a_matroska_that_declares_no_duration_is_complete(tmp_path):
     with av.open(str(tmp_path / "live.mkv")) as read:
         assert read.duration > 6.5e6, "microseconds"
     assert open_recording(tmp_path / "live.mkv").incomplete == 0
+
+
+SRGB_FROM_P3 = np.array([[1.2249, -0.2247, 0.0], [-0.0420, 1.0419, 0.0], [-0.0197, -0.0786, 1.0979]])
+COLORS = np.array(
+    [[40, 40, 40], [128, 128, 128], [235, 235, 235], [200, 40, 40], [60, 160, 60], [30, 60, 200]]
+)
+
+
+def _stripes(color):
+    return np.repeat(np.repeat(color[None].astype(np.uint8), 32, axis=0), 32, axis=1)
+
+
+@pytest.mark.slow  # tables of colours
+@pytest.mark.parametrize("curve", [ColorTrc.BT709, ColorTrc.IEC61966_2_1])
+def test_display_p3_becomes_srgb(tmp_path, curve):
+    """Its red is redder: a red animal would fade, and differ from the one of another phone."""
+    light = images.linear_from_srgb(COLORS / 255) @ np.linalg.inv(SRGB_FROM_P3).T
+    stored = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    assert np.abs(255 * stored - COLORS).max() > 25
+    with av.open(str(tmp_path / "a.mov"), "w") as written:
+        track = written.add_stream("libx264", rate=30, options={"crf": "2"})
+        track.height, track.width, track.pix_fmt = 32, 192, "yuv444p"
+        track.codec_context.color_primaries, track.codec_context.color_trc = ColorPrimaries.SMPTE432, curve
+        for _ in range(3):
+            frame = av.VideoFrame.from_ndarray(_stripes(np.rint(255 * stored)), format="rgb24")
+            frame.color_primaries, frame.color_trc = ColorPrimaries.SMPTE432, curve
+            written.mux(track.encode(frame))
+        written.mux(track.encode())
+    np.testing.assert_allclose(Movie(tmp_path / "a.mov").read(1)[16, 16::32], COLORS, atol=6)
 
 
 def test_times_vary_and_may_begin_anywhere(tmp_path):
