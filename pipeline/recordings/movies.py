@@ -12,6 +12,7 @@ from pathlib import Path
 import av
 import av.container
 import av.error
+import cv2
 import numpy as np
 from av.stream import Disposition
 from av.video.reformatter import ColorPrimaries, Colorspace, ColorTrc, VideoReformatter
@@ -105,7 +106,7 @@ class Movie:
         return (f"the copy was cut off, {ends}: {lost} of {len(self)} are missing; copy it again",)
 
     def _rgb(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "height width 3"]:
-        """Convert to 8 bits and sRGB, clipped above diffuse white (203 cd/m2, ITU-R BT.2408)."""
+        """Convert to 8 bits and sRGB, clipped above diffuse white (203 cd/m2, ITU-R BT.2408); deinterlace."""
         (height, width), hdr = self.size, frame.color_trc in HDR
         if self._hd and frame.colorspace == UNSPECIFIED:
             frame.colorspace = Colorspace.ITU709
@@ -118,7 +119,7 @@ class Movie:
             plain.color_primaries = frame.color_primaries
             target = {"dst_color_trc": ColorTrc.IEC61966_2_1, "dst_color_primaries": ColorPrimaries.BT709}
             rgb = self._tone_mapper.reformat(plain, format="rgb24", **target).to_ndarray()
-        return rgb
+        return cv2.resize(rgb[::2], (width, height)) if frame.interlaced_frame else rgb
 
     def _first(self) -> av.VideoFrame:
         frame = next((frame for frame in self._decoded_from(0)), None)

@@ -87,6 +87,18 @@ def test_display_p3_becomes_srgb(tmp_path, curve):
     np.testing.assert_allclose(Movie(tmp_path / "a.mov").read(1)[16, 16::32], COLORS, atol=6)
 
 
+def test_fields_of_interlaced_video_are_not_mixed(tmp_path):
+    """Its even rows were taken before its odd ones: a moving edge becomes a comb."""
+    picture = np.full((64, 64, 3), 40, np.uint8)
+    picture[::2, :20], picture[1::2, :30] = 220, 220
+    options = {"crf": "4", "flags": "+ildct+ilme", "x264-params": "tff=1"}
+    made_formats.write_movie(tmp_path / "a.mp4", [picture] * 4, options=options)
+    found = Movie(tmp_path / "a.mp4").read(2).astype(int)
+    assert found.shape == picture.shape
+    assert np.abs(found[:, 24].mean() - 40) < 6
+    assert np.abs(np.diff(found[:, :, 0], axis=0)).max() < 12
+
+
 def test_times_vary_and_may_begin_anywhere(tmp_path):
     times_ms = 10_000 + np.cumsum(np.random.default_rng(0).integers(8, 60, 40))
     for ending in ("mp4", "mkv"):
