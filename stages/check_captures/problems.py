@@ -43,7 +43,7 @@ MAX_DRIFT_M = 0.10
 MIN_PLACED = 0.05
 MIN_SEEN = 0.25
 MIN_LINKED, MIN_PARALLAX = 0.6, 0.3
-MAX_SEVERAL = 0.5
+MAX_SEVERAL, MAX_LARGE = 0.5, 0.06
 LONGEST_GAP_S = 1.0
 SPARSE_HZ = 5.0
 REMEDIES = {
@@ -64,6 +64,7 @@ REMEDIES = {
     "CAP-055": "keep other animals and people out, or point at the animal with a prompt",
     "CAP-056": "walk sideways instead of turning on the spot, slowly, along things with a pattern",
     "CAP-057": "copy the file unedited; check the unit of its depth, its intrinsics and what mirrored it",
+    "CAP-059": "film the room again with nobody in it, or cut that part off",
     "CAP-058": "leave poses out that are not its own; else move slowly, along things with a pattern",
 }
 
@@ -141,6 +142,10 @@ def _of_content(seen: CaptureMeasurements, role: Role) -> dict[str, str]:
     found = {}
     if seen.placed is not None and seen.placed < MIN_PLACED:
         found["CAP-053"] = f"{seen.placed:.0%} of the frames are found in the walk-through"
+    agree = seen.sample.agreement is not None and seen.sample.agreement.verdict == "agree"
+    if role == "walkthrough" and seen.moving is not None and agree and not seen.drift_m > MAX_DRIFT_M:
+        if seen.moving.large > MAX_LARGE:
+            found["CAP-059"] = f"someone or something large moves in {seen.moving.large:.0%} of the frames"
     if seen.moving is not None and role == "session":
         if seen.moving.seen < MIN_SEEN:
             found["CAP-054"] = f"something of an animal's size moves in {seen.moving.seen:.0%} of the frames"

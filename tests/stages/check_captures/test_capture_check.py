@@ -9,6 +9,7 @@ import pytest
 from pipeline.core.videos import Role
 from pipeline.geometry import cameras, rigid
 from pipeline.geometry.meshes import RayCaster, render_view
+from pipeline.mapping import picture_agreement
 from pipeline.recordings.formats import open_recording
 from stages.check_captures import __main__ as front
 from stages.check_captures import moving_objects, overlap, parallax, pose_drift, problems, sampling
@@ -221,6 +222,36 @@ def test_movers_are_counted():
         for seen in (still, lone, pair)
     ]
     assert codes == [{"CAP-054"}, set(), {"CAP-055"}]
+
+
+def test_someone_who_walks_through_the_walk_through_is_told():
+    """A cat is too small to be told from the drift of poses, which must not warn."""
+
+    def person(frame):
+        return [((0.25 * frame - 1, 0.6, 0.5), 0.35)] if frame < 8 else []
+
+    def cat(frame):
+        return [((0.25 * frame - 1, 0.1, 0.5), 0.1)]
+
+    drift = rigid.rotation_from_yaw(np.radians(2.0) * np.arange(16) / 16)
+    still = [
+        dataclasses.replace(
+            shot, odometry_from_camera=rigid.make(turn, np.zeros(3)) @ shot.odometry_from_camera
+        )
+        for shot, turn in zip(_shots(0, 16), drift, strict=True)
+    ]
+    agree = picture_agreement.PictureAgreement("agree", 0.9, 40)
+    sample = sampling.RecordingSample(None, None, [], 0.0, agree)
+    doubted = dataclasses.replace(sample, agreement=dataclasses.replace(agree, verdict="unconfirmed"))
+
+    def codes(shots, sample=sample, role="walkthrough"):
+        moving = moving_objects.find_motion(shots)
+        return set(problems._of_content(problems.CaptureMeasurements(sample, moving=moving), role))
+
+    walked = _shots(0, 16, balls=person)
+    assert codes(walked) == {"CAP-059"}
+    assert codes(walked, doubted) == codes(walked, role="turnaround") == set()
+    assert codes(still) == codes(_shots(0, 16, balls=cat)) == set()
 
 
 def test_without_poses_nothing_is_claimed():
