@@ -204,7 +204,10 @@ def _refuse_other_unit(recording: Recording, max_depth_m: float) -> None:
     shown = recording.index[evenly(len(recording.index), UNIT_VIEWS)]
     depth = np.concatenate([recording.read_depth(int(number)).ravel() for number in shown])
     depth = depth[np.isfinite(depth) & (depth > 0)]
-    typical_m = float(np.median(depth)) if len(depth) else max_depth_m
+    if not len(depth):
+        remedy = "record with the LiDAR camera, in light; export it again"
+        raise InputError("CAP-007", "every depth picture is empty", recording.where, remedy)
+    typical_m = float(np.median(depth))
     if not NEAREST_TYPICAL_M < typical_m < FARTHEST_TYPICAL * max_depth_m:
         what = f"depth is typically {typical_m:.3g} m, where up to {max_depth_m:g} m are used"
         remedy = "PNG holds millimetres (TUM: see depth_scale.txt), EXR metres; record within 5 m"
