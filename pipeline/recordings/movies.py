@@ -41,9 +41,8 @@ HDR = (ColorTrc.ARIB_STD_B67, ColorTrc.SMPTE2084)
 """transfer curves of video with a high dynamic range: HLG (iPhone, also Dolby Vision), PQ (HDR10, HDR10+)"""
 WIDE = (ColorPrimaries.SMPTE432, ColorPrimaries.SMPTE431, ColorPrimaries.BT2020)
 """primaries of wider gamuts than sRGB's: Display P3, DCI-P3 and BT.2020"""
-MIN_CUT_S, MIN_TIMES = 0.5, 2
-"""least difference between a file's declared duration and its end that counts as a copy that was cut off, and
-least number of frames whose rate is known"""
+MIN_CUT_S = 0.5
+"""least difference between a file's declared duration and its end that counts as a copy that was cut off"""
 UNSPECIFIED, HD_ROWS = 2, 720
 """code of an unnamed color matrix (ITU-T H.273), and the height from which such video is read by the matrix
 of BT.709, as players do; below it, and in MJPEG, by that of BT.601"""
@@ -96,14 +95,12 @@ class Movie:
 
     def _cut_off_remarks(self, unit_s: float) -> tuple[str, ...]:
         """Say which frames a copy that was cut off lacks. Raises CAP-001 if these are most."""
-        lost, declared_s = len(self) - len(self.complete), unit_s * (self._pts[-1] - self._pts[0])
-        if not lost:
-            return ()
-        end_s = unit_s * (self._pts[self.complete[-1]] - self._pts[0]) if len(self.complete) else 0.0
+        lost, last = len(self) - len(self.complete), self._pts[self.complete[-1:]].max(initial=self._pts[0])
+        end_s, declared_s = (unit_s * (each - self._pts[0]) for each in (last, self._pts[-1]))
+        ends = f"the pictures end after {end_s:.1f} of {declared_s:.1f} s"
         if lost > len(self.complete):
-            raise damaged(self.where, f"the pictures end after {end_s:.1f} of {declared_s:.1f} s")
-        ends = f"its pictures end after {end_s:.1f} of {declared_s:.1f} s"
-        return (f"the copy was cut off, {ends}: {lost} of {len(self)} are missing; copy it again",)
+            raise damaged(self.where, ends)
+        return (f"{ends}: {lost} of {len(self)} are missing, copy it again",) if lost else ()
 
     def _rgb(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "height width 3"]:
         """Convert to 8 bits and sRGB, clipped above diffuse white (203 cd/m2, ITU-R BT.2408); deinterlace."""
@@ -196,13 +193,12 @@ def _undelivered(
 
     Its index stands at the end of the file. A duration that FFmpeg only estimates is the streams' own too.
     """
-    declared = container.format.name.startswith("matroska") and container.duration and stream.time_base
-    if not declared or len(times) < MIN_TIMES:
+    declared = container.duration if container.format.name.startswith("matroska") else None
+    if not declared or not stream.time_base or stream.duration is not None or len(times) == 1:
         return set()
-    shown = np.array(sorted(times))
+    shown, missing_s = np.array(sorted(times)), declared / av.time_base - end_s
     step_s = float(np.median(np.diff(shown)) * stream.time_base)
-    missing_s = container.duration / av.time_base - end_s
-    if stream.duration is not None or missing_s < MIN_CUT_S + step_s:
+    if missing_s < MIN_CUT_S + step_s:
         return set()
     count = min(round(missing_s / step_s), len(shown) + 1)
     step = missing_s / count / float(stream.time_base)
