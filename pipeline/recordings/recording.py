@@ -66,7 +66,7 @@ class Recording:
     @property
     def incomplete(self) -> float:
         """Share (0..1) of the listed frames whose picture, depth or metadata are missing."""
-        return max(0.0, 1 - len(self.index) / self.listed) if self.listed else 0.0
+        return max(0, self.listed - len(self.index)) / max(self.listed, 1)
 
 
 def damaged(where: str, why: str) -> InputError:

@@ -144,6 +144,19 @@ def test_a_folder_without_its_last_depth(tmp_path, app):
     assert recording.incomplete == 0.25
 
 
+def test_rows_that_stray_scanner_cut_or_timed_twice_cost_no_more_than_themselves(tmp_path):
+    path = made_formats.stray(tmp_path / "a", walk(40, rate_hz=15.0))
+    rows = (path / "odometry.csv").read_text().split("\n")
+    twice = ", ".join([rows[10].split(", ")[0], *rows[11].split(", ")[1:]])
+    (path / "odometry.csv").write_text("\n".join([*rows[:11], twice, *rows[12:-1], rows[-1][:60]]))
+    recording = open_recording(path)
+    assert recording.index.tolist() == [i for i in range(39) if i != 10]
+    assert recording.incomplete == 0.05
+    (path / "odometry.csv").write_text("\n".join([rows[0], *rows[:0:-1]]))
+    with pytest.raises(InputError, match="CAP-004.*the times must increase"):
+        open_recording(path)
+
+
 def test_depth_of_every_second_frame_is_complete(tmp_path):
     path = made_formats.video_and_depth(tmp_path / "a", walk(40))
     for file in sorted((path / "depth").iterdir())[1::2]:
