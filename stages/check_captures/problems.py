@@ -56,7 +56,7 @@ REMEDIES = {
     "CAP-037": "avoid mirrors, glass and black things; do not cover the sensor",
     "CAP-038": "stay within 4 m of floor, walls and animal",
     "CAP-039": "record it with a LiDAR phone, or let a session with depth go where it went",
-    "CAP-050": "begin to record when the app's tracking is ready; the build goes on without, less surely",
+    "CAP-050": "correct a unit that is named; begin when tracking is ready; the build goes on, less surely",
     "CAP-051": "nothing to do; if pictures look wrong, report the app's version",
     "CAP-052": "move smoothly, keep textured things in view; the build repairs what depth shows",
     "CAP-053": "film the walk-through again and include this part of the room, or leave the file out",
@@ -64,8 +64,8 @@ REMEDIES = {
     "CAP-055": "keep other animals and people out, or point at the animal with a prompt",
     "CAP-056": "walk sideways instead of turning on the spot, slowly, along things with a pattern",
     "CAP-057": "copy the file unedited; check the unit of its depth, its intrinsics and what mirrored it",
-    "CAP-059": "film the room again with nobody in it, or cut that part off",
     "CAP-058": "leave poses out that are not its own; else move slowly, along things with a pattern",
+    "CAP-059": "film the room again with nobody in it; if nobody was there, ignore it (large panes of glass)",
 }
 
 
