@@ -5,7 +5,7 @@ documented convention is kept unless it is clearly refuted and another one clear
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal
 
@@ -19,6 +19,8 @@ TOLERANCE_M = 0.015
 TOLERANCE_SHARE = 0.01
 UNUSABLE_FACTOR = 4.0
 """residual, in tolerances, beyond which poses are wrong and not merely drifting"""
+UNIT_FACTORS = (0.1, 0.2, 0.5, 2.0, 5.0, 10.0)
+"""ratios of units of depth in use: 0.1, 0.2, 1 and 10 mm"""
 MIN_OVERLAP = 0.25
 MIN_TURN_RAD = np.radians(3.0)
 MIN_SHIFT_M = 0.05
@@ -121,7 +123,23 @@ def check_poses(
         convention: _score(odometry_from_pose(pose[frames], convention), pairs_of_views, views)
         for convention in among
     }
-    return _judge(scores, documented, len(chosen))
+    check = _judge(scores, documented, len(chosen))
+    odometry = odometry_from_pose(pose[frames], check.convention)
+    return replace(check, reason=check.reason + _unit_hint(odometry, pairs_of_views, views, check))
+
+
+def _unit_hint(
+    odometry_from_camera: np.ndarray, pairs: np.ndarray, views: Sequence[DepthPicture], check: PoseCheck
+) -> str:
+    """Say in which other unit the depth would agree with poses that do not explain it as stored, if any."""
+    best, hint = UNUSABLE_FACTOR, ""
+    for factor in UNIT_FACTORS if check.verdict == "unusable" else ():
+        scaled = [replace(view, depth=view.depth * np.float32(factor)) for view in views]
+        score = _score(odometry_from_camera, pairs, scaled)
+        if score.residual_m < min(best * score.tolerance_m, factor * check.tolerance_m):
+            best = score.residual_m / score.tolerance_m
+            hint = f"; depth times {factor:g} would agree with them: check its unit"
+    return hint
 
 
 @dataclass(frozen=True)

@@ -69,6 +69,8 @@ class ExtractionPlan:
     pose_check: PoseCheck
     scale: str = MEASURED
     """`measured` by its own depth, `relative`, or the id of the recording that supplied it"""
+    incomplete: float = 0.0
+    """share (0..1) of listed frames that were left out since a file of them is missing"""
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,7 @@ def understand(
         gravity_known=gravity_known,
         quarter_turns=turns,
         pose_check=check,
+        incomplete=recording.incomplete,
     )
 
 
@@ -201,7 +204,10 @@ def _refuse_other_unit(recording: Recording, max_depth_m: float) -> None:
     shown = recording.index[evenly(len(recording.index), UNIT_VIEWS)]
     depth = np.concatenate([recording.read_depth(int(number)).ravel() for number in shown])
     depth = depth[np.isfinite(depth) & (depth > 0)]
-    typical_m = float(np.median(depth)) if len(depth) else max_depth_m
+    if not len(depth):
+        remedy = "record with the LiDAR camera, in light; export it again"
+        raise InputError("CAP-007", "every depth picture is empty", recording.where, remedy)
+    typical_m = float(np.median(depth))
     if not NEAREST_TYPICAL_M < typical_m < FARTHEST_TYPICAL * max_depth_m:
         what = f"depth is typically {typical_m:.3g} m, where up to {max_depth_m:g} m are used"
         remedy = "PNG holds millimetres (TUM: see depth_scale.txt), EXR metres; record within 5 m"
@@ -371,8 +377,7 @@ def summary(recording: Recording, plan: ExtractionPlan) -> str:
     seen = f"{seconds:.1f} s, {count} frames {width} x {height}, {chosen} kept, {turned}"
     check = plan.pose_check
     measured = f" ({1000 * check.residual_m:.1f} mm)" if np.isfinite(check.residual_m) else ""
-    remarks = "".join(f"; {remark}" for remark in recording.remarks)
-    return f"{recording.where}: {recording.kind}, {seen}; {check.reason}{measured}{remarks}"
+    return f"{recording.where}: {recording.kind}, {seen}; {check.reason}{measured}"
 
 
 def choose_frames(timestamp_s: Float[np.ndarray, "frame"], rate_hz: float) -> Int[np.ndarray, "chosen"]:

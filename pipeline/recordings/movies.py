@@ -12,6 +12,7 @@ from pathlib import Path
 import av
 import av.container
 import av.error
+import cv2
 import numpy as np
 from av.stream import Disposition
 from av.video.reformatter import ColorPrimaries, Colorspace, ColorTrc, VideoReformatter
@@ -38,6 +39,10 @@ MAX_ASPECT = 2.0
 """maximum pixel aspect ratio; a larger one is a broken header"""
 HDR = (ColorTrc.ARIB_STD_B67, ColorTrc.SMPTE2084)
 """transfer curves of video with a high dynamic range: HLG (iPhone, also Dolby Vision), PQ (HDR10, HDR10+)"""
+WIDE = (ColorPrimaries.SMPTE432, ColorPrimaries.SMPTE431, ColorPrimaries.BT2020)
+"""primaries of wider gamuts than sRGB's: Display P3, DCI-P3 and BT.2020"""
+MIN_CUT_S = 0.5
+"""least difference between a file's declared duration and its end that counts as a copy that was cut off"""
 UNSPECIFIED, HD_ROWS = 2, 720
 """code of an unnamed color matrix (ITU-T H.273), and the height from which such video is read by the matrix
 of BT.709, as players do; below it, and in MJPEG, by that of BT.601"""
@@ -50,10 +55,13 @@ class Movie:
         self.where = str(path)
         self._path = path
         with self._opened() as (container, stream):
-            times = sorted(_cut_off(stream, path.stat().st_size).union(_packet_times(container, stream)))
+            times, end_s = _packet_times(container, stream)
             if not times or stream.time_base is None:
                 raise no_frames(self.where, "the video is empty")
-            self._pts = np.array(times)
+            missing = _cut_off(stream, path.stat().st_size) | _undelivered(container, stream, times, end_s)
+            self._pts = np.array(sorted(times | missing))
+            self.complete = np.flatnonzero(~np.isin(self._pts, sorted(missing)))
+            self.remarks = self._cut_off_remarks(float(stream.time_base))
             shown_s = (self._pts - self._pts[0]) * float(stream.time_base)
             self.timestamp_s = shown_s / _slowdown(shown_s, container.metadata.get(CAPTURE_RATE, ""))
             aspect = float(stream.sample_aspect_ratio or 1) if square_pixels else 1.0
@@ -85,19 +93,30 @@ class Movie:
         self._decoder = iter(())
         return None
 
+    def _cut_off_remarks(self, unit_s: float) -> tuple[str, ...]:
+        """Say which frames a copy that was cut off lacks. Raises CAP-001 if these are most."""
+        lost, last = len(self) - len(self.complete), self._pts[self.complete[-1:]].max(initial=self._pts[0])
+        end_s, declared_s = (unit_s * (each - self._pts[0]) for each in (last, self._pts[-1]))
+        ends = f"the pictures end after {end_s:.1f} of {declared_s:.1f} s"
+        if lost > len(self.complete):
+            raise damaged(self.where, ends)
+        return (f"{ends}: {lost} of {len(self)} are missing, copy it again",) if lost else ()
+
     def _rgb(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "height width 3"]:
-        """Convert to 8 bits; HDR to sRGB, clipped above diffuse white (203 cd/m2, ITU-R BT.2408)."""
+        """Convert to 8 bits and sRGB, clipped above diffuse white (203 cd/m2, ITU-R BT.2408); deinterlace."""
         (height, width), hdr = self.size, frame.color_trc in HDR
         if self._hd and frame.colorspace == UNSPECIFIED:
             frame.colorspace = Colorspace.ITU709
-        kind = "gbrp16le" if hdr else "rgb24"  # FFmpeg 8 mixes the channels of rgb48le where widths are odd
+        converted = hdr or frame.color_primaries in WIDE
+        kind = "gbrp16le" if converted else "rgb24"  # FFmpeg 8 mixes channels of rgb48le where widths are odd
         rgb = frame.to_ndarray(format=kind, width=width, height=height)
-        if not hdr:
-            return rgb
-        plain = av.VideoFrame.from_ndarray(rgb, format=kind)  # without its peak, which would become white
-        plain.color_trc, plain.color_primaries = frame.color_trc, frame.color_primaries
-        target = {"dst_color_trc": ColorTrc.IEC61966_2_1, "dst_color_primaries": ColorPrimaries.BT709}
-        return self._tone_mapper.reformat(plain, format="rgb24", **target).to_ndarray()
+        if converted:
+            plain = av.VideoFrame.from_ndarray(rgb, format=kind)  # without its peak, which would become white
+            plain.color_trc = frame.color_trc if hdr else ColorTrc.IEC61966_2_1
+            plain.color_primaries = frame.color_primaries
+            target = {"dst_color_trc": ColorTrc.IEC61966_2_1, "dst_color_primaries": ColorPrimaries.BT709}
+            rgb = self._tone_mapper.reformat(plain, format="rgb24", **target).to_ndarray()
+        return cv2.resize(rgb[::2], (width, height)) if frame.interlaced_frame else rgb
 
     def _first(self) -> av.VideoFrame:
         frame = next((frame for frame in self._decoded_from(0)), None)
@@ -121,20 +140,12 @@ class Movie:
 
     def _decoded_from_key_frame(self, number: int) -> Iterator[av.VideoFrame]:
         """Yield decoded frames from the key frame at or before ``number``, skipping damaged packets."""
-        with self._opened() as (container, stream):
+        with self._opened() as (container, stream), contextlib.suppress(av.error.FFmpegError):
             if number:
                 container.seek(int(self._pts[number]), stream=stream, backward=True)
-            packets = container.demux(stream)
-            while True:
-                try:
-                    packet = next(packets, None)
-                    if packet is None:
-                        return
+            for packet in container.demux(stream):
+                with contextlib.suppress(av.error.FFmpegError):
                     yield from packet.decode()
-                except av.error.EOFError:
-                    return
-                except av.error.FFmpegError:
-                    continue
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
@@ -175,6 +186,25 @@ def _cut_off(stream: av.VideoStream, size_bytes: int) -> set[int]:
     return {entry.timestamp for entry in listed if entry.pos + entry.size > size_bytes}
 
 
+def _undelivered(
+    container: av.container.InputContainer, stream: av.VideoStream, times: set[int], end_s: float
+) -> set[int]:
+    """Return about the times of frames that Matroska declares beyond the end of its last packet.
+
+    Its index stands at the end of the file. A duration that FFmpeg only estimates is the streams' own too.
+    """
+    declared = container.duration if container.format.name.startswith("matroska") else None
+    if not declared or not stream.time_base or stream.duration is not None or len(times) == 1:
+        return set()
+    shown, missing_s = np.array(sorted(times)), declared / av.time_base - end_s
+    step_s = float(np.median(np.diff(shown)) * stream.time_base)
+    if missing_s < MIN_CUT_S + step_s:
+        return set()
+    count = min(round(missing_s / step_s), len(shown) + 1)
+    step = missing_s / count / float(stream.time_base)
+    return {round(shown[-1] + step * (1 + number)) for number in range(count)}
+
+
 def _slowdown(shown_s: Float[np.ndarray, "frame"], capture_rate: str) -> float:
     """Return a video's slow-motion factor by its metadata tag; 1 without a tag."""
     try:
@@ -184,15 +214,16 @@ def _slowdown(shown_s: Float[np.ndarray, "frame"], capture_rate: str) -> float:
     return slowdown if MIN_SLOWDOWN <= max(slowdown, 1 / max(slowdown, 1e-9)) < np.inf else 1.0
 
 
-def _packet_times(container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[int]:
-    """Yield the PTS of all frames except those hidden by an edit list, which only serve as references."""
-    packets = container.demux(stream)
-    while True:
-        try:
-            packet = next(packets, None)
-        except av.error.FFmpegError:
-            return
-        if packet is None:
-            return
-        if packet.pts is not None and packet.size and not packet.is_discard:
-            yield packet.pts
+def _packet_times(container: av.container.InputContainer, stream: av.VideoStream) -> tuple[set[int], float]:
+    """Return the PTS of all frames except those hidden by an edit list, which only serve as references, and
+    the end of the last packet of any stream, seconds.
+    """
+    times, end_s = set(), 0.0
+    with contextlib.suppress(av.error.FFmpegError):
+        for packet in container.demux():
+            if packet.pts is None or packet.time_base is None or not packet.size:
+                continue
+            end_s = max(end_s, float((packet.pts + (packet.duration or 0)) * packet.time_base))
+            if packet.stream is stream and not packet.is_discard:
+                times.add(packet.pts)
+    return times, end_s

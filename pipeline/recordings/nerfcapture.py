@@ -35,8 +35,8 @@ def open_recording(path: Path) -> Recording:
     container: Container = FolderContainer(path) if path.is_dir() else ZipContainer(path)
     table = _table(container)
     scale = _meters_per_unit(table, container)
-    frames = _frames(table, container)
-    frames = [frame for frame in frames if {frame["file_path"], frame["depth_path"]} <= container.names]
+    listed = _frames(table, container)
+    frames = [frame for frame in listed if {frame["file_path"], frame["depth_path"]} <= container.names]
     if not frames:
         raise no_frames(container.where, "no frame has colour and depth")
     timestamp_s, remarks = _times(frames, container.where)
@@ -56,6 +56,7 @@ def open_recording(path: Path) -> Recording:
         convention=OPENGL,
         up=Y_UP,
         remarks=remarks,
+        listed=len(listed),
     )
 
 

@@ -40,7 +40,7 @@ def open_recording(path: Path) -> Recording:
     depth = container.numbered("depth", ".png", ".exr")
     if not depth:
         raise no_depth(container.where, "depth/ holds no numbered PNG or EXR pictures")
-    index = np.array(sorted(number for number in depth if number < len(movie)), int)
+    index = np.array(sorted(depth.keys() & set(movie.complete.tolist())), int)
     if len(index) == 0:
         why = "no depth picture carries the number of a video frame, counted from 0"
         raise no_frames(container.where, why)
@@ -68,7 +68,8 @@ def open_recording(path: Path) -> Recording:
         convention=OPENCV,
         quarter_turns=movie.quarter_turns,
         depth_camera=camera,
-        remarks=remarks + camera_remarks,
+        remarks=remarks + camera_remarks + movie.remarks,
+        listed=-(-len(movie) // max(1, int(np.median(np.diff(sorted(depth)))))) if len(depth) > 1 else 0,
     )
 
 
@@ -77,8 +78,8 @@ def _alone(path: Path) -> Recording:
     return Recording(
         where=str(path),
         kind="video without depth",
-        index=np.arange(len(movie)),
-        timestamp_s=movie.timestamp_s,
+        index=movie.complete,
+        timestamp_s=movie.timestamp_s[movie.complete],
         intrinsics=None,
         pose=None,
         color_size=movie.size,
@@ -86,6 +87,8 @@ def _alone(path: Path) -> Recording:
         read_color=movie.read,
         read_depth=lambda i: np.zeros((0, 0), np.float32),
         quarter_turns=movie.quarter_turns,
+        remarks=movie.remarks,
+        listed=len(movie),
     )
 
 

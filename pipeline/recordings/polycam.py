@@ -83,6 +83,7 @@ def open_recording(path: Path) -> Recording:
         up=Y_UP,
         read_mesh=(lambda: _mesh(container)) if mesh else None,
         remarks=("Polycam keeps sparse keyframes: good for the walk-through, too few for the animal",),
+        listed=len(set.union(*map(set, files))),
     )
 
 

@@ -84,10 +84,10 @@ def _open(container: Container, layout: _Layout) -> Recording:
         raise InputError("CAP-003", what, container.where, remedy)
     metadata = _Metadata(container, layout.metadata)
     refuse_surplus_members(container, metadata.declared_frames())
-    stored = _numbers(container.names, layout.depth)
+    stored, pictures = (_numbers(container.names, each) for each in (layout.depth, layout.color))
     if not stored:
         raise no_depth(container.where, "Record3D's archive holds none")
-    index = np.array(sorted(stored & _numbers(container.names, layout.color)), int)
+    index = np.array(sorted(stored & pictures), int)
     if len(index) == 0:
         raise no_frames(container.where, "none has colour and depth")
     timestamp_s = metadata.timestamp_s(index)
@@ -110,6 +110,7 @@ def _open(container: Container, layout: _Layout) -> Recording:
         convention=OPENGL,
         up=metadata.up(),
         remarks=tuple(metadata.remarks),
+        listed=max(metadata.declared_frames(), len(stored | pictures)),
     )
 
 

@@ -60,6 +60,13 @@ class Recording:
     """the depth camera; None if depth is registered to the colour camera"""
     remarks: tuple[str, ...] = ()
     """assumptions and omissions, one sentence each"""
+    listed: int = 0
+    """frames that its files list, of which ``index`` holds the complete ones; 0 if not known"""
+
+    @property
+    def incomplete(self) -> float:
+        """Share (0..1) of the listed frames whose picture, depth or metadata are missing."""
+        return max(0, self.listed - len(self.index)) / max(self.listed, 1)
 
 
 def damaged(where: str, why: str) -> InputError:

@@ -71,6 +71,7 @@ def open_recording(path: Path) -> Recording:
         convention=OPENCV,
         depth_camera=camera,
         remarks=remarks + camera_remarks,
+        listed=len(files["color"].keys() | files["depth"].keys()),
     )
 
 

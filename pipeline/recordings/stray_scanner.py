@@ -30,6 +30,8 @@ from pipeline.recordings.recording import (
 INTRINSICS_SIZE = (1440, 1920)
 """(height, width) that the app's intrinsics refer to, whatever the video's size"""
 POSE = ("qx", "qy", "qz", "qw", "x", "y", "z")
+MIN_TIMED = 0.5
+"""minimum share of rows with increasing times"""
 MAX_FRAMES = 1 << 31
 """upper bound of frame numbers"""
 COEFFICIENTS = ("fx", "fy", "cx", "cy")
@@ -58,7 +60,8 @@ def open_recording(path: Path) -> Recording:
     depth = container.numbered("depth")
     if not depth:
         raise no_depth(container.where, "the folder depth/ is empty")
-    valid = np.array([number < len(movie) and int(number) in depth for number in rows.frame], bool)
+    complete = depth.keys() & set(movie.complete.tolist())
+    valid = np.array([int(number) in complete for number in rows.frame], bool)
     if not valid.any():
         raise no_frames(container.where, "none has colour, depth and odometry")
     index = rows.frame[valid]
@@ -84,11 +87,16 @@ def open_recording(path: Path) -> Recording:
         read_confidence=confident if confidence else None,
         convention=OPENCV,
         up=Y_UP,
+        remarks=movie.remarks,
+        listed=max(len(movie), len(rows.frame)),
     )
 
 
 def read_odometry(text: str, where: str) -> OdometryTable:
-    """Read the table by its column names: 7 (oldest, no header), 9 or 15 columns, blanks where unknown."""
+    """Read the table by its column names: 7 (oldest, no header), 9 or 15 columns, blanks where unknown.
+
+    Rows without a later time than all before, and a last one that was cut off, are left out.
+    """
     lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines())]
     lines = [row for row in lines if any(row)]
     header = tuple(cell.lower() for cell in lines[0]) if lines else ()
@@ -98,22 +106,25 @@ def read_odometry(text: str, where: str) -> OdometryTable:
         raise broken_metadata(where, f"columns {', '.join(header) or 'none'} are no odometry")
     else:
         header = OLDEST
+    lines = lines[: len(lines) - (len(lines) > 1 and len(lines[-1]) < len(lines[0]))]
     known = [(i, name) for i, name in enumerate(header) if name in READ]
     try:
         column = {name: np.array([float(row[i] or "nan") for row in lines]) for i, name in known}
     except (ValueError, IndexError) as error:
         raise broken_metadata(where, f"a row is cut or no numbers ({error})") from error
-    timestamp_s = column.get("timestamp")
-    if timestamp_s is not None and (not np.isfinite(timestamp_s).all() or np.any(np.diff(timestamp_s) <= 0)):
+    timestamp_s = column.get("timestamp", np.arange(len(lines)))
+    later = timestamp_s > np.fmax.accumulate(np.r_[-np.inf, timestamp_s[:-1]])
+    if later.sum() < MIN_TIMED * len(lines):
         raise broken_metadata(where, "the times must increase")
-    frame = column.get("frame", np.arange(len(lines)))
+    column = {name: values[later] for name, values in column.items()}
+    frame = column.get("frame", np.flatnonzero(later))
     if not (np.isfinite(frame) & (frame >= 0) & (frame < MAX_FRAMES)).all():
         raise broken_metadata(where, "a frame has no number")
     pose, coefficients = np.stack([column[name] for name in POSE], axis=1), None
     if set(COEFFICIENTS) <= set(column):
         coefficients = np.stack([column[name] for name in COEFFICIENTS], axis=1)
         coefficients = coefficients if np.isfinite(coefficients).all() else None
-    return OdometryTable(frame.astype(int), timestamp_s, pose, coefficients)
+    return OdometryTable(frame.astype(int), column.get("timestamp"), pose, coefficients)
 
 
 def _intrinsics(

@@ -26,10 +26,10 @@ DEFAULT_SIZE = (480, 640)
 """(height, width) that the default intrinsics refer to"""
 QUOTED = 40
 """maximum characters of a line in an error"""
-PER_METER, MILLIMETERS = 5000.0, 1000.0
-"""depth units per metre of the data set, and of most other cameras"""
-MAX_RESIDUAL_RATIO = 0.5
-"""millimetres are chosen if their residual is below this share of the other unit's"""
+PER_METER, OTHERS = 5000.0, (1000.0, 10_000.0)
+"""depth units per metre of the data set, and of other cameras"""
+MAX_RESIDUAL_RATIO = 0.6
+"""another unit is chosen if their residual is below this share of the other unit's"""
 NEAREST_S = 0.02
 """maximum time difference between a colour picture, its depth and its pose, seconds"""
 DEFAULT = (525.0, 525.0, 319.5, 239.5)
@@ -78,6 +78,7 @@ def open_recording(path: Path) -> Recording:
         convention=OPENCV,
         depth_camera=camera,
         remarks=remarks + scale_remarks + camera_remarks,
+        listed=len(present),
     )
 
 
@@ -148,7 +149,8 @@ def _units_per_meter(
         check = check_poses(*tracked, lambda i: view(known[i], per_meter), documented=OPENCV, among=(OPENCV,))
         return check.residual_m / check.tolerance_m
 
-    if residual(MILLIMETERS) < min(1.0, MAX_RESIDUAL_RATIO * residual(PER_METER)):
-        fit = f"{MILLIMETERS:g} units per metre fit the poses, the set's {PER_METER:g} do not"
-        return MILLIMETERS, (f"no {name}: {fit}",)
+    best = min(OTHERS, key=residual)
+    if residual(best) < min(1.0, MAX_RESIDUAL_RATIO * residual(PER_METER)):
+        fit = f"{best:g} units per metre fit the poses, the set's {PER_METER:g} do not"
+        return best, (f"no {name}: {fit}",)
     return assumed

@@ -17,6 +17,9 @@ MARGIN_M, MARGIN_SHARE = 0.12, 0.03
 """a point is in another frame's free space if depth there is larger by this, metres and share of depth"""
 ANIMAL_M2 = (0.006, 0.6)
 """smallest and largest visible surface of an animal, square metres"""
+LARGE_M2 = 0.1
+"""visible moving surface of a person or a large animal, square metres; drift and noise of walk-throughs whose
+parts agree stay below, and so does a cat"""
 TWO_APART_M = 0.6
 """clusters further apart than this are two animals, metres"""
 VOTES = 2
@@ -30,6 +33,8 @@ class MotionShare:
     """share of frames (0..1) with a moving object of an animal's size"""
     several: float
     """share of frames with two such objects far apart"""
+    large: float
+    """share of frames in which something larger than `LARGE_M2` moves"""
 
 
 def find_motion(shots: Sequence[SampledFrame]) -> MotionShare | None:
@@ -37,9 +42,11 @@ def find_motion(shots: Sequence[SampledFrame]) -> MotionShare | None:
     if len(shots) < 4 or shots[0].odometry_from_camera is None:
         return None
     clusters = [_clusters(shot, _moved(shot, shots)) for shot in shots]
-    seen = float(np.mean([bool(found) for found in clusters]))
-    several = float(np.mean([_far_apart(found) for found in clusters]))
-    return MotionShare(seen, several)
+    animals = [[at for at, area in found if ANIMAL_M2[0] < area < ANIMAL_M2[1]] for found in clusters]
+    seen = float(np.mean([bool(found) for found in animals]))
+    several = float(np.mean([_far_apart(found) for found in animals]))
+    large = float(np.mean([any(area > LARGE_M2 for _, area in found) for found in clusters]))
+    return MotionShare(seen, several, large)
 
 
 def _moved(shot: SampledFrame, others: Sequence[SampledFrame]) -> Bool[np.ndarray, "height width"]:
@@ -65,17 +72,15 @@ def _range_around(depth: Float[np.ndarray, "height width"]) -> tuple[np.ndarray,
     return low, cv2.dilate(depth, ones)
 
 
-def _clusters(shot: SampledFrame, marked: Bool[np.ndarray, "height width"]) -> list[Float[np.ndarray, "3"]]:
-    """Return the centres (camera axes, metres) of connected regions of an animal's size."""
+def _clusters(
+    shot: SampledFrame, marked: Bool[np.ndarray, "height width"]
+) -> list[tuple[Float[np.ndarray, "3"], float]]:
+    """Return the centres (camera axes, metres) and surfaces (square metres) of connected regions."""
     count, labels = cv2.connectedComponents(marked.astype(np.uint8), connectivity=8)
     points = cameras.back_project(shot.depth, shot.depth_intrinsics)
     area = shot.depth**2 / (shot.depth_intrinsics[0, 0] * shot.depth_intrinsics[1, 1])
-    found = []
-    for label in range(1, count):
-        region = labels == label
-        if ANIMAL_M2[0] < float(area[region].sum()) < ANIMAL_M2[1]:
-            found.append(np.median(points[region], axis=0))
-    return found
+    regions = [labels == label for label in range(1, count)]
+    return [(np.median(points[region], axis=0), float(area[region].sum())) for region in regions]
 
 
 def _far_apart(centres: Sequence[Float[np.ndarray, "3"]]) -> bool:

@@ -38,11 +38,12 @@ class CaptureMeasurements:
 
 SHORTEST_S: dict[Role, float] = {"walkthrough": 30.0, "turnaround": 8.0, "session": 15.0, "heldout": 5.0}
 MAX_DARK, MAX_BLURRED, MIN_DEPTH, MAX_BEYOND, MAX_DAMAGED = 0.2, 0.25, 0.5, 0.2, 0.0
+MAX_INCOMPLETE = 0.02
 MAX_DRIFT_M = 0.10
 MIN_PLACED = 0.05
 MIN_SEEN = 0.25
 MIN_LINKED, MIN_PARALLAX = 0.6, 0.3
-MAX_SEVERAL = 0.5
+MAX_SEVERAL, MAX_LARGE = 0.5, 0.06
 LONGEST_GAP_S = 1.0
 SPARSE_HZ = 5.0
 REMEDIES = {
@@ -55,7 +56,7 @@ REMEDIES = {
     "CAP-037": "avoid mirrors, glass and black things; do not cover the sensor",
     "CAP-038": "stay within 4 m of floor, walls and animal",
     "CAP-039": "record it with a LiDAR phone, or let a session with depth go where it went",
-    "CAP-050": "begin to record when the app's tracking is ready; the build goes on without, less surely",
+    "CAP-050": "correct a unit that is named; begin when tracking is ready; the build goes on, less surely",
     "CAP-051": "nothing to do; if pictures look wrong, report the app's version",
     "CAP-052": "move smoothly, keep textured things in view; the build repairs what depth shows",
     "CAP-053": "film the walk-through again and include this part of the room, or leave the file out",
@@ -64,6 +65,7 @@ REMEDIES = {
     "CAP-056": "walk sideways instead of turning on the spot, slowly, along things with a pattern",
     "CAP-057": "copy the file unedited; check the unit of its depth, its intrinsics and what mirrored it",
     "CAP-058": "leave poses out that are not its own; else move slowly, along things with a pattern",
+    "CAP-059": "film the room again with nobody in it; if nobody was there, ignore it (large panes of glass)",
 }
 
 
@@ -77,8 +79,11 @@ def problems(seen: CaptureMeasurements, role: Role) -> list[CaptureProblem]:
 
 def _of_pictures(sample: RecordingSample, role: Role) -> dict[str, str]:
     found = {}
-    if sample.damaged > MAX_DAMAGED:
-        found["CAP-030"] = f"{sample.damaged:.0%} of the pictures are damaged"
+    if sample.recording.incomplete > MAX_INCOMPLETE:
+        complete = f"{len(sample.recording.index)} of {sample.recording.listed} frames"
+        found["CAP-030"] = f"only {complete} have their picture, depth and metadata: files are missing"
+    elif sample.damaged > MAX_DAMAGED:
+        found["CAP-030"] = f"{sample.damaged:.0%} of the pictures are damaged or missing"
     if sample.duration_s < SHORTEST_S[role]:
         found["CAP-031"] = f"only {sample.duration_s:.0f} s long"
     if sample.dark > MAX_DARK:
@@ -137,6 +142,10 @@ def _of_content(seen: CaptureMeasurements, role: Role) -> dict[str, str]:
     found = {}
     if seen.placed is not None and seen.placed < MIN_PLACED:
         found["CAP-053"] = f"{seen.placed:.0%} of the frames are found in the walk-through"
+    agree = seen.sample.agreement is not None and seen.sample.agreement.verdict == "agree"
+    if role == "walkthrough" and seen.moving is not None and agree and not seen.drift_m > MAX_DRIFT_M:
+        if seen.moving.large > MAX_LARGE:
+            found["CAP-059"] = f"someone or something large moves in {seen.moving.large:.0%} of the frames"
     if seen.moving is not None and role == "session":
         if seen.moving.seen < MIN_SEEN:
             found["CAP-054"] = f"something of an animal's size moves in {seen.moving.seen:.0%} of the frames"

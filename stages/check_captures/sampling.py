@@ -1,7 +1,7 @@
 """Sample a recording: a few dozen upright frames spread over it, and what can be measured without a map."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -30,14 +30,14 @@ class SampledFrame:
 
     timestamp_s: float
     gray: UInt8[np.ndarray, "height width"]
-    intrinsics: Float[np.ndarray, "3 3"]
-    depth: Float[np.ndarray, "depth_height depth_width"]
-    """metres, 0 = unknown"""
-    depth_intrinsics: Float[np.ndarray, "3 3"]
-    odometry_from_camera: Float[np.ndarray, "4 4"] | None
     sharpness: float
     brightness: float
-    beyond: float
+    intrinsics: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    depth: Float[np.ndarray, "depth_height depth_width"] = field(default_factory=lambda: np.zeros((0, 0)))
+    """metres, 0 = unknown"""
+    depth_intrinsics: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    odometry_from_camera: Float[np.ndarray, "4 4"] | None = None
+    beyond: float = 0.0
     """share of the depth that is known but beyond the sensor's range"""
 
     @property
@@ -155,22 +155,9 @@ def _look_at_pictures(recording: Recording, count: int) -> RecordingSample:
     rows, shots = evenly(len(recording.index), count, rounded=True), []
     for row in rows:
         color = extraction.picture(recording, row)
-        if color is None:
-            continue
-        sharpness, brightness = extraction.picture_statistics(color)
-        shots.append(
-            SampledFrame(
-                timestamp_s=float(recording.timestamp_s[row]),
-                gray=cv2.cvtColor(color, cv2.COLOR_RGB2GRAY),
-                intrinsics=np.eye(3),
-                depth=np.zeros((0, 0), np.float32),
-                depth_intrinsics=np.eye(3),
-                odometry_from_camera=None,
-                sharpness=sharpness,
-                brightness=brightness,
-                beyond=0.0,
-            )
-        )
+        if color is not None:
+            gray, statistics = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), extraction.picture_statistics(color)
+            shots.append(SampledFrame(float(recording.timestamp_s[row]), gray, *statistics))
     _refuse_empty(recording, shots)
     return RecordingSample(recording, None, shots, 1 - len(shots) / len(rows))
 

@@ -70,11 +70,11 @@ def _seen(
         shifted = parallax.parallax(sample.shots) if role == "walkthrough" else None
         return CaptureMeasurements(sample, parallax=shifted)
     drift_m = pose_drift.drift_m(sample.shots)
+    moving = moving_objects.find_motion(sample.shots) if role in ("walkthrough", "session") else None
     if role == "walkthrough":
         room += overlap.describe(sample.shots)
-        return CaptureMeasurements(sample, drift_m)
+        return CaptureMeasurements(sample, drift_m, moving)
     placed = None
     if room and role != "turnaround":  # may be filmed anywhere: only the animal's template is made from it
         placed = overlap.placed_share(room, overlap.describe(sample.shots), rng)
-    moving = moving_objects.find_motion(sample.shots) if role == "session" else None
     return CaptureMeasurements(sample, drift_m, moving, placed)

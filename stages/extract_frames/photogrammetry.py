@@ -206,6 +206,7 @@ def _plan(
         quarter_turns=turns,
         pose_check=PoseCheck("untested", OPENCV, 0, np.nan, np.nan, TOLERANCE_M, reason),
         scale=scale,
+        incomplete=recording.incomplete,
     )
 
 

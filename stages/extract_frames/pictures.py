@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from pipeline.core.errors import InputError
@@ -13,9 +12,7 @@ from pipeline.geometry import cameras
 from pipeline.recordings import extraction
 from pipeline.recordings.recording import Recording, damaged
 from stages.extract_frames.config import Config
-from stages.extract_frames.writing import MAX_LOST, MIN_FRAMES
-
-SHEET_FRAMES, SHEET_HEIGHT_PX = 12, 200
+from stages.extract_frames.writing import BLURRED_SHARE, MAX_LOST, MIN_FRAMES, SHEET_FRAMES, thumbnail
 
 
 def write(folder: Path, recording: Recording, config: Config) -> None:
@@ -34,8 +31,7 @@ def write(folder: Path, recording: Recording, config: Config) -> None:
         chosen.append(row)
         statistics.append(extraction.picture_statistics(color))
         if row in shown:
-            width = round(color.shape[1] * SHEET_HEIGHT_PX / color.shape[0])
-            strip.append(cv2.resize(color, (width, SHEET_HEIGHT_PX), interpolation=cv2.INTER_AREA))
+            strip.append(thumbnail(color))
     if len(rows) - len(chosen) > MAX_LOST * len(rows):
         raise damaged(recording.where, f"{len(rows) - len(chosen)} of {len(rows)} pictures cannot be decoded")
     if len(chosen) < MIN_FRAMES:
@@ -52,7 +48,8 @@ def write(folder: Path, recording: Recording, config: Config) -> None:
         brightness=brightness,
     )
     log(f"{recording.where}: {recording.kind}, {len(chosen)} pictures; cameras and depth come from the map")
-    blurred = float((sharpness < 0.4 * max(float(np.median(sharpness)), 1e-6)).mean())
+    lost = 1 - (1 - recording.incomplete) * len(chosen) / len(rows)
+    blurred = float((sharpness < BLURRED_SHARE * max(float(np.median(sharpness)), 1e-6)).mean())
     qa.write(
         folder,
         good="upright, sharp pictures",
@@ -62,6 +59,7 @@ def write(folder: Path, recording: Recording, config: Config) -> None:
             qa.Check("pictures", float(len(chosen)), "", warn=50, better="higher"),
             qa.Check("dark pictures", 100 * float((brightness < extraction.DARK).mean()), "%", warn=20.0),
             qa.Check("blurred pictures", 100 * blurred, "%", warn=25.0),
+            qa.Check("damaged or missing pictures", 100 * lost, "%", warn=0.0),
         ],
         pictures=[qa.Picture("contact_sheet", np.concatenate(strip, axis=1), "frames spread over the video")],
     )

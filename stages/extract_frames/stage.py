@@ -31,6 +31,8 @@ def run(
     Raises InputError CAP-001..022, MAP-004 for what cannot be used.
     """
     recording = open_recording(inputs.recording)
+    for remark in recording.remarks:
+        progress.log(f"{recording.where}: {remark}")
     if recording.depth_size is None and video is not None and video.role in ("session", "turnaround"):
         pictures.write(out, recording, config)
         return

@@ -57,7 +57,7 @@ def write_frames(
             lost += 1
             continue
         if number in shown:
-            strip.append((_thumbnail(frame.color), _thumbnail(_colored_depth(frame.depth))))
+            strip.append((thumbnail(frame.color), thumbnail(_colored_depth(frame.depth))))
         if frame.depth_valid < min_depth_valid:
             continue
         name = f"{len(statistics):06d}"
@@ -130,6 +130,7 @@ def report_quality(
         qa.Check("known depth", 100 * float(written.depth_valid.mean()), "%", warn=50.0, better="higher"),
         qa.Check("frames dropped for lack of depth", 100 * dropped, "%", warn=10.0),
         qa.Check("damaged frames", 100 * written.lost, "%", warn=0.0),
+        qa.Check("incomplete frames left out", 100 * plan.incomplete, "%", warn=2.0),
         qa.Check("clockwise quarter turns applied", float(plan.quarter_turns)),
         qa.Check("device poses usable", with_poses, "", warn=0.5, better="higher"),
         _check_of_poses(plan),
@@ -170,7 +171,8 @@ def _check_of_pictures(agreement: PictureAgreement | None) -> list[qa.Check]:
     return [qa.Check(name, agreeing, "", warn=0.75, fail=0.25, better="higher")]
 
 
-def _thumbnail(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
+def thumbnail(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
+    """Reduce a picture to the height of a contact sheet."""
     width = max(round(image.shape[1] * SHEET_HEIGHT_PX / image.shape[0]), 1)
     return cv2.resize(image, (width, SHEET_HEIGHT_PX), interpolation=cv2.INTER_AREA)
 

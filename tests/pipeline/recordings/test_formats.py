@@ -282,12 +282,24 @@ def test_streams_may_name_pictures_without_their_ending(tmp_path, ending):
     assert recording.read_color(5) == (path / f"rgb/5{ending}").read_bytes()
 
 
-@pytest.mark.parametrize("per_meter", [1000, 5000])
+@pytest.mark.parametrize("per_meter", [1000, 5000, 10_000])
 def test_poses_tell_millimetres_from_the_units_of_the_set(tmp_path, per_meter):
     made = walk(18, rate_hz=RATE_HZ)
     recording = open_recording(made_formats.tum(tmp_path / "a", made, per_meter=per_meter))
     np.testing.assert_allclose(recording.read_depth(3), made.depth(3), atol=1e-3)
     assert any(f"{per_meter} units per metre" in remark for remark in recording.remarks)
+
+
+@pytest.mark.parametrize(("per_meter", "named"), [(100, "times 10 "), (1000, ""), (200, "times 5 ")])
+def test_poses_name_the_unit_in_which_depth_would_agree(tmp_path, per_meter, named):
+    made = walk(18, rate_hz=RATE_HZ)
+    path = made_formats.video_and_depth(tmp_path / "a", made)
+    for number in range(18):
+        depth = made_formats.png(made_formats.millimeters(made.depth(number), per_meter))
+        (path / f"depth/{number:06d}.png").write_bytes(depth)
+    _, plan = _understand(path)
+    assert (plan.odometry_from_camera is None) == bool(named)
+    assert f"depth {named}would agree with them" in plan.pose_check.reason or not named
 
 
 def test_a_file_tells_the_units_of_depth(tmp_path):
@@ -537,6 +549,13 @@ def _zipped(path, made):
     return path.with_suffix(".zip")
 
 
+def _no_depth_anywhere(path, made):
+    made_formats.video_and_depth(path, made)
+    for file in (path / "depth").iterdir():
+        file.write_bytes(made_formats.png(np.zeros((32, 24), np.uint16)))
+    return path
+
+
 FAULTS = {
     "CAP-001": _cut_video,
     "CAP-003": lambda path, made: path,
@@ -546,6 +565,7 @@ FAULTS = {
     "CAP-004 ": _new_polycam,
     "CAP-006": _no_depth,
     "CAP-007": _unmatched,
+    "CAP-007 ": _no_depth_anywhere,
     "CAP-008": _other_depth_size,
     "CAP-004  ": _intrinsics_of_another_size,
     "CAP-008 ": _millimetres_as_metres,

@@ -9,6 +9,7 @@ import pytest
 from pipeline.core.videos import Role
 from pipeline.geometry import cameras, rigid
 from pipeline.geometry.meshes import RayCaster, render_view
+from pipeline.mapping import picture_agreement
 from pipeline.recordings.formats import open_recording
 from stages.check_captures import __main__ as front
 from stages.check_captures import moving_objects, overlap, parallax, pose_drift, problems, sampling
@@ -141,6 +142,11 @@ def test_damaged_pictures_and_missing_depth_are_told(tmp_path):
     data[middle - 20_000 : middle + 20_000] = bytes(40_000)
     (tmp_path / "a.mp4").write_bytes(data)
     assert "CAP-030" in _codes(tmp_path / "a.mp4")
+    made_formats.write_movie(tmp_path / "a.mkv", [made.color(i) for i in range(60)], rate=15)
+    data = (tmp_path / "a.mkv").read_bytes()
+    assert "CAP-030" not in _codes(tmp_path / "a.mkv")
+    (tmp_path / "a.mkv").write_bytes(data[: len(data) * 2 // 3])
+    assert "CAP-030" in _codes(tmp_path / "a.mkv")
 
 
 def _shots(
@@ -164,7 +170,7 @@ def _shots(
         small = depth[1::3, 1::3].astype(np.float32)
         depth_intrinsics = cameras.scale_intrinsics(intrinsics, size, small.shape)
         found.append(
-            SampledFrame(float(frame), gray, intrinsics, small, depth_intrinsics, odometry, 20.0, 0.5, 0.0)
+            SampledFrame(float(frame), gray, 20.0, 0.5, intrinsics, small, depth_intrinsics, odometry)
         )
     return found
 
@@ -216,6 +222,36 @@ def test_movers_are_counted():
         for seen in (still, lone, pair)
     ]
     assert codes == [{"CAP-054"}, set(), {"CAP-055"}]
+
+
+def test_someone_who_walks_through_the_walk_through_is_told():
+    """A cat is too small to be told from the drift of poses, which must not warn."""
+
+    def person(frame):
+        return [((0.25 * frame - 1, 0.6, 0.5), 0.35)] if frame < 8 else []
+
+    def cat(frame):
+        return [((0.25 * frame - 1, 0.1, 0.5), 0.1)]
+
+    drift = rigid.rotation_from_yaw(np.radians(2.0) * np.arange(16) / 16)
+    still = [
+        dataclasses.replace(
+            shot, odometry_from_camera=rigid.make(turn, np.zeros(3)) @ shot.odometry_from_camera
+        )
+        for shot, turn in zip(_shots(0, 16), drift, strict=True)
+    ]
+    agree = picture_agreement.PictureAgreement("agree", 0.9, 40)
+    sample = sampling.RecordingSample(None, None, [], 0.0, agree)
+    doubted = dataclasses.replace(sample, agreement=dataclasses.replace(agree, verdict="unconfirmed"))
+
+    def codes(shots, sample=sample, role="walkthrough"):
+        moving = moving_objects.find_motion(shots)
+        return set(problems._of_content(problems.CaptureMeasurements(sample, moving=moving), role))
+
+    walked = _shots(0, 16, balls=person)
+    assert codes(walked) == {"CAP-059"}
+    assert codes(walked, doubted) == codes(walked, role="turnaround") == set()
+    assert codes(still) == codes(_shots(0, 16, balls=cat)) == set()
 
 
 def test_without_poses_nothing_is_claimed():
@@ -288,7 +324,7 @@ def _layers(near_step_px: int) -> list[SampledFrame]:
 
     Per picture the far one moves by 4 pixels, the near one by its own step.
     """
-    rng, nothing = np.random.default_rng(0), np.zeros((0, 0), np.float32)
+    rng = np.random.default_rng(0)
     far, near = (
         cv2.normalize(cv2.GaussianBlur(rng.normal(size=(240, 600)), (0, 0), 3), None, 0, 255, cv2.NORM_MINMAX)
         for _ in range(2)
@@ -297,11 +333,7 @@ def _layers(near_step_px: int) -> list[SampledFrame]:
     for number in range(8):
         picture = far[:, 4 * number : 4 * number + 320].copy()
         picture[120:] = near[120:, near_step_px * number : near_step_px * number + 320]
-        shots.append(
-            SampledFrame(
-                float(number), picture.astype(np.uint8), np.eye(3), nothing, np.eye(3), None, 20.0, 0.5, 0.0
-            )
-        )
+        shots.append(SampledFrame(float(number), picture.astype(np.uint8), 20.0, 0.5))
     return shots
 
 
