@@ -1,6 +1,4 @@
-"""A small truth for behaviour tests: an animal that wanders in a walled room with an observer who walks
-about.
-"""
+"""Synthetic data for behavior tests: an animal that wanders in a walled room with a walking observer."""
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -29,7 +27,7 @@ ARCHITECTURE = Architecture(
 
 
 def room() -> FeatureVolume:
-    """A floor and four walls of 4 x 4 m around the origin, each with its own feature."""
+    """A room of 4 x 4 m around the origin: floor and four walls, each with its own feature."""
     shape = (44, 12, 44)
     occupancy = np.zeros(shape, np.uint8)
     features = np.zeros((16, *shape), np.float16)
@@ -42,7 +40,7 @@ def room() -> FeatureVolume:
 
 
 def wander(rng: np.random.Generator, seconds: float = 12.0) -> Trajectory:
-    """One recording: smooth random motion inside the room, swaying bones."""
+    """One recording: smooth random motion inside the room and periodic bone motion."""
     count = round(seconds * RATE_HZ)
     course = gaussian_filter1d(rng.standard_normal((count, 2)), 12, axis=0, mode="wrap")
     course *= 1.4 / np.abs(course).max()
@@ -67,7 +65,7 @@ def wander(rng: np.random.Generator, seconds: float = 12.0) -> Trajectory:
 
 
 def wandering(seed: int = 0, videos: int = 3) -> BehaviorData:
-    """Several recordings, the last for testing, with all their windows."""
+    """Several recordings with all their windows; the last is the test recording."""
     rng = np.random.default_rng(seed)
     trajectories = {f"v{number:03d}": wander(rng) for number in range(videos)}
     per_video = len(trajectories["v000"].timestamp_s) - PAST - FUTURE + 1

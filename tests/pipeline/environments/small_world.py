@@ -1,4 +1,4 @@
-"""An untrained animal in a room of 4 m, for tests of environments; imports no library of theirs."""
+"""An untrained animal in a room of 4 m, for tests of environments; imports no environment library."""
 
 import numpy as np
 
