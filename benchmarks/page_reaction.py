@@ -47,8 +47,8 @@ def main() -> None:
     with browser.opened(arguments.build / "simulator/index.html", timeout_s=300) as (page, errors):
         page.set_default_timeout(0)
         page.evaluate("ats.pause()")
-        of_page = twins.asked_of_the_page(page, approaches, arguments.checks)
-    of_python = twins.asked_of_python(
+        of_page = twins.goals_of_page(page, approaches, arguments.checks)
+    of_python = twins.goals_of_python(
         arguments.build, arguments.build / "simulator", approaches, arguments.checks
     )
     print("| | page | Python |\n|---|---|---|")

@@ -1,6 +1,4 @@
-"""Fifty frames of a real kitchen (7-Scenes): the first half a walk-through, the second a session, both
-without odometry.
-"""
+"""Fifty frames of a real kitchen (7-Scenes): a walk-through and a session, without odometry."""
 
 import os
 import shutil
@@ -22,7 +20,7 @@ RATE_HZ = 30.0
 
 @dataclass(frozen=True)
 class Half:
-    """One half as a recording, and where its cameras truly were."""
+    """One half as a recording, and its true cameras."""
 
     clip: Clip
     world_from_camera: Float[np.ndarray, "frame 4 4"]

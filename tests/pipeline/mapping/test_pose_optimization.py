@@ -70,7 +70,7 @@ def test_odometry_constrains_frames_without_correspondences():
     assert np.abs(found.world_from_camera - truth).max() < 1e-4
 
 
-def test_covisible_pairs_and_fixed_frames():
+def test_covisible_pairs_are_aligned_and_fixed_frames_stay():
     rng = np.random.default_rng(2)
     _, truth, _, _ = corridor(rng)
     first, second = np.repeat(np.arange(FRAMES - 1), 60), np.repeat(np.arange(1, FRAMES), 60)

@@ -287,7 +287,7 @@ def test_poses_distinguish_millimetres_from_dataset_units(tmp_path, per_meter):
     assert any(f"{per_meter} units per metre" in remark for remark in recording.remarks)
 
 
-def test_sidecar_gives_the_depth_unit(tmp_path):
+def test_depth_scale_file_gives_the_depth_unit(tmp_path):
     made = walk(6)
     path = made_formats.tum(tmp_path / "a", made, poses=False, per_meter=256)
     (path / "depth_scale.txt").write_text("# units per metre\n256\n")

@@ -1,4 +1,4 @@
-"""The page of several animals: each lives, perceives the others as Python does, and obeys hands alone."""
+"""The page of several animals: all are simulated, perceive each other as in Python, and react to input."""
 
 import json
 from pathlib import Path
@@ -34,7 +34,7 @@ def home(animals: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return small_world.exported_home(animals, tmp_path_factory.mktemp("home") / "page")
 
 
-def test_contract_has_every_animal_and_the_room_once(home: Path, animals: Path) -> None:
+def test_contract_has_each_animal_and_one_room(home: Path, animals: Path) -> None:
     told = json.loads((home / "simulator.json").read_bytes())
     own = json.loads(
         (small_world.exported(animals / "cat", home.parent / "cat") / "simulator.json").read_bytes()
@@ -63,7 +63,7 @@ def test_animals_perceive_each_other_as_in_python(home: Path, animals: Path, chr
 
 
 def _check_goals(page: Page, home: Path, cat: Path) -> None:
-    """Goals beside a companion, with the same noise: the page's are Python's, and shift away from it."""
+    """Goals beside a companion with the same noise equal those of Python, and shift away from it."""
     met = twins.approaches(BehaviorData.load(cat / "behavior_data"), 20, np.random.default_rng(0))
     contract = json.loads((home / "simulator.json").read_bytes())
     height = np.full((*met.near.shape[:2], 1), 0.1)
@@ -98,7 +98,7 @@ def _check_goals(page: Page, home: Path, cat: Path) -> None:
     assert (away_m > 0.1).mean() > 0.4, "it flees from whom it perceives"
 
 
-def test_one_is_selected_switched_off_or_replayed(home: Path, animals: Path, chromium: Browser) -> None:
+def test_animals_are_selected_removed_and_replayed(home: Path, animals: Path, chromium: Browser) -> None:
     with browser.shown(chromium, (home / "index.html").as_uri(), size=(1100, 760)) as (page, wrong):
         page.wait_for_function(ALL_PLAN, timeout=60_000)
         gaps = []

@@ -47,7 +47,7 @@ def source():
     return MotionSource(split, ComparedModels(model, ablated, bank))
 
 
-def test_the_truth_scores_nothing_and_a_shifted_motion_its_shift(source):
+def test_errors_of_true_and_shifted_motion(source):
     dataset, model = source.split.held_out, source.models.ours
     part = dataset.stretches[0][:61]
     reference = scores.references([part], np.array([0]), dataset, model)[0]
@@ -72,7 +72,7 @@ def test_the_truth_scores_nothing_and_a_shifted_motion_its_shift(source):
     assert told["orientation"] == told["pose"] == pytest.approx(0, abs=1e-6)
 
 
-def test_the_memory_bank_finds_itself(source):
+def test_memory_bank_retrieves_its_own_clips(source):
     found = methods.nearest(source.models.bank, source.models.bank)
     torch.testing.assert_close(found, source.models.bank.channels)
 
@@ -125,7 +125,7 @@ def test_tables_hold_every_method_with_intervals(source):
     assert len(bars.checks(found)) > 10
 
 
-def test_clips_come_two_by_two_and_a_torn_join_is_measured(source):
+def test_clips_are_paired_and_the_gap_at_the_joint_is_measured(source):
     dataset, model = source.split.held_out, source.models.ours
     travelled = select_clips(dataset, np.random.default_rng(0), stride=10, resting=0.0)
     cuts = comparison.select_runs(travelled, 2, 6)
@@ -147,15 +147,15 @@ def test_clips_come_two_by_two_and_a_torn_join_is_measured(source):
     np.testing.assert_array_equal(torn[2:], whole[2:])
 
 
-def test_minutes_are_measured(source):
+def test_long_takes_are_measured(source):
     found = lengths.figures(source, replace(SMALL, minutes_s=12.0, subgoals=3))
     assert found["longterm_minutes/seconds"] >= 12.0
     assert found["longterm_minutes/subgoals"] == 3
     assert found["longterm_minutes/outside_room_m"] < 0.05
 
 
-def test_a_clip_is_blocked_where_the_block_stands_between_its_ends(source):
-    """The strider walks around the block: only ends on opposite sides of it have it between them."""
+def test_clips_with_an_obstacle_between_their_ends_are_marked(source):
+    """Only clips with ends on opposite sides of the block have it in between."""
     clips = comparison.encode_selection(
         source.split.held_out,
         select_clips(source.split.held_out, np.random.default_rng(0), stride=5),
