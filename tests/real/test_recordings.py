@@ -27,12 +27,12 @@ def _sample(name: str) -> Path:
 
 def test_exr_pictures_are_paired_with_their_rows():
     recording = open_recording(_sample("record3d_exr12"))
-    told = json.loads((_sample("record3d_exr12") / "EXR_RGBD" / "metadata.json").read_text())
-    assert len(told["poses"]) == 345
+    metadata = json.loads((_sample("record3d_exr12") / "EXR_RGBD" / "metadata.json").read_text())
+    assert len(metadata["poses"]) == 345
     assert recording.index.tolist() == [0, 30, 59, *range(90, 331, 30)]
     for row, number in enumerate(recording.index):
-        np.testing.assert_array_equal(recording.pose[row], told["poses"][number])
-        assert recording.timestamp_s[row] == told["frameTimestamps"][number]
+        np.testing.assert_array_equal(recording.pose[row], metadata["poses"][number])
+        assert recording.timestamp_s[row] == metadata["frameTimestamps"][number]
 
 
 @pytest.mark.slow

@@ -33,12 +33,12 @@ def test_roots_face_the_path_and_keep_the_posture():
         path, yaw = walk(torch.full((FRAMES,), 0.03), speed)
         held = columns(torch.full((FRAMES,), first))
         looks = rotated_to_heading(held, net.headings(net.steps(path, torch.zeros(1), path), held))
-        told = torch.atan2(-looks[0, 2], looks[0, 0])  # of the x axis
+        angle = torch.atan2(-looks[0, 2], looks[0, 0])  # of the x axis
         if speed:
-            assert (told - yaw)[10:30].abs().max() < 0.1
-            assert (told[30:] - told[29]).abs().max() < 1e-4
+            assert (angle - yaw)[10:30].abs().max() < 0.1
+            assert (angle[30:] - angle[29]).abs().max() < 1e-4
         else:
-            assert (told - first).abs().max() < 1e-4
+            assert (angle - first).abs().max() < 1e-4
 
 
 def test_one_stage_body_has_the_heading_of_its_path():

@@ -84,8 +84,8 @@ def test_samples_have_the_covariance_of_the_data():
     noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(4))
     drawn = sample(denoise, noise, schedule, method="dpm_solver", count=100)
     for each in (drawn, clean), (drawn.diff(dim=-1), clean.diff(dim=-1)):
-        told, true = (torch.cov(sequence[:, ROOT:].transpose(0, 1).flatten(1)) for sequence in each)
-        assert (told - true).norm() < 0.15 * true.norm()
+        sampled, true = (torch.cov(sequence[:, ROOT:].transpose(0, 1).flatten(1)) for sequence in each)
+        assert (sampled - true).norm() < 0.15 * true.norm()
 
 
 def test_other_channels_keep_unit_variance():

@@ -35,5 +35,5 @@ def test_interrupt_ends_all_processes_with_one_message():
     )
     assert running.stdout.readline() == "begun\n"
     os.killpg(running.pid, signal.SIGINT)
-    told, errors = running.communicate(timeout=30)
-    assert (told, errors, running.returncode) == ("stopped\n", "", 0)
+    output, errors = running.communicate(timeout=30)
+    assert (output, errors, running.returncode) == ("stopped\n", "", 0)

@@ -169,8 +169,8 @@ def test_moving_clips_are_kept_and_waypoints_are_level(dataset, model):
 def test_waypoints_have_clearance(dataset):
     root = np.tile(np.eye(4), (2, 1, 1))
     root[:, :3, 3] = [[1.2, 0.3, 1.2], [0.0, 0.7, 0.0]]  # over the floor, over the block
-    told = encode_places(root, np.array([0, 0]), dataset.scenes, 16, np.random.default_rng(0))
-    torch.testing.assert_close(told.place[:, 0], torch.tensor([0.3, 0.2]), atol=0.03, rtol=0)
+    encoded = encode_places(root, np.array([0, 0]), dataset.scenes, 16, np.random.default_rng(0))
+    torch.testing.assert_close(encoded.place[:, 0], torch.tensor([0.3, 0.2]), atol=0.03, rtol=0)
 
 
 def test_planned_legs_avoid_the_block_and_keep_the_duration(dataset, model):

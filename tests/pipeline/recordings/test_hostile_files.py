@@ -275,9 +275,9 @@ def test_mesh_that_expands_to_gigabytes_is_refused(tmp_path):
 
 
 def test_control_characters_are_escaped_in_messages():
-    told = str(InputError("CAP-001", "damaged \x1b[2J", "a\x1b]0;x\x07\nb.r3d", "again"))
-    assert "\x1b" not in told
-    assert told.count("\n") == 1, "only the remedy has a line of its own"
+    message = str(InputError("CAP-001", "damaged \x1b[2J", "a\x1b]0;x\x07\nb.r3d", "again"))
+    assert "\x1b" not in message
+    assert message.count("\n") == 1, "only the remedy has a line of its own"
 
 
 def test_picture_that_expands_to_gigabytes_is_refused(tmp_path):

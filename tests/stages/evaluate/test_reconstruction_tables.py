@@ -36,8 +36,8 @@ def test_difference_to_a_baseline_has_an_interval():
     assert found.values["totalrecon/depth_acc_scene_less_than_reference"] == pytest.approx(0.25)
     assert found.values["totalrecon/depth_acc_agent_less_than_reference"] == 0
     assert found.values["totalrecon/depth_acc_all_less_than_reference_ci95_low"] > 0.19
-    told = table.text({"ours/depth_acc_all": 0.9, **found.values}, ("ours", "totalrecon"))
-    assert "0.708 / 0.695 / 0.703" in told and "0.200 [0.200 0.200]" in told
+    text = table.text({"ours/depth_acc_all": 0.9, **found.values}, ("ours", "totalrecon"))
+    assert "0.708 / 0.695 / 0.703" in text and "0.200 [0.200 0.200]" in text
 
 
 def test_no_table_without_ground_truth():

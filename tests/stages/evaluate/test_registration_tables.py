@@ -79,9 +79,9 @@ def test_ablations_are_compared_frame_by_frame(capture):
     assert values["worse/v001/rotation_deg_more_than_ours"] == pytest.approx(2.0, abs=1e-6)
     assert values["worse/v001/rotation_deg_median"] == pytest.approx(3.0, abs=1e-6)
     assert values["worse/v002/rotation_deg_median"] is None
-    told = table.text(values, ("ours", "worse"))
-    assert "6.35 / 0.41" in told
-    assert "1/2" in told
+    text = table.text(values, ("ours", "worse"))
+    assert "6.35 / 0.41" in text
+    assert "1/2" in text
 
 
 def test_no_table_without_ground_truth(capture):

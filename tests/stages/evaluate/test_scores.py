@@ -220,10 +220,10 @@ def test_constant_velocity_is_exact_on_straight_walks(data):
 
 
 def test_windows_of_the_whole_test_are_evaluated_and_counted(data):
-    for asked, told in ((7, 7), (120, 97)):
+    for asked, counted in ((7, 7), (120, 97)):
         values = behavior.behavior_metrics(data, Oracle(data), replace(PROTOCOL, plan_windows=asked)).values
         assert (
-            values["behavior/plan_windows"] == told
+            values["behavior/plan_windows"] == counted
             and values["behavior/plan_trials"] == 1
             and values["behavior/test_windows"] == 97
         )

@@ -33,9 +33,9 @@ def test_blender_animates_the_animal_like_python(tmp_path) -> None:
     model, places = moving_tube.model()
     (tmp_path / "agent.glb").write_bytes(model)
     command = [BLENDER, "-c", SCRIPT, str(tmp_path / "agent.glb"), str(moving_tube.SECONDS)]
-    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     found = json.loads(
-        next(line for line in told.splitlines() if line.startswith("RESULT")).removeprefix("RESULT")
+        next(line for line in output.splitlines() if line.startswith("RESULT")).removeprefix("RESULT")
     )
     assert any(name.startswith("walk") for name in found["names"])
     x, y, z = np.array(found["places"]).T  # +z is up in Blender

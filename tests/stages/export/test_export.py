@@ -91,8 +91,8 @@ def test_glb_round_trips(agent: reading.Agent) -> None:
 
 
 def test_glb_is_valid(agent: reading.Agent, tmp_path: Path) -> None:
-    told = glb_export.write(tmp_path, agent, glb.static(small_world.room(), "scene"))
-    assert told.loss_mm == {"skinning_mean": 0.1, "skinning_max": 0.5}
+    written = glb_export.write(tmp_path, agent, glb.static(small_world.room(), "scene"))
+    assert written.loss_mm == {"skinning_mean": 0.1, "skinning_max": 0.5}
     if shutil.which("node") is None or not (WEB / "node_modules/gltf-validator").is_dir():
         pytest.skip("needs node, and `npm ci` in stages/export_simulator/web")
     script = (
@@ -113,8 +113,8 @@ def test_glb_is_valid(agent: reading.Agent, tmp_path: Path) -> None:
 
 
 def test_bvh_is_exact(agent: reading.Agent, tmp_path: Path) -> None:
-    told = bvh.write(tmp_path, agent)
-    assert told.loss_mm["flat_max"] < 0.01, "mm: six decimals"
+    written = bvh.write(tmp_path, agent)
+    assert written.loss_mm["flat_max"] < 0.01, "mm: six decimals"
     assert {path.name for path in tmp_path.iterdir()} == {"walk.flat.bvh", "turn.flat.bvh"}
 
 
@@ -132,9 +132,9 @@ def test_boxes_cover_exactly_the_solid_space() -> None:
 def test_splats_have_248_bytes_and_valid_values(tmp_path: Path) -> None:
     rows = np.zeros((4, 62), np.float32)
     rows[:, 58], rows[1, 0], rows[2, 54] = 2.0, np.nan, -9
-    told = splats.write(tmp_path, {"scene": rows, "agent": rows})
+    written = splats.write(tmp_path, {"scene": rows, "agent": rows})
     head, _, body = (tmp_path / "scene.ply").read_bytes().partition(b"end_header\n")
-    assert len(body) == 2 * 248 and b"element vertex 2" in head and told.loss_mm == {}
+    assert len(body) == 2 * 248 and b"element vertex 2" in head and written.loss_mm == {}
     np.testing.assert_array_equal(np.frombuffer(body, "<f4").reshape(-1, 62)[:, 58], 1)
 
 
@@ -182,8 +182,8 @@ def test_pictures_keep_their_cameras(shots: list[reading.CameraFrame], tmp_path:
     )
     for name in ("colmap", "nerfstudio"):
         (tmp_path / name).mkdir()
-    told = cameras.write_colmap(tmp_path / "colmap", shots, small_world.room())
-    assert told.loss_mm["camera_places"] < 0.01, "mm"
+    written = cameras.write_colmap(tmp_path / "colmap", shots, small_world.room())
+    assert written.loss_mm["camera_places"] < 0.01, "mm"
     cameras.write_nerfstudio(tmp_path / "nerfstudio", shots)
     frame = json.loads((tmp_path / "nerfstudio/transforms.json").read_bytes())["frames"][1]
     seen = (
@@ -201,9 +201,9 @@ def test_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ImportError(name)
 
     monkeypatch.setattr(importlib, "import_module", refuse)
-    with pytest.raises(InputError, match="make extras") as told:
+    with pytest.raises(InputError, match="make extras") as raised:
         writing.extra("pxr.Usd", "usd-core")
-    assert told.value.code == "EXP-010"
+    assert raised.value.code == "EXP-010"
 
 
 def test_usd_joints_have_their_poses(agent: reading.Agent, tmp_path: Path) -> None:

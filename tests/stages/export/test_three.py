@@ -44,9 +44,9 @@ def test_three_animates_the_animal_like_python() -> None:
     with browser.chromium() as opened:
         page = opened.new_page()
         page.add_script_tag(content=script)
-        told = page.evaluate(
+        loaded = page.evaluate(
             "([text, seconds]) => moved(text, seconds)",
             [base64.b64encode(model).decode(), moving_tube.SECONDS],
         )
-    assert told["names"] == ["walk"]
-    np.testing.assert_allclose(told["places"], places, atol=2e-5)  # metres
+    assert loaded["names"] == ["walk"]
+    np.testing.assert_allclose(loaded["places"], places, atol=2e-5)  # metres

@@ -80,8 +80,8 @@ def asked(question: str, **more: Any) -> Any:
     """Return the answer of the page about the home."""
     solid = home()
     marks = mark_supported(solid == 0, solid)
-    told = {"volume": VOLUME, "occupancy": solid.ravel().tolist(), "allowed": marks.ravel().tolist()} | more
-    return run_node(ASK, question=question, **told).item()["answer"]
+    grids = {"volume": VOLUME, "occupancy": solid.ravel().tolist(), "allowed": marks.ravel().tolist()} | more
+    return run_node(ASK, question=question, **grids).item()["answer"]
 
 
 def test_only_free_standing_furniture_is_movable() -> None:
@@ -121,10 +121,10 @@ def test_unobserved_space_moves_with_the_furniture() -> None:
     solid = home()
     solid[29:34, :7, 29:34] = 2
     marks = mark_supported(solid == 0, solid)
-    told = {"occupancy": solid.ravel().tolist(), "allowed": marks.ravel().tolist()}
+    grids = {"occupancy": solid.ravel().tolist(), "allowed": marks.ravel().tolist()}
     after = {
         key: np.reshape(value, SHAPE)
-        for key, value in asked("arranged", moves=[(TABLE, [-3, -12])], **told).items()
+        for key, value in asked("arranged", moves=[(TABLE, [-3, -12])], **grids).items()
         if key in ("occupancy", "allowed")
     }
     assert (after["occupancy"][26:31, LEVEL:7, 17:22] == 2).all()

@@ -35,12 +35,12 @@ def home(animals: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_contract_has_each_animal_and_one_room(home: Path, animals: Path) -> None:
-    told = json.loads((home / "simulator.json").read_bytes())
+    document = json.loads((home / "simulator.json").read_bytes())
     own = json.loads(
         (small_world.exported(animals / "cat", home.parent / "cat") / "simulator.json").read_bytes()
     )
-    assert [animal["name"] for animal in told["animals"]] == ["cat", "dog"]
-    cat = told["animals"][0]
+    assert [animal["name"] for animal in document["animals"]] == ["cat", "dog"]
+    cat = document["animals"][0]
     assert (
         cat["behavior"] == own["behavior"] and cat["agent"] == own["agent"] and cat["volume"] == own["volume"]
     )
@@ -85,8 +85,10 @@ def _check_goals(page: Page, home: Path, cat: Path) -> None:
             [q | changes | {"K": 1, "steps": twins.STEPS, "interactivity": 1} for q in questions]
         )
         found[name] = np.array(page.evaluate(twins.ASK, text))[:, [0, 2]]
-    told = contract["animals"][0]["behavior"]["sampling"]
-    sampling = PlanSamplingConfig(told["method"], max(twins.STEPS, told["goal_steps"]), twins.STEPS, 1.0)
+    settings = contract["animals"][0]["behavior"]["sampling"]
+    sampling = PlanSamplingConfig(
+        settings["method"], max(twins.STEPS, settings["goal_steps"]), twins.STEPS, 1.0
+    )
     ats = Ats.load(cat / "behavior", Scenes.load(cat / "behavior_data", ("any",)), sampling)
     eyes_m = contract["scene"]["floor_m"] + contract["observer"]["eye_height_m"]
     eyes = np.stack([met.far[..., 0], np.full(met.far.shape[:2], eyes_m), met.far[..., 1]], -1)

@@ -135,7 +135,7 @@ def _check_reaction(page: Page) -> None:
     page.click("#panel-toggle")
     page.locator("#interactivity").press("Home")
     assert page.inner_text("#interactivity-value") == "0.00"
-    assert np.abs(reaction.goals(page, near) - far).max() < 1e-5, "nor does one it is told to ignore"
+    assert np.abs(reaction.goals(page, near) - far).max() < 1e-5, "nor does one it is instructed to ignore"
     page.locator("#interactivity").press("End")
     page.locator("[data-sense=observer]").locator("xpath=..").click()
     assert "observer=0" in page.evaluate("location.hash")
@@ -161,7 +161,9 @@ def _check_it_reacts_as_python_does(page: Page, build: Path) -> None:
     assert np.median(np.abs(here.near - there.near)) < 1e-3, "metres"
     for answers in (here, there):
         assert np.abs(answers.opposite - answers.far[:5]).max() < 1e-5, "a far observer does not matter"
-        assert np.abs(answers.ignored - answers.far[:5]).max() < 1e-5, "nor does one it is told to ignore"
+        assert np.abs(answers.ignored - answers.far[:5]).max() < 1e-5, (
+            "nor does one it is instructed to ignore"
+        )
 
 
 def _check_the_person_is_carried(page: Page) -> None:
@@ -518,9 +520,9 @@ def test_unreadable_splats_fall_back_to_the_mesh(simulator: Path, chromium: Brow
 
 def test_large_hall_is_framed_like_a_room(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
     folder = shutil.copytree(simulator.parent / "light", tmp_path / "light")
-    told = json.loads(gzip.decompress((folder / "assets/simulator.gz").read_bytes()))
-    told["scene"]["bounds_m"] = (np.array(told["scene"]["bounds_m"]) * [4, 1, 4]).tolist()
-    (folder / "assets/simulator.gz").write_bytes(gzip.compress(json.dumps(told).encode()))
+    model = json.loads(gzip.decompress((folder / "assets/simulator.gz").read_bytes()))
+    model["scene"]["bounds_m"] = (np.array(model["scene"]["bounds_m"]) * [4, 1, 4]).tolist()
+    (folder / "assets/simulator.gz").write_bytes(gzip.compress(json.dumps(model).encode()))
     size, half = (390, 780), 4 * small_world.HALF_ROOM_M
     with served(folder) as address, browser.shown(chromium, address, size=size) as (page, _):
         near, far = (np.array(page.evaluate("p => ats.screen(p)", [0, 0, side * half])) for side in (1, -1))

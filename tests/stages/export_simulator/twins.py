@@ -125,7 +125,7 @@ def goals_of_page(page: Page, met: Approaches, checks: int) -> Answers:
     past = past.reshape(*past.shape[:2], -1)
 
     def goals(observer: np.ndarray, **more: object) -> np.ndarray:
-        told = [
+        questions = [
             {
                 "past": rows.tolist(),
                 "observer": places.tolist(),
@@ -139,7 +139,7 @@ def goals_of_page(page: Page, met: Approaches, checks: int) -> Answers:
                 past[: len(observer)], observer, met.seed[: len(observer)], strict=True
             )
         ]
-        return np.array(page.evaluate(ASK, json.dumps(told)))[:, [0, 2]]
+        return np.array(page.evaluate(ASK, json.dumps(questions)))[:, [0, 2]]
 
     few = slice(checks)
     return Answers(
@@ -151,12 +151,12 @@ def goals_of_python(build: Path, simulator: Path, met: Approaches, checks: int) 
     """Sample goals in Python; the last two only for the first ``checks`` plans."""
     contract = json.loads((simulator / "simulator.json").read_bytes())
     eyes_m = contract["scene"]["floor_m"] + contract["observer"]["eye_height_m"]
-    told = contract["behavior"]["sampling"]
+    settings = contract["behavior"]["sampling"]
     scenes = Scenes.load(build / "behavior_data", ("any",))
 
     def goals(observer: np.ndarray, guidance: float = 1.0) -> np.ndarray:
         count = len(observer)
-        sampling = PlanSamplingConfig(told["method"], max(STEPS, told["goal_steps"]), STEPS, guidance)
+        sampling = PlanSamplingConfig(settings["method"], max(STEPS, settings["goal_steps"]), STEPS, guidance)
         ats = Ats.load(build / "behavior", scenes, sampling)
         eyes = np.stack([observer[..., 0], np.full(observer.shape[:2], eyes_m), observer[..., 1]], -1)
         parts = []

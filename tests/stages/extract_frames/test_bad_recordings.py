@@ -109,9 +109,9 @@ def test_flipped_bytes_are_refused(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize("frames", [1, 5])
 def test_too_short_recording_is_refused(tmp_path, monkeypatch, capsys, frames):
-    told = _refused(walk(frames).write(tmp_path / "a.r3d"), tmp_path, monkeypatch, capsys)
-    assert "CAP-007" in told
-    assert "record some seconds" in told
+    message = _refused(walk(frames).write(tmp_path / "a.r3d"), tmp_path, monkeypatch, capsys)
+    assert "CAP-007" in message
+    assert "record some seconds" in message
 
 
 def test_mostly_damaged_video_is_refused(tmp_path):

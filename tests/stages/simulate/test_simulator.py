@@ -228,8 +228,8 @@ def test_take_in_the_home_of_another_build(tmp_path):
     inputs = Inputs(**{name: own / name for name in artifacts}, home=other)
     settings = Config(seconds=1.0, goal_steps=4, sequence_steps=2)
     stage.run(inputs, settings, tmp_path)
-    told = json.loads((tmp_path / "home.json").read_text())
-    assert told["home"] == "other" and told["share_known"] == 1.0 and told["goals_in_solid"] == 0.0
+    summary = json.loads((tmp_path / "home.json").read_text())
+    assert summary["home"] == "other" and summary["share_known"] == 1.0 and summary["goals_in_solid"] == 0.0
     take, volume = npz.load(tmp_path / "take.npz"), npz.load(tmp_path / "volume.npz")
     assert len(take["timestamp_s"]) == 11 and volume["allowed"].shape == volume["occupancy"].shape
     with pytest.raises(InputError, match="SIM-011"):

@@ -51,25 +51,25 @@ def test_errors_of_true_and_shifted_motion(source):
     dataset, model = source.split.held_out, source.models.ours
     part = dataset.stretches[0][:61]
     reference = scores.references([part], np.array([0]), dataset, model)[0]
-    told = dict(zip(scores.METRICS, scores.score(part, reference, model.poses, np.zeros(1)), strict=True))
-    assert all(told[name] == pytest.approx(0, abs=1e-6) for name in scores.METRICS[:6])
-    assert told["contact"] == 1 and told["slide_m_s"] < 0.01 and told["planted"] > 0.5
+    metrics = dict(zip(scores.METRICS, scores.score(part, reference, model.poses, np.zeros(1)), strict=True))
+    assert all(metrics[name] == pytest.approx(0, abs=1e-6) for name in scores.METRICS[:6])
+    assert metrics["contact"] == 1 and metrics["slide_m_s"] < 0.01 and metrics["planted"] > 0.5
     step = np.linalg.norm(np.diff(part.world_from_agent[:, :3, 3], axis=0)[[0, -1]], axis=1).mean()
-    assert told["neighbour_v2v_mm"] == pytest.approx(1000 * step, rel=0.5)
+    assert metrics["neighbour_v2v_mm"] == pytest.approx(1000 * step, rel=0.5)
     root = part.world_from_agent.copy()
     root[:, :3, 3] += [0.03, 0.0, 0.04]
-    told = dict(
+    metrics = dict(
         zip(
             scores.METRICS,
             scores.score(BodyMotion(root, part.agent_from_bone), reference, model.poses, np.zeros(1)),
             strict=True,
         )
     )
-    assert told["translation"] == pytest.approx(100 * 0.07 / 3)
+    assert metrics["translation"] == pytest.approx(100 * 0.07 / 3)
     for name in ("mpjpe_mm", "mpvpe_mm"):
-        assert told[name] == pytest.approx(50, abs=0.01)
-    assert told["end_v2v_share"] == pytest.approx(0.05 / dataset.body.length_m, rel=1e-3)
-    assert told["orientation"] == told["pose"] == pytest.approx(0, abs=1e-6)
+        assert metrics[name] == pytest.approx(50, abs=0.01)
+    assert metrics["end_v2v_share"] == pytest.approx(0.05 / dataset.body.length_m, rel=1e-3)
+    assert metrics["orientation"] == metrics["pose"] == pytest.approx(0, abs=1e-6)
 
 
 def test_memory_bank_retrieves_its_own_clips(source):

@@ -280,17 +280,17 @@ def test_rectified_flow_target_is_noise_minus_sample():
         Schedule(course="rectified"),
         torch.randn(64, 4, generator=torch.Generator().manual_seed(1)),
     )
-    told = {}
+    inputs_seen = {}
 
     def denoise(x, t):
-        told.update(x=x, t=t)
+        inputs_seen.update(x=x, t=t)
         return x.sin()
 
     error = squared_error(denoise, clean, schedule, "flow", torch.Generator().manual_seed(0))
-    moment = ((told["t"] + 1) / (schedule.steps + 1))[:, None]
-    way = told["x"] * ((1 - moment) ** 2 + moment**2).sqrt()
+    moment = ((inputs_seen["t"] + 1) / (schedule.steps + 1))[:, None]
+    way = inputs_seen["x"] * ((1 - moment) ** 2 + moment**2).sqrt()
     true = (way - (1 - moment) * clean) / moment - clean
-    predicted = told["x"].sin() - (way - moment * told["x"].sin()) / (1 - moment)
+    predicted = inputs_seen["x"].sin() - (way - moment * inputs_seen["x"].sin()) / (1 - moment)
     torch.testing.assert_close(error, (predicted - true) ** 2, atol=1e-4, rtol=1e-3)
 
 

@@ -31,10 +31,10 @@ def described(views: int, seed: int) -> DescribedViews:
         camera = np.concatenate(
             [(cell[:, ::-1] - (4, 5.5)) * 0.12, np.ones((len(cell), 1))], axis=1
         ) * rng.uniform(1.5, 2.0)
-        told = np.sin(rigid.apply(pose, camera) @ frequency + phase)
+        descriptor = np.sin(rigid.apply(pose, camera) @ frequency + phase)
         spoilt = rng.random(len(cell)) < 0.1
-        told[spoilt] = rng.normal(0, 1, (spoilt.sum(), AXES))
-        descriptors.append(told / np.linalg.norm(told, axis=1, keepdims=True))
+        descriptor[spoilt] = rng.normal(0, 1, (spoilt.sum(), AXES))
+        descriptors.append(descriptor / np.linalg.norm(descriptor, axis=1, keepdims=True))
         patches.append(Patches(descriptors[-1], camera, cell))
     basis = PcaBasis(np.zeros(AXES, np.float32), np.eye(AXES, dtype=np.float32))
     return DescribedViews(
@@ -63,19 +63,19 @@ def test_poses_are_regressed():
 
 
 def test_optimal_uncertainty_is_the_error():
-    told = torch.linspace(-4, 1, 400)
+    log_scale = torch.linspace(-4, 1, 400)
     turned = torch.from_numpy(rigid.exp(np.array([0, 0.2, 0, 0, 0, 0]))[:3, :3].astype(np.float32)).expand(
         400, 3, 3
     )
     error, surprise = pose_loss(
         torch.eye(3).expand(400, 3, 3),
         torch.zeros(400, 3),
-        told,
+        log_scale,
         turned,
         torch.tensor([0.0, 0.0, 0.1]).expand(400, 3),
     )
     assert torch.allclose(error, torch.tensor(0.21), atol=1e-4), "0.2 rad + (0.1 m)^2"
-    assert abs(float(told[surprise.argmin()]) - np.log(0.3)) < 0.02
+    assert abs(float(log_scale[surprise.argmin()]) - np.log(0.3)) < 0.02
 
 
 def test_networks_survive_saving(tmp_path):
