@@ -22,9 +22,8 @@ from stages.simulate import takes
 from stages.simulate.config import Config
 from stages.simulate.inputs import Inputs
 from stages.train_behavior.export import write_contract
-from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, scaling, wandering
 from tests.stages.export import moving_tube
-from tests.stages.simulate.test_simulator import scaling
 
 QUICK = EnvironmentConfig(goal_steps=2, sequence_steps=2, candidates=1, start_m=(0.8, 1.5))
 

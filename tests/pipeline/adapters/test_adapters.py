@@ -10,38 +10,19 @@ import pytest
 
 from pipeline.adapters.live_animal import ZUP_FROM_WORLD, LiveAnimal
 from pipeline.adapters.ros2_animal import AnimalNode
-from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
-from pipeline.behavior.diffusion import Schedule
-from pipeline.behavior.model import Architecture, BehaviorNets
-from pipeline.behavior.planning import Sampler, TorchNetworks
-from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.simulator import Simulator
 from pipeline.core.errors import InputError
 from pipeline.data.glb import Action, Skin
 from pipeline.geometry import rigid
 from stages.export import mjcf, reading, usd
-from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
+from tests.pipeline.behavior.wandering import REST, untrained_simulator
 from tests.stages.export_simulator import small_world
-from tests.stages.simulate.test_simulator import scaling
 
 PERSON = np.array([0.5, 1.3, 0.5])
 
 
-def simulator(architecture: Architecture = ARCHITECTURE) -> Simulator:
-    volume = room()
-    return Simulator(
-        Sampler(TorchNetworks(BehaviorNets(architecture)), Schedule(), scaling()),
-        wandering(),
-        Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int)),
-        "yaw",
-        sampling=PlanSamplingConfig(goal_steps=2, sequence_steps=2),
-        chaining=ReplanningConfig(candidates=1),
-    )
-
-
 @pytest.fixture(scope="module")
 def animal() -> LiveAnimal:
-    return LiveAnimal(simulator(), seed=3)
+    return LiveAnimal(untrained_simulator(goal_steps=2, candidates=1), seed=3)
 
 
 def exported_agent() -> reading.Agent:

@@ -15,8 +15,7 @@ from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import AnimalBatch, as_companions
 from pipeline.behavior.trajectories import ABSENT_M, KINDS, MAX_COMPANIONS, PAST, BehaviorData, nearest
 from stages.train_behavior.objective import with_some_absent
-from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
-from tests.stages.simulate.test_simulator import scaling
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, scaling, wandering
 
 ANIMAL = float(KINDS.index("animal"))
 

@@ -3,8 +3,13 @@
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from pipeline.behavior.model import Architecture
+from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
+from pipeline.behavior.diffusion import Schedule
+from pipeline.behavior.model import Architecture, BehaviorNets, Scaling
 from pipeline.behavior.perception import FeatureVolume
+from pipeline.behavior.planning import Sampler, TorchNetworks
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.simulator import Simulator
 from pipeline.behavior.trajectories import FUTURE, PAST, RATE_HZ, BehaviorData, Trajectory
 from pipeline.geometry import rigid
 
@@ -73,3 +78,29 @@ def wandering(seed: int = 0, videos: int = 3) -> BehaviorData:
     start = np.tile(np.arange(per_video), videos).astype(np.int32)
     split = (video == videos - 1).astype(np.uint8)
     return BehaviorData(trajectories, REST.astype(np.float32), video, start, split, tuple(trajectories))
+
+
+def scaling() -> Scaling:
+    """Return a plausible normalization of goals, paths and bodies."""
+    channels = ARCHITECTURE.body_channels
+    mean = np.concatenate([[1.0, 0, 0, 0, 1, 0], np.zeros(channels - 6)])
+    return Scaling(
+        np.array([0.3, 0.01, 0.3]),
+        np.array([[0.5, 0.1, 0.5, 1.0]]),
+        np.linspace(0.01, 0.3, 56) * np.ones((3, 1)) * [[1], [0.02], [1]],
+        mean,
+        np.full(channels, 0.05),
+    )
+
+
+def untrained_simulator(goal_steps: int, candidates: int) -> Simulator:
+    """Return a simulator of untrained networks in `room`."""
+    volume = room()
+    return Simulator(
+        Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling()),
+        wandering(),
+        Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int)),
+        "yaw",
+        sampling=PlanSamplingConfig(goal_steps=goal_steps, sequence_steps=2),
+        chaining=ReplanningConfig(candidates=candidates),
+    )

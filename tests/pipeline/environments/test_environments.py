@@ -14,10 +14,9 @@ from pipeline.environments.floor import PersonFloor, to_local, to_world
 from pipeline.environments.rewards import REWARDS, StepOutcome
 from pipeline.environments.world import AnimalWorld
 from stages.train_behavior.export import write_contract
-from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, scaling, wandering
 from tests.pipeline.environments.small_world import QUICK, small_world
 from tests.pipeline.environments.test_other_home import write
-from tests.stages.simulate.test_simulator import scaling
 
 gymnasium = pytest.importorskip("gymnasium")
 pytest.importorskip("pettingzoo")

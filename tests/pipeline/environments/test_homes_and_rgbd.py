@@ -19,9 +19,8 @@ from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
 from pipeline.longterm.bodies import SkinnedBody
 from stages.train_behavior.export import write_contract
-from tests.pipeline.behavior.wandering import ARCHITECTURE, BONES, REST, wandering
+from tests.pipeline.behavior.wandering import ARCHITECTURE, BONES, REST, scaling, wandering
 from tests.pipeline.environments.test_other_home import write
-from tests.stages.simulate.test_simulator import scaling
 
 gymnasium = pytest.importorskip("gymnasium")
 

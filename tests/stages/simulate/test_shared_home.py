@@ -17,8 +17,7 @@ from stages.simulate import stage
 from stages.simulate.config import Config
 from stages.simulate.inputs import Inputs
 from stages.train_behavior.export import write_contract
-from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
-from tests.stages.simulate.test_simulator import scaling
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, scaling, wandering
 
 SETTINGS = Config(seconds=6.0, observer="away", seed=3, goal_steps=4, sequence_steps=2)
 

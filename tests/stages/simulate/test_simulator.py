@@ -8,12 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
+from pipeline.behavior.config import ReplanningConfig
 from pipeline.behavior.diffusion import Schedule
-from pipeline.behavior.model import BehaviorNets, Scaling
-from pipeline.behavior.planning import Sampler, TorchNetworks
-from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.simulator import AnimalBatch, PoseFrames, Simulator, blended_frames
+from pipeline.behavior.model import BehaviorNets
+from pipeline.behavior.simulator import AnimalBatch, PoseFrames, blended_frames
 from pipeline.core.errors import InputError
 from pipeline.data import glb, npz
 from pipeline.geometry import rigid
@@ -25,35 +23,20 @@ from stages.simulate.live import LiveAppearance, LiveView
 from stages.simulate.observers import scripted
 from stages.simulate.rollout import rollout, write_take
 from stages.train_behavior.export import write_contract
-from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
+from tests.pipeline.behavior.wandering import (
+    ARCHITECTURE,
+    REST,
+    room,
+    scaling,
+    untrained_simulator,
+    wandering,
+)
 from tests.pipeline.environments import test_other_home
-
-
-def scaling():
-    channels = ARCHITECTURE.body_channels
-    mean = np.concatenate([[1.0, 0, 0, 0, 1, 0], np.zeros(channels - 6)])
-    return Scaling(
-        np.array([0.3, 0.01, 0.3]),
-        np.array([[0.5, 0.1, 0.5, 1.0]]),
-        np.linspace(0.01, 0.3, 56) * np.ones((3, 1)) * [[1], [0.02], [1]],
-        mean,
-        np.full(channels, 0.05),
-    )
 
 
 @pytest.fixture(scope="module")
 def simulator():
-    volume = room()
-    sampler = Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling())
-    sampling = PlanSamplingConfig(goal_steps=4, sequence_steps=2)
-    return Simulator(
-        sampler,
-        wandering(),
-        Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int)),
-        "yaw",
-        sampling=sampling,
-        chaining=ReplanningConfig(candidates=3),
-    )
+    return untrained_simulator(goal_steps=4, candidates=3)
 
 
 def test_simulation_is_deterministic_and_continues(simulator):
