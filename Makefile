@@ -23,18 +23,18 @@ AGENTS := $(filter-out $(COMMANDS),$(patsubst agents/%.toml,%,$(wildcard agents/
 WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 
 .PHONY: $(COMMANDS) FORCE
-# What ends in a command line or a path holds plain names only.
+# Variables that become part of a command line or a path may contain plain names only.
 PLAIN := a b c d e f g h i j k l m n o p q r s t u v w x y z 0 1 2 3 4 5 6 7 8 9 _ -
 rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)
 $(foreach name,AGENT NAME ABSENT REPLAYED OTHER VARIANT FORMAT PLACES PROCESSES LOCK BODY,$(if $(call rest,$(PLAIN),$(value $(name))),$(error REC-004 \
   $(name) is no plain name: use a-z, 0-9, _ and -)))
-# Where an agent's, its variant's, or in a home of several animals one's (NAME=) own things stand; what a variant does not
-# touch is its agent's (`INPUTS` knows).
+# Folder of an agent, of its variant, or of one animal of a home (NAME=); `INPUTS` takes what a variant does not change from
+# its agent.
 ANIMAL := $(or $(AGENT),cat)
 HOME_OF := build/$(ANIMAL)$(if $(VARIANT),/variants/$(VARIANT))$(if $(NAME),/animals/$(NAME))
 INPUTS = inputs=$$($(PLAN) inputs $(HOME_OF:build/%=%) $1)
 TOGETHER_INPUTS = inputs=$$($(PLAN) together $(HOME_OF:build/%=%) $1)
-# Called by a recipe, make shares the caller's jobs: as many at once as -j allows in all.
+# Nested make shares the job slots of its caller.
 NESTING := --no-print-directory NESTED=1
 
 help:
@@ -45,7 +45,7 @@ include $(WANTED:%=build/%$(if $(TABLES),/tables)$(if $(VARIANT),/variants/$(VAR
 build/%/plan/rules.mk: .venv/.ok FORCE
 	@$(PLAN) plan $* $(if $(MAKE_RESTARTS),>/dev/null)
 
-# LOCK=cuda or cpu, where this machine is not the one that computes (a login node without a GPU); `doctor` shows it.
+# LOCK=cuda or cpu, if jobs run on another machine than this one (a login node without a GPU); `doctor` shows it.
 .venv/.ok: envs/cpu.txt envs/cuda.txt envs/setup $(if $(LOCK),$(if $(filter-out $(LOCK),$(shell cat .venv/lock 2>/dev/null || echo none)),FORCE))
 	@envs/setup $(LOCK)
 
@@ -56,7 +56,7 @@ behavior-tables: .venv/.ok
 behavior-benchmark: .venv/.ok
 	@$(MAKE) $(NESTING) behavior-tables AGENT=benchmark
 
-# DATA is a folder of public data; what it lacks is skipped with the layout that is expected.
+# DATA is a folder of public data; rows without data are skipped, with the expected layout.
 real-benchmark: .venv/.ok
 	@$(if $(DATA),,$(error REC-004 give DATA=folder, which holds the public data))$(PYTHON) -m benchmarks.real "$$DATA"
 
@@ -85,8 +85,8 @@ capture-check: .venv/.ok
 gallery: .venv/.ok
 	@$(PYTHON) -m stages.compile_gallery build
 
-# One format for another program, after the simulator; with a take of `make simulate` as one motion more, and on
-# the body of another build (BODY=luna).
+# One export format; includes a take of `make simulate` as a further motion, optionally on the body of another build
+# (BODY=luna).
 EXPORTED = $(HOME_OF)/exports/$(or $(FORMAT),glb)$(BODY:%=_on_%)
 export: .venv/.ok
 	@$(PYTHON) -m stages.export --format $(or $(FORMAT),glb) --help >/dev/null
@@ -98,9 +98,9 @@ export: .venv/.ok
 	  $(BODY:%=--body build/%/simulator) --videos build/$(ANIMAL)$(if $(NAME),/animals/$(NAME))/plan/videos.json --out $(EXPORTED)
 	@echo '[$(HOME_OF)] written: $(EXPORTED); export.json lists what is lost'
 
-# The behaviour model without a page: half a minute beside a scripted observer; `serve` shows it live. In a home of several
-# animals all together, without one (ABSENT=) or with a recorded one (REPLAYED=); one alone with NAME=. In another build's home
-# (HOME=other): a take, and a page that begins from it.
+# The behavior model without a page: half a minute beside a scripted observer; `serve` shows it live. In a home of several
+# animals all are simulated, without one (ABSENT=) or with a recorded one (REPLAYED=); a single one with NAME=. In the home of
+# another build (HOME=other): a take, and a page that starts from it.
 JOURNEY = $(if $(SUBGOALS)$(PLACES),longterm) $(if $(SUBGOALS)$(filter-out behavior,$(PLACES)),,behavior)
 export SUBGOALS
 ELSEWHERE = $(HOME_OF)/homes/$(OTHER)
@@ -124,47 +124,47 @@ serve: .venv/.ok
 extras: .venv/.ok
 	@envs/extras
 
-# The type checker and the run-time checks of array shapes, from a hashed lock; .ci/run uses both.
+# Type checker and run-time checks of array shapes, from a hashed lock, as in .ci/run.
 dev: .venv/.ok
 	@$(PYTHON) -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r envs/dev.txt
 
 types: dev
 	@.venv/bin/basedpyright
 
-# One process of tests per core, four at most: each takes up to 1.5 GB.
+# One test process per core, at most four: each takes up to 1.5 GB.
 WORKERS := auto --maxprocesses 4
 test: .venv/.ok
 	@$(PYTHON) -m pytest tests -n $(WORKERS) --no-loadscope-reorder
 
-# The inner loop: what takes seconds; `slow` and `toy` are left to `make test`.
+# Fast tests for development, without those marked `slow` and `toy`.
 test-fast: .venv/.ok
 	@$(PYTHON) -m pytest tests -n $(WORKERS) -m 'not slow and not toy'
 
-# A flow on a Slurm that the test starts on this machine; skipped where slurmctld, slurmd, munge or Snakemake's plugin lack.
+# A flow on a local Slurm that the test starts; skipped without slurmctld, slurmd, munge or the Snakemake plugin.
 test-slurm: .venv/.ok
 	@$(PYTHON) -m pytest tests/pipeline/workflow/test_slurm.py -rs
 
-# Mutated files for every reader of user files, a minute each; what fails is kept in build/fuzz.
+# Fuzz every reader of user files for a minute each; failing inputs are kept in build/fuzz.
 fuzz: .venv/.ok
 	@$(PYTHON) -m tests.fuzz $(FUZZ)
 
 doctor: .venv/.ok
 	@$(PYTHON) -m pipeline.workflow.doctor
 
-# Build again from a report's crate and name the first artifact that differs.
+# Rebuild from the crate of a report and name the first artifact that differs.
 reproduce: .venv/.ok
 	@agent=$$($(PYTHON) -SE -m pipeline.workflow.reproduce begin '$(CRATE)') && \
 	$(MAKE) $(NESTING) $$agent && \
 	$(PYTHON) -SE -m pipeline.workflow.reproduce compare '$(CRATE)' $$agent
 
-# Hash all that stands in build/<agent> and captures/<agent>: a build itself looks at keys, sizes and times.
+# Hash all files in build/<agent> and captures/<agent>; a build itself compares only keys, sizes and times.
 verify: .venv/.ok
 	@$(PYTHON) -SE -m pipeline.workflow.verify $(HOME_OF:build/%=%)
 
 clean:
 	rm -rf build .snakemake
 
-# A table compares variants that its own rule cannot make; name what does.
+# A table compares variants that its own rule cannot build; name the command that does.
 .DEFAULT:
 	@case '$@' in build/*/variants/*) \
 	  set -- $(subst /, ,$@); echo "error: REC-007 '$@' belongs to variant $$4 of $$2 and is not there yet" >&2; \

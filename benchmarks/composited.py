@@ -1,8 +1,8 @@
-"""Draw the built-in animal into a real RGB-D sequence: the parts of `semi_real`.
+"""Composite the built-in animal into a real RGB-D sequence, for `semi_real`.
 
-`Sequence` reads a 7-Scenes style folder; `surfaces` finds what an animal can walk on; `course` lets it walk,
-sit, come and go; `Compositor` draws each frame with the sequence's own depth deciding occlusion and its own
-measured noise and holes. World: the sequence's, turned so that +y is up, metres.
+`Sequence` reads a 7-Scenes style folder; `surfaces` finds walkable surfaces; `course` samples a trajectory on which
+the animal walks, rests, and enters and leaves the scene; `Compositor` renders each frame, with occlusion by the
+sequence's depth and with its measured noise and holes. World: that of the sequence, rotated so that +y is up, metres.
 """
 
 from collections.abc import Iterator
@@ -24,16 +24,15 @@ from stages.synthesize_capture import animal, gait, raster, shade
 from stages.synthesize_capture.session import STEP_S, AnimalCourse
 
 COLOR_FOCAL_PX, DEPTH_FOCAL_PX, BASELINE_M = 525.5, 585.0, 0.025
-"""Kinect v1 as measured on 7-Scenes: focal lengths of both cameras at 640 x 480, and how far the colour
-camera stands right"""
+"""Kinect v1 as measured on 7-Scenes: focal lengths of both cameras at 640 x 480, and the offset of the colour camera
+to the right"""
 PROJECTOR_BASELINE_M = 0.075
-"""Kinect v1: from infrared projector to infrared camera; surfaces that the projector does not reach have no
-depth"""
+"""Kinect v1: from infrared projector to infrared camera; surfaces in the projector's shadow have no depth"""
 MILLIMETRES = 1000
 FARTHEST_M = 6.0
 CELL_M = 0.04
 ABSENT_M = 100.0
-"""how far below the world the animal is put while it is away"""
+"""depth below the world at which an absent animal is placed"""
 
 
 @dataclass(frozen=True)
@@ -43,12 +42,12 @@ class Sequence:
     folder: Path
     numbers: tuple[int, ...]
     registered: bool
-    """Depth is brought into the colour camera; else colours are only brought to the depth camera's focal
-    length."""
+    """Whether depth is reprojected into the colour camera; otherwise colour is only rescaled to the focal length of the
+    depth camera."""
 
     @property
     def intrinsics(self) -> Float[np.ndarray, "3 3"]:
-        """Return the pinhole of both pictures, pixels."""
+        """Return the intrinsics shared by colour and depth, pixels."""
         focal = COLOR_FOCAL_PX if self.registered else DEPTH_FOCAL_PX
         return np.array([[focal, 0, 320.0], [0, focal, 240.0], [0, 0, 1]])
 
@@ -68,10 +67,10 @@ class Sequence:
             / MILLIMETRES
         )
         raw[raw > FARTHEST_M] = 0
-        return _registered(raw, DEPTH_FOCAL_PX, COLOR_FOCAL_PX, BASELINE_M) if self.registered else raw
+        return _reproject_depth(raw, DEPTH_FOCAL_PX, COLOR_FOCAL_PX, BASELINE_M) if self.registered else raw
 
     def poses(self) -> Float[np.ndarray, "frame 4 4"]:
-        """Read `world_from_camera`, turned so that +y is up."""
+        """Read `world_from_camera`, rotated so that +y is up."""
         given = np.stack([np.loadtxt(self._path(index, "pose.txt")) for index in range(len(self.numbers))])
         if self.registered:
             given = given @ rigid.make(np.eye(3), np.array([BASELINE_M, 0, 0]))
@@ -87,8 +86,8 @@ class Sequence:
 
 
 @njit(cache=True)
-def _registered(depth, depth_focal, color_focal, baseline_m):
-    """Bring depth into a camera with another focal length that stands ``baseline_m`` to the right."""
+def _reproject_depth(depth, depth_focal, color_focal, baseline_m):
+    """Reproject depth into a camera with another focal length, ``baseline_m`` to the right."""
     height, width = depth.shape
     out = np.zeros((height, width), np.float32)
     for i in range(height):
@@ -105,20 +104,18 @@ def _registered(depth, depth_focal, color_focal, baseline_m):
 
 @dataclass(frozen=True)
 class Noise:
-    """What the sensor does to depth, measured on the sequence."""
+    """Sensor noise measured on the sequence."""
 
     coefficients: Float[np.ndarray, "3"]
-    """Standard deviation in metres = polynomial of z in metres, constant last."""
+    """Standard deviation of depth in metres as a polynomial of z in metres, constant last."""
     shadow_side: int
-    """Side of a nearer surface on which depth is missing: -1 left, 1 right."""
+    """Side of a nearer surface on which depth is missing (projector shadow): -1 left, 1 right."""
     color: float
-    """Standard deviation of the picture's noise, 0..255."""
+    """Standard deviation of the colour noise, 0..255."""
 
 
 def measure_noise(sequence: Sequence, frames: int = 12) -> Noise:
-    """Measure depth noise against local planes by range, the side of the projector's shadow, and the
-    picture's noise.
-    """
+    """Measure depth noise against local planes by range, the side of the projector shadow, and colour noise."""
     ranges, errors, sides, grain = [], [], np.zeros(2), []
     for index in np.linspace(0, len(sequence.numbers) - 1, frames).astype(int).tolist():
         depth = sequence.depth(index)
@@ -151,11 +148,11 @@ def measure_noise(sequence: Sequence, frames: int = 12) -> Noise:
 
 @dataclass(frozen=True)
 class Surface:
-    """A level surface: its height, by cell too, and which cells of (x, z) an animal can stand on."""
+    """A horizontal surface: its height, per cell too, and the cells of (x, z) on which an animal can stand."""
 
     height_m: float
     heights_m: Float[np.ndarray, "x z"]
-    """poses err by a centimetre or two, and a true table is level only so far"""
+    """differ by pose errors of one to two centimetres, and because real tables are not exactly level"""
     free: Bool[np.ndarray, "x z"]
     origin: Float[np.ndarray, "2"]
 
@@ -165,16 +162,14 @@ class Surface:
         return np.stack([at[:, 0], self.heights_m[self.free], at[:, 1]], axis=1)
 
     def connects(self, a: np.ndarray, b: np.ndarray) -> bool:
-        """Return whether the straight way between two points is free."""
+        """Return whether the straight line between two points is free."""
         way = a + np.linspace(0, 1, max(2, int(np.linalg.norm(b - a) / (CELL_M / 2))))[:, None] * (b - a)
         at = np.floor((way[:, [0, 2]] - self.origin) / CELL_M).astype(int)
         return bool(self.free[at[:, 0], at[:, 1]].all())
 
 
 def surfaces(sequence: Sequence, world_from_camera: np.ndarray, every: int = 8) -> list[Surface]:
-    """Find level surfaces of a quarter of a square metre and more, with free room for an animal, largest
-    first.
-    """
+    """Find horizontal surfaces with free space for an animal, largest first."""
     points, up = [], []
     for index in range(0, len(sequence.numbers), every):
         view = sequence.view(index)
@@ -189,24 +184,24 @@ def surfaces(sequence: Sequence, world_from_camera: np.ndarray, every: int = 8) 
     count, _ = np.histogram(points[up, 1], edges)
     found = []
     for peak in np.argsort(-count)[:8]:
-        own = up & (np.abs(points[:, 1] - edges[peak] - 0.02) < 0.04)
-        if own.sum() < 300:
+        level = up & (np.abs(points[:, 1] - edges[peak] - 0.02) < 0.04)
+        if level.sum() < 300:
             continue
-        height = float(np.median(points[own, 1]))
+        height = float(np.median(points[level, 1]))
         if any(abs(height - other.height_m) < 0.1 for other in found):
             continue
-        ground, above = np.zeros(shape, int), np.zeros(shape, int)
-        np.add.at(ground, tuple(at[own].T), 1)
+        support, above = np.zeros(shape, int), np.zeros(shape, int)
+        np.add.at(support, tuple(at[level].T), 1)
         np.add.at(above, tuple(at[(points[:, 1] > height + 0.06) & (points[:, 1] < height + 0.4)].T), 1)
-        free = np.array(ndimage.binary_closing(ground >= 2)) & ~ndimage.binary_dilation(
+        free = np.array(ndimage.binary_closing(support >= 2)) & ~ndimage.binary_dilation(
             above >= 4, iterations=3
         )
         free = ndimage.binary_erosion(free, iterations=3)
         if free.sum() * CELL_M**2 > 0.05:
             total = np.zeros(shape)
-            np.add.at(total, tuple(at[own].T), points[own, 1] - height)
+            np.add.at(total, tuple(at[level].T), points[level, 1] - height)
             smooth = ndimage.gaussian_filter(total, 3) / np.maximum(
-                ndimage.gaussian_filter(ground * 1.0, 3), 1e-3
+                ndimage.gaussian_filter(support * 1.0, 3), 1e-3
             )
             found.append(Surface(height, height + smooth, free, origin[[0, 2]]))
     return sorted(found, key=lambda surface: -surface.free.sum())
@@ -216,37 +211,35 @@ def course(
     sequence: Sequence,
     world_from_camera: np.ndarray,
     timestamp_s: np.ndarray,
-    grounds: list[Surface],
+    walkable: list[Surface],
     rng: np.random.Generator,
 ) -> tuple[AnimalCourse, Bool[np.ndarray, "frame"]]:
-    """Let the animal come, walk between places in view, rest there and go; return its course and when it is
-    there.
+    """Sample a trajectory on which the animal appears, walks between points in view, rests there and disappears;
+    return it and the frames with the animal.
     """
     steps = np.arange(int(np.ceil((timestamp_s[-1] + 2) / STEP_S))) * STEP_S
     position = np.tile([0.0, -ABSENT_M, 0.0], (len(steps), 1))
     yaw, posture, air = np.zeros(len(steps)), np.zeros((len(steps), 3)), np.zeros(len(steps))
-    there, now = np.zeros(len(steps), bool), rng.uniform(0.5, 3.0)
+    present, now = np.zeros(len(steps), bool), rng.uniform(0.5, 3.0)
     while now < steps[-1] - 2.5:
         stay = rng.uniform(3.0, 7.5)
         chosen = np.flatnonzero((steps >= now) & (steps < now + stay))
         frame = int(np.argmin(np.abs(timestamp_s - now - 0.4 * stay)))
-        walk = _walk(sequence, world_from_camera[frame], frame, grounds, len(chosen), rng)
+        walk = _walk(sequence, world_from_camera[frame], frame, walkable, len(chosen), rng)
         if walk is not None:
             position[chosen], yaw[chosen], posture[chosen], air[chosen] = walk
-            there[chosen] = True
+            present[chosen] = True
         now += stay + rng.uniform(1.5, 5.0)
     gaze = position + np.stack([np.sin(yaw), np.full(len(yaw), 0.25), np.cos(yaw)], axis=1)
     made = AnimalCourse(steps, position, yaw, posture, air, gaze, np.full(len(steps), 0.2))
-    return made, np.interp(timestamp_s, steps, there.astype(float)) > 0.999
+    return made, np.interp(timestamp_s, steps, present.astype(float)) > 0.999
 
 
-def _walk(sequence, world_from_camera, frame, grounds, count, rng):
-    """Walk and rest for ``count`` steps within view of a frame; rise over the edge at first, sink behind it
-    at last.
-    """
+def _walk(sequence, world_from_camera, frame, walkable, count, rng):
+    """Walk and rest for ``count`` steps within view of a frame, climbing over the edge at the start and the end."""
     for _ in range(40):
-        ground = grounds[min(int(rng.exponential(0.8)), len(grounds) - 1)]
-        cells = ground.points()
+        surface = walkable[min(int(rng.exponential(0.8)), len(walkable) - 1)]
+        cells = surface.points()
         pixel, z = cameras.project(rigid.apply(rigid.inverse(world_from_camera), cells), sequence.intrinsics)
         inside = (np.abs(np.asarray(pixel) - [320, 240]) < [270, 190]).all(1) & (z > 0.7) & (z < 3.5)
         at = np.clip(np.asarray(pixel).astype(int), 0, [639, 479])
@@ -260,7 +253,7 @@ def _walk(sequence, world_from_camera, frame, grounds, count, rng):
     places, headings, rests, heading = [], [], [], rng.uniform(-np.pi, np.pi)
     while len(places) < count:
         target = cells[rng.integers(len(cells))]
-        if rng.random() < 0.35 or not ground.connects(here, target):
+        if rng.random() < 0.35 or not surface.connects(here, target):
             wait = int(rng.uniform(0.3, 1.6) / STEP_S)
             kind = np.eye(3)[rng.integers(2)] * (rng.random() < 0.6)
             places += [here] * wait
@@ -292,12 +285,12 @@ _EMPTY = shade.Backdrop(
     np.zeros((0, 3), np.float32), np.zeros(1, np.uint8), np.zeros((0, 8, 3), np.int64),
     np.zeros(0, np.float32),
 )  # fmt: skip
-"""a room without anything: only the animal is rendered"""
+"""an empty room: only the animal is rendered"""
 
 
 @dataclass(frozen=True)
 class Composite:
-    """One frame with the animal and what is true of it."""
+    """One frame with the animal, and its ground truth."""
 
     color: UInt8[np.ndarray, "height width 3"]
     depth: Float[np.ndarray, "height width"]
@@ -305,25 +298,25 @@ class Composite:
 
 
 class Compositor:
-    """Draws the animal into frames of a sequence."""
+    """Renders the animal into frames of a sequence."""
 
     def __init__(self, sequence: Sequence, creature: animal.Animal, noise: Noise, rng: np.random.Generator):
         self.sequence, self.creature, self.noise, self._rng = sequence, creature, noise, rng
         pictures = [sequence.color(i) for i in np.linspace(0, len(sequence.numbers) - 1, 8).astype(int)]
         self._light = np.mean([((p / 255.0) ** 2.2).mean((0, 1)) for p in pictures], axis=0) / 0.3
-        """of a scene whose surfaces reflect 30 % on average, linear RGB"""
+        """for an average albedo of 30 %, linear RGB"""
 
     def frames(
-        self, world_from_camera: np.ndarray, motion: gait.AnimalMotion, there: np.ndarray
+        self, world_from_camera: np.ndarray, motion: gait.AnimalMotion, present: np.ndarray
     ) -> Iterator[Composite]:
-        """Draw every frame, in order."""
+        """Render every frame, in order."""
         turned = rigid.vector_from_rotation(
             np.swapaxes(world_from_camera[:-1, :3, :3], -1, -2) @ world_from_camera[1:, :3, :3]
         )
         turned = np.concatenate([turned, turned[-1:]])
-        for index, present in enumerate(there):
+        for index, visible in enumerate(present):
             color, depth = self.sequence.color(index), self.sequence.depth(index)
-            if present:
+            if visible:
                 blur = 0.15 * self.sequence.intrinsics[0, 0] * np.array([-turned[index, 1], turned[index, 0]])
                 yield self._draw(color, depth, world_from_camera[index], motion, index, blur)
             else:
@@ -340,7 +333,7 @@ class Compositor:
             return Composite(color, depth, np.zeros(depth.shape, bool))
         view = raster.rasterize(body, self.creature.faces, np.diag([2, 2, 1]) @ k, 2 * height, 2 * width)
         normals = animal.normals_of(body, self.creature.faces) @ world_from_camera[:3, :3].T
-        shine = (
+        irradiance = (
             0.45 + 0.4 * (0.5 + 0.5 * normals[:, 1:2]) + 0.25 * np.clip(normals[:, :1], 0, 1)
         ) * self._light
         anatomy = self.creature.anatomy
@@ -349,29 +342,39 @@ class Compositor:
             local = np.asarray(rest) - anatomy.heads[animal.INDEX[bone]]
             balls[row] = *rigid.apply(camera_from_bone[animal.INDEX[bone]], local[None])[0], radius
         coat = shade.Coat(
-            self.creature.faces, self.creature.vertices, shine.astype(np.float32), self.creature.fur, balls
+            self.creature.faces,
+            self.creature.vertices,
+            irradiance.astype(np.float32),
+            self.creature.fur,
+            balls,
         )
         fur = shade.shade(view.face, view.inverse_corners, focal, _EMPTY, coat, camera_from_world)
         own = raster.depth_through(view.face, view.inverse_depth, view.inverse_corners, focal, height, width)
-        cover = cv2.resize((view.face >= 0).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-        hidden = (_filled(depth) < own - 0.012 - 0.01 * own) & (own > 0)
-        cover[hidden], fur[hidden] = 0, 0
-        if not (cover >= 0.5).any():
+        coverage = cv2.resize(
+            (view.face >= 0).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA
+        )
+        hidden = (_fill_holes(depth) < own - 0.012 - 0.01 * own) & (own > 0)
+        coverage[hidden], fur[hidden] = 0, 0
+        if not (coverage >= 0.5).any():
             return Composite(color, depth, np.zeros(depth.shape, bool))
-        dark = _contact_shadow(_filled(depth), np.asarray(focal), camera_from_world[:3, 1].copy(), balls)
-        room = (color / 255.0).astype(np.float32) ** 2.2 * dark[..., None]
-        layer = _smeared(cv2.GaussianBlur(np.dstack([fur, cover]).astype(np.float32), (0, 0), 0.7), blur_px)
+        shading = _contact_shadow(
+            _fill_holes(depth), np.asarray(focal), camera_from_world[:3, 1].copy(), balls
+        )
+        room = (color / 255.0).astype(np.float32) ** 2.2 * shading[..., None]
+        layer = _motion_blurred(
+            cv2.GaussianBlur(np.dstack([fur, coverage]).astype(np.float32), (0, 0), 0.7), blur_px
+        )
         linear = layer[..., :3] + room * (1 - layer[..., 3:])
         shown = 255 * np.clip(linear, 0, 1) ** (1 / 2.2)
         shown += layer[..., 3:] * self._rng.normal(0, self.noise.color, shown.shape)
         return Composite(
-            np.clip(shown, 0, 255).astype(np.uint8), self._measured(depth, own * (cover >= 0.5)), cover >= 0.5
+            np.clip(shown, 0, 255).astype(np.uint8),
+            self._sensor_depth(depth, own * (coverage >= 0.5)),
+            coverage >= 0.5,
         )
 
-    def _measured(self, room: np.ndarray, own: np.ndarray) -> Float[np.ndarray, "height width"]:
-        """Return what the sensor measures of room and animal: noise with grain, a wandering outline, the
-        projector's shadow.
-        """
+    def _sensor_depth(self, room: np.ndarray, own: np.ndarray) -> Float[np.ndarray, "height width"]:
+        """Return depth as the sensor measures it: correlated noise, a jittered outline, the projector shadow."""
         height, width = room.shape
         bend = cv2.resize(
             self._rng.standard_normal((height // 8, width // 8, 2)).astype(np.float32), (width, height)
@@ -379,7 +382,10 @@ class Compositor:
         x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
         own = cv2.remap(own.astype(np.float32), x + bend[..., 0], y + bend[..., 1], cv2.INTER_NEAREST)
         shadow = _projector_shadow(
-            own, _filled(room), self.sequence.intrinsics[0, 0] * PROJECTOR_BASELINE_M, self.noise.shadow_side
+            own,
+            _fill_holes(room),
+            self.sequence.intrinsics[0, 0] * PROJECTOR_BASELINE_M,
+            self.noise.shadow_side,
         )
         sigma = np.maximum(np.polyval(self.noise.coefficients, own), 0.001)
         grain = cv2.GaussianBlur(self._rng.standard_normal(own.shape), (0, 0), 1.5) * 5.3
@@ -396,15 +402,15 @@ def _nearest_known(shape, data):
     return np.array(ndimage.distance_transform_edt(depth == 0, return_distances=False, return_indices=True))
 
 
-def _filled(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-    """Give unknown pixels the nearest known depth."""
+def _fill_holes(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """Fill unknown pixels with the nearest known depth."""
     rows, columns = _nearest_known(depth.shape, np.ascontiguousarray(depth, np.float32).tobytes())
     return depth[rows, columns]
 
 
 @njit(cache=True)
 def _projector_shadow(own, room, focal_baseline, side):
-    """Mark what the animal hides from the projector: as wide as the disparity between both surfaces."""
+    """Mark pixels that the animal occludes from the projector: as wide as the disparity between both surfaces."""
     height, width = own.shape
     out = np.zeros((height, width), np.bool_)
     for i in range(height):
@@ -422,7 +428,7 @@ def _projector_shadow(own, room, focal_baseline, side):
 
 @njit(cache=True)
 def _contact_shadow(depth, focal_center, up_camera, balls):
-    """Return the share of light left on level ground near the animal (analytic sphere occlusion)."""
+    """Return the fraction of light on horizontal ground near the animal (analytic sphere occlusion)."""
     out = np.ones(depth.shape, np.float32)
     for i in range(depth.shape[0]):
         for j in range(depth.shape[1]):
@@ -442,8 +448,8 @@ def _contact_shadow(depth, focal_center, up_camera, balls):
     return out
 
 
-def _smeared(picture: np.ndarray, blur_px: np.ndarray) -> np.ndarray:
-    """Blur along the camera's motion."""
+def _motion_blurred(picture: np.ndarray, blur_px: np.ndarray) -> np.ndarray:
+    """Apply motion blur along the camera's motion."""
     length = min(float(np.hypot(*blur_px)), 12.0)
     if length < 1:
         return picture

@@ -1,13 +1,11 @@
-"""Compare dense descriptors that need no downloaded weights: how many cells find their true partner in
-another view?
+"""Compare dense descriptors that need no downloaded weights by the matching accuracy between two views.
 
     python -m benchmarks.descriptors build/cat --rgbd 7scenes/kitchen --pairs 24
 
-Pairs of views see the same things from 5 to 45 degrees apart: of a folder of RGB-D frames with poses
-(7-Scenes), as they are and with the second one relit, and of different sessions of a finished build, whose
-light differs. A cell's partner is told by depth and poses; it is found when the likest of all cells of the
-other picture lies within a cell of it. Each descriptor is asked raw and through the 16 channels that
-everything downstream uses.
+Pairs of overlapping views differ by 5 to 45 degrees: from a folder of RGB-D frames with poses (7-Scenes), unchanged
+and with the second view relit, and from different sessions of a finished build, whose light differs. The true match
+of a cell follows from depth and poses; it is found if the nearest neighbour among all cells of the other picture lies
+within one cell of it. Each descriptor is evaluated raw and reduced to the 16 channels that all stages use.
 """
 
 import argparse
@@ -30,9 +28,9 @@ from pipeline.geometry import cameras, rigid
 
 STRIDE_PX = 8
 WINDOW_PX = 36
-"""side of what a descriptor sees, reduced pixels; that of DAISY"""
+"""side of the support region of a descriptor, pixels of the reduced picture; that of DAISY"""
 SURFACE_M = 0.05
-"""depths that agree within it show the same surface"""
+"""tolerance within which two depths show the same surface"""
 MIN_CELLS = 150
 Describe = Callable[[UInt8[np.ndarray, "height width 3"], int], Float[np.ndarray, "rows columns channel"]]
 
@@ -55,8 +53,8 @@ class View:
         return np.where(inside, self.depth[at[:, 1], at[:, 0]], 0)
 
 
-def of_rgbd(folder: Path) -> list[View]:
-    """Read frames of the 7-Scenes kind; colour and depth share one camera."""
+def rgbd_views(folder: Path) -> list[View]:
+    """Read frames in the 7-Scenes format; colour and depth share one camera."""
     intrinsics, found = np.loadtxt(folder / "camera-intrinsics.txt"), []
     for path in sorted(folder.glob("frame-*.pose.txt")):
         name = path.name.removesuffix(".pose.txt")
@@ -67,8 +65,8 @@ def of_rgbd(folder: Path) -> list[View]:
     return found
 
 
-def of_build(build: Path, per_session: int) -> list[list[View]]:
-    """Read some frames of each registered session, with the poses that the registration gave them."""
+def session_views(build: Path, per_session: int) -> list[list[View]]:
+    """Read some frames of each registered session, with their registered poses."""
     sessions = []
     for path in sorted(build.glob("registration/*/poses.npz")):
         clip = Clip.open(build / "frames" / path.parent.name)
@@ -85,7 +83,7 @@ def of_build(build: Path, per_session: int) -> list[list[View]]:
 
 
 def relit(view: View) -> View:
-    """Return the view at dusk: darker, flatter, yellower, with noise."""
+    """Return the view relit as at dusk: darker, with less contrast, yellower, with noise."""
     noise = np.random.default_rng(0).normal(0, 3, view.color.shape)
     color = 255 * (view.color / 255) ** 1.4 * [0.6, 0.5, 0.35] + 12 + noise
     return replace(view, color=np.clip(np.round(color), 0, 255).astype(np.uint8))
@@ -93,21 +91,21 @@ def relit(view: View) -> View:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two views and, for cells of the first, where in the second picture their surface is seen."""
+    """Two views and, for cells of the first, the pixels of the second that show the same surface."""
 
     first: View
     second: View
     cell: Float[np.ndarray, "cell"]
     """index of the cell, rows by columns"""
-    partner_px: Float[np.ndarray, "cell 2"]
+    match_px: Float[np.ndarray, "cell 2"]
 
 
-def paired(first: View, second: View) -> Pair | None:
-    """Find true partners; None where the views turn too little or too far or share too little."""
-    turned = np.degrees(
+def match_cells(first: View, second: View) -> Pair | None:
+    """Find the true matches; None where the rotation between the views is too small or too large, or the overlap too small."""
+    angle_deg = np.degrees(
         rigid.rotation_angle(first.world_from_camera[:3, :3], second.world_from_camera[:3, :3])
     )
-    if not 5 < turned < 45:
+    if not 5 < angle_deg < 45:
         return None
     rows, columns = (side // STRIDE_PX for side in first.color.shape[:2])
     pixel = ((cameras.pixel_grid(rows, columns)) * STRIDE_PX).reshape(-1, 2)
@@ -121,13 +119,13 @@ def paired(first: View, second: View) -> Pair | None:
     return Pair(first, second, np.flatnonzero(seen), target[seen]) if seen.sum() >= MIN_CELLS else None
 
 
-def drawn(
+def draw_pairs(
     candidates: Callable[[np.random.Generator], tuple[View, View]], count: int, tries: int = 2000
 ) -> list[Pair]:
-    """Draw pairs until there are enough."""
+    """Draw candidates until ``count`` pairs are found."""
     rng, found = np.random.default_rng(0), []
     for _ in range(tries):
-        pair = paired(*candidates(rng))
+        pair = match_cells(*candidates(rng))
         if pair is not None:
             found.append(pair)
         if len(found) == count:
@@ -139,7 +137,7 @@ def dense_sift(
     color: UInt8[np.ndarray, "height width 3"], stride_px: int
 ) -> Float[np.ndarray, "rows columns channel"]:
     """Upright SIFT (Lowe 2004) at every cell, square-rooted (Arandjelovic and Zisserman 2012)."""
-    gray, points, shape = _prepared(color, stride_px, WINDOW_PX / 6)
+    gray, points, shape = _keypoint_grid(color, stride_px, WINDOW_PX / 6)
     raw = cv2.SIFT.create().compute(gray, points)[1]
     return np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-6)).reshape(*shape, -1)
 
@@ -147,8 +145,8 @@ def dense_sift(
 def dense_vgg(
     color: UInt8[np.ndarray, "height width 3"], stride_px: int
 ) -> Float[np.ndarray, "rows columns channel"]:
-    """Convexly learnt descriptors (Simonyan et al. 2014), whose tables are part of opencv-contrib."""
-    gray, points, shape = _prepared(color, stride_px, WINDOW_PX / 6.25)
+    """Descriptors learnt by convex optimization (Simonyan et al. 2014), shipped with opencv-contrib."""
+    gray, points, shape = _keypoint_grid(color, stride_px, WINDOW_PX / 6.25)
     raw = cv2.xfeatures2d.VGG.create().compute(gray, points)[1]
     return _unit(raw).reshape(*shape, -1)
 
@@ -159,7 +157,7 @@ def dense_kernels(
     """Multiple kernel descriptors (Mukundan et al. 2019) of kornia, without its learnt whitening."""
     from kornia.feature import MKDDescriptor
 
-    gray, points, shape = _prepared(color, stride_px, WINDOW_PX)
+    gray, points, shape = _keypoint_grid(color, stride_px, WINDOW_PX)
     offset = ((np.arange(patch) + 0.5) / patch - 0.5) * WINDOW_PX
     at = np.array([point.pt for point in points], np.float32)
     x, y = np.broadcast_arrays(
@@ -180,10 +178,8 @@ DESCRIPTORS: dict[str, Describe] = {
 }
 
 
-def compared(sets: dict[str, list[Pair]], describe: Describe) -> Iterator[tuple[str, float, float]]:
-    """Yield (set, share found raw, share found with 16 channels); the basis is fitted to all pictures of all
-    sets.
-    """
+def matching_accuracy(sets: dict[str, list[Pair]], describe: Describe) -> Iterator[tuple[str, float, float]]:
+    """Yield (set, accuracy of raw descriptors, accuracy with 16 channels); the basis is fitted to all pictures of all sets."""
     views = {
         id(view): view for pairs in sets.values() for pair in pairs for view in (pair.first, pair.second)
     }
@@ -194,33 +190,34 @@ def compared(sets: dict[str, list[Pair]], describe: Describe) -> Iterator[tuple[
     for name, pairs in sets.items():
         shares = [
             np.mean(
-                [_found(pair, project(raw[id(pair.first)]), project(raw[id(pair.second)])) for pair in pairs]
+                [
+                    _accuracy(pair, project(raw[id(pair.first)]), project(raw[id(pair.second)]))
+                    for pair in pairs
+                ]
             )
             for project in (lambda d: d, basis.project)
         ]
         yield name, float(shares[0]), float(shares[1])
 
 
-def _found(
+def _accuracy(
     pair: Pair,
     first: Float[np.ndarray, "rows columns channel"],
     second: Float[np.ndarray, "rows columns channel"],
 ) -> float:
-    """Return the share of cells whose likest cell is within one of their partner."""
-    likest = (first.reshape(-1, first.shape[-1])[pair.cell] @ second.reshape(-1, second.shape[-1]).T).argmax(
+    """Return the fraction of cells whose nearest neighbour is within one cell of the true match."""
+    nearest = (first.reshape(-1, first.shape[-1])[pair.cell] @ second.reshape(-1, second.shape[-1]).T).argmax(
         1
     )
-    row, column = np.divmod(likest, second.shape[1])
+    row, column = np.divmod(nearest, second.shape[1])
     found_px = (np.stack([column, row], -1) + 0.5) * STRIDE_PX
-    return float((np.abs(found_px - pair.partner_px).max(-1) < 1.5 * STRIDE_PX).mean())
+    return float((np.abs(found_px - pair.match_px).max(-1) < 1.5 * STRIDE_PX).mean())
 
 
-def _prepared(
+def _keypoint_grid(
     color: np.ndarray, stride_px: int, size: float
 ) -> tuple[np.ndarray, list[cv2.KeyPoint], tuple[int, int]]:
-    """Return the reduced picture, mirrored beyond its edges, with a key point per cell, and the grid's
-    shape.
-    """
+    """Return the reduced picture with reflected borders, a key point per cell, and the shape of the grid."""
     gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
     scale = min(1.0, daisy.WORKING_SIDE_PX / max(gray.shape))
     gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else gray
@@ -244,15 +241,15 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("build", type=Path, help="a build with a finished registration")
-    parser.add_argument("--rgbd", type=Path, help="a folder of frames of the 7-Scenes kind")
+    parser.add_argument("--rgbd", type=Path, help="a folder of frames in the 7-Scenes format")
     parser.add_argument("--pairs", type=int, default=24, help="pairs of views per set")
     parser.add_argument("--descriptors", nargs="+", choices=DESCRIPTORS, default=list(DESCRIPTORS))
-    given = parser.parse_args()
-    sessions, sets = of_build(given.build, 12), {}
-    if given.rgbd:
-        views = of_rgbd(given.rgbd)
-        sets["rgbd"] = drawn(
-            lambda rng: tuple(views[i] for i in rng.choice(len(views), 2, replace=False)), given.pairs
+    arguments = parser.parse_args()
+    sessions, sets = session_views(arguments.build, 12), {}
+    if arguments.rgbd:
+        views = rgbd_views(arguments.rgbd)
+        sets["rgbd"] = draw_pairs(
+            lambda rng: tuple(views[i] for i in rng.choice(len(views), 2, replace=False)), arguments.pairs
         )
         sets["rgbd, relit"] = [replace(pair, second=relit(pair.second)) for pair in sets["rgbd"]]
 
@@ -262,10 +259,13 @@ def main() -> None:
             rng.integers(len(sessions[other]))
         ]
 
-    sets["between sessions"] = drawn(of_two_sessions, given.pairs)
-    for name, describe in ((name, DESCRIPTORS[name]) for name in given.descriptors):
-        begin = time.process_time()
-        shares = {part: [round(raw, 3), round(reduced, 3)] for part, raw, reduced in compared(sets, describe)}
+    sets["between sessions"] = draw_pairs(of_two_sessions, arguments.pairs)
+    for name, describe in ((name, DESCRIPTORS[name]) for name in arguments.descriptors):
+        start = time.process_time()
+        shares = {
+            part: [round(raw, 3), round(reduced, 3)]
+            for part, raw, reduced in matching_accuracy(sets, describe)
+        }
         counts = {part: len(pairs) for part, pairs in sets.items()}
         print(
             json.dumps(
@@ -273,7 +273,7 @@ def main() -> None:
                     "descriptor": name,
                     "raw, 16 channels": shares,
                     "pairs": counts,
-                    "cpu_s": round(time.process_time() - begin, 1),
+                    "cpu_s": round(time.process_time() - start, 1),
                 }
             )
         )

@@ -1,10 +1,9 @@
-"""Animal-steps per CPU second (one thread) of the vectorised environment against one animal after the other,
-in one run on one core.
+"""Animal-steps per CPU second (one thread) of the vectorized environment and of sequential simulation.
 
     python -m benchmarks.environment_speed build/toy --count 32 --steps 100
 
-Persons walk at random; both simulate as many animals for as many steps, few-step sampling for both, and the
-loop once more with the default sampler. Plans per step say how long plans are followed.
+Persons walk at random. Both are measured in one run with the few-step sampler; the sequential simulation also with
+the default sampler. Plans per step show how long plans are followed.
 """
 
 import argparse
@@ -21,26 +20,26 @@ from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.spaces import person_observation
 from pipeline.environments.world import AnimalWorld
 
-LOOP_SHARE = 8
-"""One animal after the other is timed with so many times fewer animals."""
+SEQUENTIAL_REDUCTION = 8
+"""Factor by which fewer animals are simulated sequentially."""
 
 
-def many_at_once(world: AnimalWorld, count: int, steps: int) -> tuple[float, float]:
-    """Return animal-steps per second and plans per animal and step of ``count`` animals."""
+def vectorized_speed(world: AnimalWorld, count: int, steps: int) -> tuple[float, float]:
+    """Return animal-steps per second and plans per animal-step of ``count`` animals in parallel."""
     rng = np.random.default_rng(0)
     world.begin(count, rng)
-    begin, planned = time.process_time(), world.animals.plans_drawn
+    start, planned = time.process_time(), world.animals.plans_drawn
     for _ in range(steps):
         world.step(rng.uniform(-1, 1, (count, world.action_size)))
         person_observation(world)
-    seconds = time.process_time() - begin
+    seconds = time.process_time() - start
     return count * steps / seconds, (world.animals.plans_drawn - planned) / (count * steps)
 
 
-def one_after_another(
+def sequential_speed(
     world: AnimalWorld, sampling: PlanSamplingConfig, chaining: ReplanningConfig, count: int, steps: int
 ) -> float:
-    """Return animal-steps per second of `Simulator`, as it is used beside the page."""
+    """Return animal-steps per second of `Simulator`."""
     single = Simulator(
         world.animals.sampler,
         world.data,
@@ -53,35 +52,39 @@ def one_after_another(
     for seed in range(count):
         state = single.reset(seed)
         position = state.world_from_agent[:3, 3] + [2.0, 1.2, 0.0]
-        begin = time.process_time()
+        start = time.process_time()
         for _ in range(steps):
             position = position + rng.uniform(-0.1, 0.1, 3) * [1, 0, 1]
             single.step(position)
-        seconds += time.process_time() - begin
+        seconds += time.process_time() - start
     return count * steps / seconds
 
 
 def main() -> None:
-    """Print the figures."""
+    """Print the speeds."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("build", type=Path)
     parser.add_argument("--count", type=int, default=32)
     parser.add_argument("--steps", type=int, default=100)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
-    world = AnimalWorld.load(asked.build, EnvironmentConfig())
-    speed, plans = many_at_once(world, asked.count, asked.steps)
-    print(f"{asked.count} at once: {speed:.0f} animal-steps/s, {plans:.3f} plans per animal and step")
-    few, chaining = world.animals.sampling, world.animals.chaining
-    some = max(asked.count // LOOP_SHARE, 1)
-    loop = one_after_another(world, few, chaining, some, asked.steps)
-    print(f"one after another, same sampler: {loop:.0f} animal-steps/s")
-    default = one_after_another(
-        world, replace(few, **vars(PlanSamplingConfig())), ReplanningConfig(), some, asked.steps
+    world = AnimalWorld.load(arguments.build, EnvironmentConfig())
+    speed, plans = vectorized_speed(world, arguments.count, arguments.steps)
+    print(f"{arguments.count} in parallel: {speed:.0f} animal-steps/s, {plans:.3f} plans per animal-step")
+    few_step, chaining = world.animals.sampling, world.animals.chaining
+    sequential_count = max(arguments.count // SEQUENTIAL_REDUCTION, 1)
+    sequential = sequential_speed(world, few_step, chaining, sequential_count, arguments.steps)
+    print(f"sequential, same sampler: {sequential:.0f} animal-steps/s")
+    default_speed = sequential_speed(
+        world,
+        replace(few_step, **vars(PlanSamplingConfig())),
+        ReplanningConfig(),
+        sequential_count,
+        arguments.steps,
     )
-    print(f"one after another, default sampler: {default:.0f} animal-steps/s")
+    print(f"sequential, default sampler: {default_speed:.0f} animal-steps/s")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,11 @@
-"""Compare the kinds of localizers in one run: error against seconds of training, on clean and on spoilt
-queries.
+"""Compare the kinds of localizers in one run: error versus training time, on clean and degraded queries.
 
     python -m benchmarks.localizers cat
 
-All kinds learn the same rendered views of the scene's template and localize the same fresh renders: as they
-are, at low contrast, blurred, dark; and frames of the sessions, whose poses are the registration's. Seconds
-are CPU seconds of one process; rendering and describing views is reported apart, since every kind needs it.
-Needs a finished registration.
+All kinds are trained on the same rendered views of the scene template and localize the same new renders (clean, low
+contrast, blurred, dark) and frames of the sessions, against their registered poses. Times are CPU seconds of one
+process; rendering and describing views is reported separately, since every kind needs it. Needs a finished
+registration.
 """
 
 import argparse
@@ -32,13 +31,13 @@ from stages.train_localizer import described_views, training
 from stages.train_localizer.config import Config, NetworkConfig, SceneConfig
 from stages.train_localizer.views import RenderedView
 
-NEAR = (5.0, 0.2)
-"""degrees and metres within which an answer is near"""
+RECALL_LIMITS = (5.0, 0.2)
+"""degrees and metres within which a pose counts as correct"""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One training."""
+    """One trained localizer."""
 
     kind: model.Kind
     views: int
@@ -51,9 +50,11 @@ SETTINGS = (
 )
 
 
-def spoilt(picture: UInt8[np.ndarray, "height width 3"], how: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Return a picture as bad light or a moving hand would have made it."""
-    match how:
+def degraded(
+    picture: UInt8[np.ndarray, "height width 3"], degradation: str
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Return a picture degraded by bad light or motion blur."""
+    match degradation:
         case "clean":
             return picture
         case "low contrast":
@@ -63,27 +64,25 @@ def spoilt(picture: UInt8[np.ndarray, "height width 3"], how: str) -> UInt8[np.n
         case "dark":
             noise = np.random.default_rng(int(picture[0, 0, 0])).normal(0, 3, picture.shape)
             return np.clip(np.round(0.12 * picture + noise), 0, 255).astype(np.uint8)
-    raise ValueError(how)
+    raise ValueError(degradation)
 
 
 QUERIES = ("clean", "low contrast", "blurred", "dark")
 
 
 def errors_of_renders(
-    localizer: model.Localizer, queries: list[RenderedView], how: str
+    localizer: model.Localizer, queries: list[RenderedView], degradation: str
 ) -> tuple[float, float, float]:
-    """Return the median rotation (degrees) and translation (metres) and the share near the truth; silence
-    counts as wrong.
-    """
-    spoilt_queries = iter([replace(query, color=spoilt(query.color, how)) for query in queries])
-    held = described_views.evaluate(localizer, lambda: next(spoilt_queries), len(queries))
-    return _summary(held.rotation_deg, held.translation_m)
+    """Return the median rotation (degrees) and translation (metres) error and the recall; no answer counts as wrong."""
+    degraded_queries = iter([replace(query, color=degraded(query.color, degradation)) for query in queries])
+    evaluated = described_views.evaluate(localizer, lambda: next(degraded_queries), len(queries))
+    return _summary(evaluated.rotation_deg, evaluated.translation_m)
 
 
 def errors_of_sessions(
     localizer: model.Localizer, build: Path, per_session: int
 ) -> tuple[float, float, float]:
-    """Return the same over frames of the sessions, against the poses that the registration gave them."""
+    """Return the same over frames of the sessions, against their registered poses."""
     found, truth = [], []
     for path in sorted(build.glob("registration/*/poses.npz")):
         clip, masks = (
@@ -106,42 +105,46 @@ def _summary(rotation, translation):
     return (
         float(np.median(rotation)),
         float(np.median(translation)),
-        float(((rotation <= NEAR[0]) & (translation <= NEAR[1])).mean()),
+        float(((rotation <= RECALL_LIMITS[0]) & (translation <= RECALL_LIMITS[1])).mean()),
     )
 
 
 def rows(build: Path, queries: int, per_session: int, settings: tuple[Setting, ...]) -> Iterator[str]:
-    """Train and localize; yield the lines of a Markdown table as they become known."""
+    """Train and localize; yield the lines of a Markdown table as they are measured."""
     template = build / "scene_template"
     clip = Clip.open(build / "frames" / _walkthrough(build))
     walk = SceneCameras.open(template).world_from_camera
     floor_m = json.loads((template / "world.json").read_text())["floor"]
     scene = SceneConfig(views=max(setting.views for setting in settings), held_out=40)
-    shown, seconds = timed(
+    scene_views, seconds = timed(
         lambda: training.scene_views(
             ply.read_ply(template / "mesh.ply"), walk, floor_m, clip, scene, np.random.default_rng(0)
         )
     )
     per_view = seconds / scene.views
     rng = np.random.default_rng(2)
-    queries_drawn = [shown.draw_query(rng) for _ in range(queries)]
-    yield f"{1000 * per_view:.0f} ms to render a view; {queries} fresh renders, {per_session} frames of each session; deg / m / near"
-    yield f"| kind | views | steps | s to learn | s / query | {' | '.join(QUERIES)} | sessions |"
+    rendered_queries = [scene_views.draw_query(rng) for _ in range(queries)]
+    yield f"{1000 * per_view:.0f} ms to render a view; {queries} new renders, {per_session} frames of each session; deg / m / recall"
+    yield f"| kind | views | steps | training s | s / query | {' | '.join(QUERIES)} | sessions |"
     yield "|---" * (6 + len(QUERIES)) + "|"
     for setting in settings:
-        some = replace(shown, pictures=shown.pictures[: setting.views] + shown.pictures[scene.views :])
+        training_views = replace(
+            scene_views, pictures=scene_views.pictures[: setting.views] + scene_views.pictures[scene.views :]
+        )
         rng = np.random.default_rng(1)
         config = Config(kind=setting.kind, network=NetworkConfig(steps=setting.steps))
-        (localizer, _), learning = timed(
-            lambda c=config, p=some, r=rng: training.train(p, c, Describer(), "cpu", r)
+        (localizer, _), training_s = timed(
+            lambda c=config, p=training_views, r=rng: training.train(p, c, Describer(), "cpu", r)
         )
-        answers, asking = timed(
-            lambda m=localizer: [errors_of_renders(m, queries_drawn, how) for how in QUERIES]
+        render_errors, query_s = timed(
+            lambda m=localizer: [
+                errors_of_renders(m, rendered_queries, degradation) for degradation in QUERIES
+            ]
         )
-        cells = [*answers, errors_of_sessions(localizer, build, per_session)]
-        per_query = asking / len(QUERIES) / queries
-        figures = " | ".join(f"{deg:.2f} / {metres:.3f} / {near:.2f}" for deg, metres, near in cells)
-        yield f"| {setting.kind} | {setting.views} | {setting.steps or ''} | {learning:.0f} | {per_query:.3f} | {figures} |"
+        cells = [*render_errors, errors_of_sessions(localizer, build, per_session)]
+        per_query = query_s / len(QUERIES) / queries
+        error_cells = " | ".join(f"{deg:.2f} / {metres:.3f} / {recall:.2f}" for deg, metres, recall in cells)
+        yield f"| {setting.kind} | {setting.views} | {setting.steps or ''} | {training_s:.0f} | {per_query:.3f} | {error_cells} |"
 
 
 def _walkthrough(build: Path) -> str:
@@ -150,7 +153,7 @@ def _walkthrough(build: Path) -> str:
 
 
 def timed(work: Callable):
-    """Return what the work gave and its CPU seconds."""
+    """Return the result of a call and its CPU seconds."""
     start = time.process_time()
     return work(), time.process_time() - start
 
@@ -160,27 +163,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("agent", help="whose build, for example cat")
-    parser.add_argument("--build", type=Path, default=Path("build"), help="where builds lie")
-    parser.add_argument("--queries", type=int, default=60, help="fresh renders that are localized")
-    parser.add_argument("--frames", type=int, default=12, help="frames of each session that are localized")
+    parser.add_argument("agent", help="agent of the build, for example cat")
+    parser.add_argument("--build", type=Path, default=Path("build"), help="folder of builds")
+    parser.add_argument("--queries", type=int, default=60, help="number of localized renders")
+    parser.add_argument("--frames", type=int, default=12, help="localized frames per session")
     parser.add_argument(
-        "--max-steps", type=int, default=2500, help="networks that learn for longer are left out"
+        "--max-steps", type=int, default=2500, help="skip networks that are trained for longer"
     )
     parser.add_argument(
         "--kinds",
         nargs="+",
         default=list(get_args(model.Kind)),
         choices=get_args(model.Kind),
-        help="kinds compared",
+        help="kinds to compare",
     )
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     settings = tuple(
-        setting for setting in SETTINGS if setting.steps <= given.max_steps and setting.kind in given.kinds
+        setting
+        for setting in SETTINGS
+        if setting.steps <= arguments.max_steps and setting.kind in arguments.kinds
     )
-    for line in rows(given.build / given.agent, given.queries, given.frames, settings):
+    for line in rows(arguments.build / arguments.agent, arguments.queries, arguments.frames, settings):
         print(line, flush=True)
 
 

@@ -1,10 +1,9 @@
-"""Does the cost of masks stay linear, and their memory bounded? Repeat one session's frames and segment each
-length.
+"""Measure how time and memory of segmentation scale with the length of a recording.
 
     python -m benchmarks.masks_scale cat --frames 200 800
 
-A session of a build with frames is walked forth and back as often as needed. Seconds are CPU seconds of one
-process; peak memory is the process's own, each length in a process of its own.
+The frames of one session are repeated, alternately forward and backward, up to each length. Each length runs in its
+own process; CPU seconds and peak memory are those of that process.
 """
 
 import argparse
@@ -18,20 +17,20 @@ import cv2
 import numpy as np
 import torch
 
-from benchmarks.registration_scale import There, forth_and_back
+from benchmarks.registration_scale import RepeatedClip, repeat_frames
 from pipeline.data.clips import Clip
 from stages.segment_agent.config import Config
 from stages.segment_agent.masks import segment
 
 
 def measure(build: Path, video: str, frames: int) -> tuple[float, float, float]:
-    """Return CPU seconds, peak memory in MB, and the share of frames in which the animal is seen."""
+    """Return CPU seconds, peak memory in MB, and the fraction of frames with the animal."""
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     clip = Clip.open(build / "frames" / video)
     start = time.process_time()
     masks = segment(
-        There(clip, forth_and_back(len(clip), frames)),
+        RepeatedClip(clip, repeat_frames(len(clip), frames)),
         build / "flow" / video,
         "session",
         None,
@@ -43,19 +42,19 @@ def measure(build: Path, video: str, frames: int) -> tuple[float, float, float]:
 
 
 def main() -> None:
-    """Print the table of one session of an agent's build."""
+    """Print the table for one session of a build."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("agent", help="whose build, for example cat")
-    parser.add_argument("--build", type=Path, default=Path("build"), help="where builds lie")
-    parser.add_argument("--frames", type=int, nargs="+", default=[200, 800, 3200], help="lengths")
-    given = parser.parse_args()
-    build = given.build / given.agent
+    parser.add_argument("agent", help="agent of the build, for example cat")
+    parser.add_argument("--build", type=Path, default=Path("build"), help="folder of builds")
+    parser.add_argument("--frames", type=int, nargs="+", default=[200, 800, 3200], help="lengths to measure")
+    arguments = parser.parse_args()
+    build = arguments.build / arguments.agent
     videos = json.loads((build / "plan" / "videos.json").read_text())
     video = next(video["id"] for video in videos if video["role"] == "session")
     print("| frames | s | s / frame | peak MB | animal seen |\n|---|---|---|---|---|", flush=True)
-    for frames in given.frames:
+    for frames in arguments.frames:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             seconds, peak_mb, seen = pool.apply(measure, (build, video, frames))
         print(

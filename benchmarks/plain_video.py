@@ -1,9 +1,9 @@
-"""Take the depth away from a built-in capture: sessions and turnaround become plain videos.
+"""Convert sessions and turnaround of a built-in capture to plain videos without depth.
 
     python -m benchmarks.plain_video build/toy/synthetic_capture captures/toy_plain
 
-Writes `<name>.mp4` for sessions and turnaround, without depth, poses and lens; walk-through and held-out phone
-are copied. Build it like any capture, then measure it on the truth of the built-in capture:
+Writes `<name>.mp4` for sessions and turnaround, without depth, poses and intrinsics; walk-through and held-out phone
+are copied. Build it like any capture, then evaluate it against the ground truth of the built-in capture:
 
     cp agents/toy.toml agents/toy_plain.toml && make toy_plain
     python -m stages.evaluate.reconstruction_metrics --truth build/toy/synthetic_capture/truth ...
@@ -22,31 +22,30 @@ from pipeline.core.progress import log, track
 from pipeline.data import images
 from pipeline.recordings.formats import open_recording
 
-CLOCK = 10_000
-"""ticks per second of the movie's time stamps"""
-QUALITY = {"crf": "20", "preset": "veryfast"}
-"""of the encoder: about what phones record with"""
+TICKS_HZ = 10_000
+"""ticks per second of the video timestamps"""
+ENCODER_OPTIONS = {"crf": "20", "preset": "veryfast"}
+"""encoder options, similar to the quality of phones"""
 HELDOUT_SIDECAR = 'synchronized_with = "session-1.mp4"\noffset_s = 0.0\n'
-"""the second phone films the toy's first session"""
+"""the held-out phone records the first session"""
 
 
-def without_depth(recording: Path, movie: Path) -> None:
-    """Write the pictures of a recording as an H.264 video with its own time stamps."""
-    known = open_recording(recording)
-    height, width = known.color_size
+def write_plain_video(recording: Path, movie: Path) -> None:
+    """Write the pictures of a recording as an H.264 video with the timestamps of the recording."""
+    source = open_recording(recording)
+    height, width = source.color_size
     with av.open(str(movie), "w") as container:
-        stream = container.add_stream("libx264", rate=30, options=QUALITY)
+        stream = container.add_stream("libx264", rate=30, options=ENCODER_OPTIONS)
         stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
-        stream.time_base = stream.codec_context.time_base = Fraction(1, CLOCK)
-        turns = known.quarter_turns
-        assert turns == 0, "the built-in capture is stored without a rotation tag"
-        for number, time_s in zip(track(known.index, movie.name), known.timestamp_s, strict=True):
-            stored = known.read_color(int(number))
+        stream.time_base = stream.codec_context.time_base = Fraction(1, TICKS_HZ)
+        assert source.quarter_turns == 0, "the built-in capture is stored without a rotation tag"
+        for number, time_s in zip(track(source.index, movie.name), source.timestamp_s, strict=True):
+            stored = source.read_color(int(number))
             color = images.decode_color(stored, str(recording)) if isinstance(stored, bytes) else stored
             assert color is not None, number
-            even = cv2.copyMakeBorder(color, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
-            frame.pts, frame.time_base = round(float(time_s) * CLOCK), Fraction(1, CLOCK)
+            padded = cv2.copyMakeBorder(color, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(padded), format="rgb24")
+            frame.pts, frame.time_base = round(float(time_s) * TICKS_HZ), Fraction(1, TICKS_HZ)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
 
@@ -56,8 +55,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("capture", type=Path, help="a finished artifact `synthetic_capture`")
-    parser.add_argument("out", type=Path, help="a new folder of recordings")
+    parser.add_argument("capture", type=Path, help="a finished `synthetic_capture` artifact")
+    parser.add_argument("out", type=Path, help="folder of recordings to create")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True)
     for recording in sorted((arguments.capture / "recordings").glob("*.r3d")):
@@ -66,7 +65,7 @@ def main() -> None:
             if recording.stem == "heldout":
                 (arguments.out / "heldout.r3d.toml").write_text(HELDOUT_SIDECAR)
         else:
-            without_depth(recording, arguments.out / f"{recording.stem}.mp4")
+            write_plain_video(recording, arguments.out / f"{recording.stem}.mp4")
     log(f"{len(list(arguments.out.iterdir()))} recordings in {arguments.out}")
 
 

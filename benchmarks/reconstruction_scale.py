@@ -1,13 +1,11 @@
-"""Does a step of the reconstruction cost the same however many videos there are, and what does a frame cost
-in memory?
+"""Measure the time of a reconstruction step and the memory per frame for different numbers of videos.
 
     python -m benchmarks.reconstruction_scale cat --sessions 1 2 4
 
-The first sessions of a finished build are taken, with walk-through and turnaround; each number of them in a
-process of its own. Milliseconds are CPU time of one thread per step, forward, backward and update, the median
-of ``--steps``. What is measured (rays and thumbnails) lies in mapped files; ``memory`` is what cannot be
-dropped (anonymous pages), less what the programs took before they read a frame, when the steps are done: per
-frame, poses, bones and their optimiser's state.
+Uses the first sessions of a finished build with walk-through and turnaround; each number of sessions runs in its own
+process. Milliseconds are the median single-thread CPU time per step (forward, backward, update) over ``--steps``. Rays
+and thumbnails are memory-mapped; ``memory_mb`` is the growth of anonymous memory from before the first frame is read
+until the steps are done: poses, bones and their optimizer state per frame.
 """
 
 import argparse
@@ -36,15 +34,15 @@ from stages.reconstruct.scene import SceneLoss
 KINDS = ("frames", "masks", "flow", "features")
 
 
-def opened(build: Path, sessions: int) -> Problem:
-    """Return the problem of the first so many sessions."""
+def load_problem(build: Path, sessions: int) -> Problem:
+    """Return the optimization problem of the first ``sessions`` sessions."""
     videos = json.loads((build / "plan" / "videos.json").read_text())
-    of_role = {
+    ids_by_role = {
         role: [video["id"] for video in videos if video["role"] == role]
         for role in ("walkthrough", "turnaround", "session")
     }
-    walkthrough, turnaround = of_role["walkthrough"][0], of_role["turnaround"][0]
-    ids = [walkthrough, turnaround, *of_role["session"][:sessions]]
+    walkthrough, turnaround = ids_by_role["walkthrough"][0], ids_by_role["turnaround"][0]
+    ids = [walkthrough, turnaround, *ids_by_role["session"][:sessions]]
     found = {kind: {id: build / kind / id for id in ids if (build / kind / id).exists()} for kind in KINDS}
     folders = reading.Inputs(
         **found, **{name: build / name for name in ("registration", "scene_template", "agent_template")}
@@ -62,28 +60,28 @@ def stored_bytes(problem: Problem) -> int:
 
 
 def anonymous_mb() -> float:
-    """Return the process's memory that no file stands behind."""
+    """Return the anonymous memory of the process."""
     status = Path("/proc/self/status").read_text()
     return int(status.split("RssAnon:")[1].split()[0]) / 1024
 
 
 def step_ms(problem: Problem, loss, groups: list[dict], steps: int) -> float:
     """Return the median CPU milliseconds of a step."""
-    optimizer, taken = torch.optim.AdamW(groups, lr=1.0), []
+    optimizer, times_ms = torch.optim.AdamW(groups, lr=1.0), []
     for step in range(steps):
-        begin = time.process_time()
+        start = time.process_time()
         optimizer.zero_grad(set_to_none=True)
         sum(loss(step, torch.Generator().manual_seed(step)).values()).backward()
         optimizer.step()
-        taken.append(1000 * (time.process_time() - begin))
-    return float(np.median(taken))
+        times_ms.append(1000 * (time.process_time() - start))
+    return float(np.median(times_ms))
 
 
 def measure(build: Path, sessions: int, steps: int) -> dict[str, float]:
-    """Return what one number of sessions costs."""
+    """Return the cost for one number of sessions."""
     torch.set_num_threads(1)
     before_mb = anonymous_mb()
-    problem = opened(build, sessions)
+    problem = load_problem(build, sessions)
     weights, batches, rates = LossWeights(), RayBatches(), LearningRates()
     scene = optimise.field_groups(problem.scene, rates)
     return {
@@ -99,17 +97,17 @@ def measure(build: Path, sessions: int, steps: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure and print a table."""
+    """Measure and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("agent")
     parser.add_argument("--sessions", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--steps", type=int, default=20)
-    given = parser.parse_args()
-    for sessions in given.sessions:
+    arguments = parser.parse_args()
+    for sessions in arguments.sessions:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
-            row = pool.apply(measure, (Path("build", given.agent), sessions, given.steps))
+            row = pool.apply(measure, (Path("build", arguments.agent), sessions, arguments.steps))
         print("  ".join(f"{name} {value:.4g}" for name, value in row.items()), flush=True)
 
 

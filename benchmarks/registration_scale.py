@@ -1,10 +1,9 @@
-"""Does the cost of a registration stay linear? Repeat one session's frames and time the registration of each
-length.
+"""Measure how time and memory of registration scale with the length of a recording.
 
     python -m benchmarks.registration_scale cat --frames 200 600 1800 5000
 
-A session of a finished build is walked forth and back as often as needed, so that motions stay real. Seconds
-are CPU seconds of one process; peak memory is the process's own, each length in a process of its own.
+The frames of one session are repeated, alternately forward and backward so that motions stay continuous, up to each
+length. Each length runs in its own process; CPU seconds and peak memory are those of that process.
 """
 
 import argparse
@@ -29,12 +28,12 @@ from stages.register_videos.config import Config
 
 
 @dataclass(frozen=True)
-class There:
-    """A clip, forth and back again: `Clip` as the registration reads it."""
+class RepeatedClip:
+    """A `Clip` whose frames are repeated in a given order."""
 
     clip: Clip
     order: np.ndarray
-    """[frame] which frame of the clip is shown"""
+    """[frame] index into the clip"""
 
     def __getattr__(self, name: str):
         value = getattr(self.clip, name)
@@ -45,25 +44,25 @@ class There:
 
     @property
     def timestamp_s(self) -> np.ndarray:
-        """Steady time."""
+        """Evenly spaced timestamps, 10 Hz."""
         return np.arange(len(self.order)) * 0.1
 
     def color(self, frame: int):
-        """Read a frame's colour."""
+        """Read the colour of a frame."""
         return self.clip.color(int(self.order[frame]))
 
     def depth(self, frame: int):
-        """Read a frame's depth."""
+        """Read the depth of a frame."""
         return self.clip.depth(int(self.order[frame]))
 
     def confidence(self, frame: int):
-        """Read a frame's depth confidence."""
+        """Read the depth confidence of a frame."""
         return self.clip.confidence(int(self.order[frame]))
 
 
 @dataclass(frozen=True)
-class ThereRows:
-    """Features or masks to it, which are read when they are asked for."""
+class RepeatedRows:
+    """Features or masks of a `RepeatedClip`, read on access."""
 
     rows: np.ndarray | Masks
     order: np.ndarray
@@ -73,19 +72,19 @@ class ThereRows:
 
 
 @dataclass(frozen=True)
-class ThereMasks(ThereRows):
-    """The masks to it."""
+class RepeatedMasks(RepeatedRows):
+    """Masks of a `RepeatedClip`."""
 
     rows: Masks
 
     @property
     def visible(self) -> np.ndarray:
-        """Per frame."""
+        """Whether the animal is visible, per frame."""
         return self.rows.visible[self.order]
 
 
-def forth_and_back(length: int, frames: int) -> Int[np.ndarray, "frame"]:
-    """Return which frame of a clip of this length is shown when it is walked forth and back."""
+def repeat_frames(length: int, frames: int) -> Int[np.ndarray, "frame"]:
+    """Return indices of a clip of ``length`` frames, alternately forward and backward."""
     phase = np.arange(frames) % (2 * length - 2)
     return np.where(phase < length, phase, 2 * length - 2 - phase)
 
@@ -94,7 +93,7 @@ def measure(build: Path, video: str, frames: int) -> tuple[float, float, bool]:
     """Return CPU seconds, peak memory in MB, and whether the recording was registered."""
     cv2.setNumThreads(1)
     clip, masks = Clip.open(build / "frames" / video), Masks.open(build / "masks" / video)
-    order = forth_and_back(len(clip), frames)
+    order = repeat_frames(len(clip), frames)
     maps = registration.Maps(
         ply.read_ply(build / "scene_template" / "mesh.ply"),
         ply.read_ply(build / "agent_template" / "agent.ply"),
@@ -105,31 +104,33 @@ def measure(build: Path, video: str, frames: int) -> tuple[float, float, bool]:
     features = open_features(build / "features" / video)
     start = time.process_time()
     found = registration.register(
-        There(clip, order),
-        ThereMasks(masks, order),
+        RepeatedClip(clip, order),
+        RepeatedMasks(masks, order),
         maps,
         Config(),
         np.random.default_rng(0),
-        ThereRows(features, order),
+        RepeatedRows(features, order),
     )
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return time.process_time() - start, peak_mb, isinstance(found, registration.Registered)
 
 
 def main() -> None:
-    """Print the table of one session of an agent's build."""
+    """Print the table for one session of a build."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("agent", help="whose build, for example cat")
-    parser.add_argument("--build", type=Path, default=Path("build"), help="where builds lie")
-    parser.add_argument("--frames", type=int, nargs="+", default=[200, 600, 1800, 5000], help="lengths")
-    given = parser.parse_args()
-    build = given.build / given.agent
+    parser.add_argument("agent", help="agent of the build, for example cat")
+    parser.add_argument("--build", type=Path, default=Path("build"), help="folder of builds")
+    parser.add_argument(
+        "--frames", type=int, nargs="+", default=[200, 600, 1800, 5000], help="lengths to measure"
+    )
+    arguments = parser.parse_args()
+    build = arguments.build / arguments.agent
     videos = json.loads((build / "plan" / "videos.json").read_text())
     video = next(video["id"] for video in videos if video["role"] == "session")
     print("| frames | s | s / frame | peak MB | registered |\n|---|---|---|---|---|", flush=True)
-    for frames in given.frames:
+    for frames in arguments.frames:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             seconds, peak_mb, registered = pool.apply(measure, (build, video, frames))
         print(

@@ -1,16 +1,16 @@
-"""What a model gains from perceiving another animal: simulated lives of the built-in dog, which follows the cat,
-plays with it and avoids it in turn.
+"""Measure what a behavior model gains from perceiving another animal: the built-in dog alternately follows, plays with
+and avoids the built-in cat.
 
     python -m benchmarks.social OUT --seeds 5
 
-Lets cat, dog and a person live in furnished homes, the last ones unseen in training, trains the behaviour model
-of the dog, and judges it on the same test windows with the cat as it was, with a cat that stands where it is
-now, and with the cat taken out of perception. Training leaves companions out of a tenth of the samples, so none
-of the three is new to the networks. What is in OUT already is not computed again.
+Simulates cat, dog and a person in furnished homes, some held out for testing, trains the behavior model of the dog,
+and evaluates it on the same test windows with three perceptions of the cat: as it was, frozen at its current position,
+and removed. Training drops companions from a tenth of the samples, so that none of the three is out of distribution.
+Results that are in OUT already are reused.
 
-Goals are scored as in the tables of the paper. Then the dog lives for half a minute beside the recorded cat and
-person, in a closed loop: distance kept, collisions, and the shares of what it does (`doings`), which are the
-same functions of simulated and true lives. Bodies are not learned; the dog looks where it goes.
+Goals are scored as in the tables of the paper. Closed-loop rollouts of 28 s beside the recorded cat and person are
+compared with the recorded dog: distance to the cat, collisions, and the fractions of its activities
+(`classify_activity`). Bodies are not learned; the dog faces its direction of motion.
 """
 
 import argparse
@@ -67,9 +67,9 @@ from stages.train_behavior.config import (
 from stages.train_behavior.config import Config as TrainingConfig
 
 TAKES, SESSION_S = 5, 150.0
-"""Takes of a session, each begun anew from anywhere, and its length: as in `stages.synthesize_capture.lives`."""
+"""Takes of a session, each from a random start, and its duration: as in `stages.synthesize_capture.lives`."""
 WINDOW_STRIDE = 5
-"""Frames between windows: neighbours are nearly the same, and a window of 6.4 s takes memory."""
+"""Frames between windows: adjacent ones are nearly identical, and a window of 6.4 s takes memory."""
 MODEL = TrainingConfig(
     export=False,
     ensemble_size=1,
@@ -79,28 +79,28 @@ MODEL = TrainingConfig(
         ObjectiveConfig(weighting="flow", code_dropout=0.0, path_share=1.0, body_share=0.0),
     ),
 )
-"""As in `agents/benchmark.toml`, without bodies and with fewer steps of paths: nothing was chosen here."""
+"""As in `agents/benchmark.toml`, without bodies and with fewer steps for paths; not tuned."""
 PERCEIVED = ("as it is", "standing still", "not at all")
-LIVED = ("as it is", "not at all")
+ROLLOUT_PERCEPTIONS = ("as it is", "not at all")
 GOALS, GOAL_STRIDE = 16, 20
-"""Samples per window, and of how many test windows one is judged."""
-LIFE, LIFE_STRIDE = 280, 3
-"""Frames of a life in a closed loop: two seconds less than a take; and of how many takes one is lived again."""
-DOING_STRIDE = 10
-"""Frames between the moments of a life at which it is asked what the dog does."""
+"""Samples per window, and stride of the evaluated test windows."""
+ROLLOUT_FRAMES, ROLLOUT_STRIDE = 280, 3
+"""Frames of a closed-loop rollout, two seconds less than a take; and stride of the simulated takes."""
+ACTIVITY_STRIDE = 10
+"""Frames between classified activities."""
 NEAR_M, CHASE_M = 1.2, 1.1
-"""Who is within so much of the cat after 5.6 s stays with it: the dog follows at 0.95 m and plays at 0.75 m. Who
-covers more than that in some second plays: it follows at 0.9 m/s, plays at 1.5 m/s."""
+"""Maximal distance to the cat after 5.6 s of a dog that stays with it (it follows at 0.95 m, plays at 0.75 m), and
+distance within one second above which it plays (it follows at 0.9 m/s, plays at 1.5 m/s)."""
 COLLISION_M = 0.45
-"""Centres nearer than this are in each other: the bodies of the built-in world keep 0.62 m on the floor."""
-TURN_WAY_M = 0.3
-"""Way after which a heading counts for a third, about a body's length."""
-DOINGS = ("follows", "plays", "avoids", "goes its own way")
+"""Distance of centres below which bodies intersect: those of the synthetic world keep 0.62 m on the floor."""
+HEADING_DECAY_M = 0.3
+"""Distance over which the weight of a past heading decays to 1/e, about a body length."""
+ACTIVITIES = ("follows", "plays", "avoids", "goes its own way")
 
 
 @dataclass(frozen=True)
-class LooksAhead(Sampler):
-    """Draws goals and paths; the body looks where it goes, upright."""
+class ForwardFacingSampler(Sampler):
+    """Samples goals and paths; the body is upright and faces its direction of motion."""
 
     def bodies(
         self,
@@ -109,7 +109,7 @@ class LooksAhead(Sampler):
         sampling: PlanSamplingConfig,
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan frame channel"]:
-        """Return roots that turn along the path, from +z at the beginning."""
+        """Return roots that turn along the path, starting with heading +z."""
         steps = np.diff(path, axis=1, prepend=codes.start[:, None])[..., ::2]
         facing, found = (
             np.tile([0.0, 1.0], (len(path), 1)),
@@ -118,7 +118,8 @@ class LooksAhead(Sampler):
         for frame in range(path.shape[1]):
             step = steps[:, frame]
             facing = (
-                facing * np.exp(-np.linalg.norm(step, axis=1, keepdims=True) / TURN_WAY_M) + step / TURN_WAY_M
+                facing * np.exp(-np.linalg.norm(step, axis=1, keepdims=True) / HEADING_DECAY_M)
+                + step / HEADING_DECAY_M
             )
             facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-9)
             turn = np.pad(np.arctan2(*facing.T)[:, None], ((0, 0), (1, 1)))
@@ -127,37 +128,37 @@ class LooksAhead(Sampler):
 
 
 @dataclass(frozen=True)
-class Lives:
-    """Takes in which the dog was recorded beside cat and person, as one lives them again."""
+class RecordedTakes:
+    """Recorded takes of dog, cat and person, from which closed-loop rollouts start."""
 
     context: Context
-    path: Float[np.ndarray, "life frame 3"]
-    """Where the dog truly went."""
-    cat: Float[np.ndarray, "life frame 4"]
-    """Place and kind; the past comes first."""
-    person: Float[np.ndarray, "life frame 3"]
+    path: Float[np.ndarray, "take frame 3"]
+    """Recorded path of the dog."""
+    cat: Float[np.ndarray, "take frame 4"]
+    """Position and kind, including the past."""
+    person: Float[np.ndarray, "take frame 3"]
 
     @classmethod
-    def of(cls, data: BehaviorData) -> "Lives":
-        """Take the beginnings of all takes of the test."""
-        data = data.with_horizon(LIFE)
+    def load(cls, data: BehaviorData) -> "RecordedTakes":
+        """Load the first window of every `ROLLOUT_STRIDE`-th test take."""
+        data = data.with_horizon(ROLLOUT_FRAMES)
         test = data.indices(TEST)
         begins = np.diff(data.start[test], prepend=-2) != 1
-        some = test[begins][::LIFE_STRIDE]
-        frames = data.start[some][:, None] + np.arange(data.past + LIFE)
-        tracks = [data.trajectories[data.videos[video]] for video in data.video[some]]
+        selected = test[begins][::ROLLOUT_STRIDE]
+        frames = data.start[selected][:, None] + np.arange(data.past + ROLLOUT_FRAMES)
+        tracks = [data.trajectories[data.videos[video]] for video in data.video[selected]]
         cats = [track.companions for track in tracks if track.companions is not None]
         cat = np.stack([each[row, 0] for each, row in zip(cats, frames, strict=True)])
         person = [track.world_from_camera[row, :3, 3] for track, row in zip(tracks, frames, strict=True)]
-        context, future = data.windows(some)
+        context, future = data.windows(selected)
         return cls(context, future.path_world, cat, np.stack(person))
 
-    def lived_again(self, ats: Ats, *, aware: bool, seed: int) -> Float[np.ndarray, "life frame 3"]:
-        """Let the dog live beside recorded cat and person, and return where it goes; it is asked to keep clear
-        of the cat only where it is ``aware`` of it.
+    def rollout(self, ats: Ats, *, aware: bool, seed: int) -> Float[np.ndarray, "take frame 3"]:
+        """Simulate the dog beside the recorded cat and person and return its path; it perceives the cat and keeps clear
+        of it only if ``aware``.
         """
         scenes, own = ats.scenes, ats.sampler
-        sampler = LooksAhead(own.networks, own.schedule, own.scaling)
+        sampler = ForwardFacingSampler(own.networks, own.schedule, own.scaling)
         dogs = AnimalBatch(
             sampler,
             scenes,
@@ -171,27 +172,27 @@ class Lives:
         context = replace(self.context, companions=cat[:, :, :PAST] if aware else None)
         dogs.begin(context, np.random.default_rng(seed), companions=context.companions)
         found = []
-        for frame in range(LIFE):
+        for frame in range(ROLLOUT_FRAMES):
             past = slice(frame, frame + PAST)
             now = dogs.step(self.person[:, frame + PAST - 1], cat[:, :, past] if aware else None)
             found.append(now.root[:, 0, :3, 3])
         return np.stack(found, axis=1)
 
-    def described(self, path: Float[np.ndarray, "life frame 3"]) -> dict[str, Float[np.ndarray, "life"]]:
-        """Return per life the mean distance to the cat, the share of time in its body and of each doing."""
+    def statistics(self, path: Float[np.ndarray, "take frame 3"]) -> dict[str, Float[np.ndarray, "take"]]:
+        """Return the mean distance to the cat and the fractions of time in collision and of each activity, per take."""
         cat = self.cat[:, PAST:, :3]
         apart = path - cat
-        starts = np.arange(0, LIFE - FUTURE, DOING_STRIDE)
+        starts = np.arange(0, ROLLOUT_FRAMES - FUTURE, ACTIVITY_STRIDE)
         ahead = starts[:, None] + 1 + np.arange(FUTURE)
-        done = doings(path[:, ahead], path[:, starts], cat[:, ahead], cat[:, starts])
+        activity = classify_activity(path[:, ahead], path[:, starts], cat[:, ahead], cat[:, starts])
         return {
             "distance, m": np.linalg.norm(apart[..., [0, 2]], axis=-1).mean(1),
-            "in its body": (np.linalg.norm(apart, axis=-1) < COLLISION_M).mean(1),
-        } | {name: (done == number).mean(1) for number, name in enumerate(DOINGS)}
+            "in collision": (np.linalg.norm(apart, axis=-1) < COLLISION_M).mean(1),
+        } | {name: (activity == number).mean(1) for number, name in enumerate(ACTIVITIES)}
 
 
-def lived(home: Room, rng: np.random.Generator) -> MeasuredMotion:
-    """Let cat, dog and person live in a home, in several takes; the dog is the agent."""
+def simulate_session(home: Room, rng: np.random.Generator) -> MeasuredMotion:
+    """Simulate cat, dog and person in a home in several takes; the dog is the agent."""
     time = np.arange(round(SESSION_S / TAKES * RATE_HZ)) / RATE_HZ
     sample = np.round(time / session.STEP_S).astype(int)
     dog, cat, camera = [], [], []
@@ -208,20 +209,20 @@ def lived(home: Room, rng: np.random.Generator) -> MeasuredMotion:
     return MeasuredMotion(clock, *motion, volume_of(home), np.concatenate(cat)[:, None])
 
 
-def prepared(out: Path, homes: int, test_homes: int, test_sessions: int) -> tuple[BehaviorData, Scenes]:
-    """Let them live, and slice what they did into windows."""
+def load_data(out: Path, homes: int, test_homes: int, test_sessions: int) -> tuple[BehaviorData, Scenes]:
+    """Simulate sessions and slice them into windows."""
     sliced = out / "behavior_data"
     if not (sliced / "qa.json").is_file():
         videos, tables = [], {}
         for number in range(homes + test_homes):
             home = dwellings.furnish_otherwise(np.random.default_rng([0, 10, number]))
-            for again in range(1 if number < homes else test_sessions):
-                rng = np.random.default_rng([0, 13, number, again])
-                name = f"home{number}-{again}"
+            for session_index in range(1 if number < homes else test_sessions):
+                rng = np.random.default_rng([0, 13, number, session_index])
+                name = f"home{number}-{session_index}"
                 tables[name] = out / "lives" / name
                 shutil.rmtree(tables[name], ignore_errors=True)
                 tables[name].mkdir(parents=True)
-                motion = lived(dwellings.rearranged(home, rng), rng)
+                motion = simulate_session(dwellings.rearranged(home, rng), rng)
                 npz.save(tables[name] / "motion.npz", compress=False, **motion.arrays())
                 npz.save(tables[name] / "skin.npz", agent_from_bone_rest=motion.agent_from_bone_rest)
                 npz.save(tables[name] / "feature_volume.npz", **vars(motion.volume))
@@ -240,8 +241,8 @@ def prepared(out: Path, homes: int, test_homes: int, test_sessions: int) -> tupl
     return data, Scenes.load(sliced, data.videos)
 
 
-def trained(out: Path, seed: int) -> Path:
-    """Train one model, unless that was done."""
+def train_model(out: Path, seed: int) -> Path:
+    """Train one model, unless it exists."""
     model = out / f"behavior-{seed}"
     if not (model / "behavior.json").is_file():
         shutil.rmtree(model, ignore_errors=True)
@@ -250,11 +251,11 @@ def trained(out: Path, seed: int) -> Path:
     return model
 
 
-def perceiving(context: Context, how: str) -> Context:
-    """Return windows in which the cat is perceived in one of the ways of `PERCEIVED`."""
+def with_perception(context: Context, perception: str) -> Context:
+    """Return windows with one of the perceptions `PERCEIVED` of the cat."""
     cat = context.companions
     assert cat is not None
-    match how:
+    match perception:
         case "as it is":
             return context
         case "standing still":
@@ -263,97 +264,118 @@ def perceiving(context: Context, how: str) -> Context:
             return replace(context, companions=np.where(np.arange(4) < 3, ABSENT_M, cat))
 
 
-def doings(
+def classify_activity(
     path: Float[np.ndarray, "*moment frame 3"],
     now: Float[np.ndarray, "*moment 3"],
     cat: Float[np.ndarray, "*moment frame 3"],
     cat_now: Float[np.ndarray, "*moment 3"],
 ) -> Int[np.ndarray, "*moment"]:
-    """Return which of `DOINGS` each path of 5.6 s is, given where the cat goes meanwhile."""
-    stays = np.linalg.norm((path - cat)[..., -1, :][..., [0, 2]], axis=-1) < NEAR_M
+    """Classify paths of 5.6 s as one of `ACTIVITIES`, given the path of the cat."""
+    near = np.linalg.norm((path - cat)[..., -1, :][..., [0, 2]], axis=-1) < NEAR_M
     second = (path[..., RATE_HZ:, :] - path[..., :-RATE_HZ, :])[..., [0, 2]]
     covered = np.linalg.norm(second, axis=-1).max(-1)
-    return np.select([stays & (covered < CHASE_M), stays, flees(path, now, cat_now)], [0, 1, 2], 3)
+    return np.select([near & (covered < CHASE_M), near, flees(path, now, cat_now)], [0, 1, 2], 3)
 
 
 def sampled_goals(out: Path, seed: int, scenes: Scenes, context: Context) -> dict[str, np.ndarray]:
-    """Return a model's goals for each way of perceiving, from the same noise, unless that was done."""
+    """Return goals of a model for each perception, from the same noise; cached."""
     path = out / f"goals-{seed}.npz"
     if not path.is_file():
-        ats = Ats.load(trained(out, seed), scenes, PlanSamplingConfig())
-        shown = {how: perceiving(context, how) for how in PERCEIVED}
-        goals = {how: ats.goals(seen, GOALS, np.random.default_rng(seed)).goal for how, seen in shown.items()}
+        ats = Ats.load(train_model(out, seed), scenes, PlanSamplingConfig())
+        shown = {perception: with_perception(context, perception) for perception in PERCEIVED}
+        goals = {
+            perception: ats.goals(seen, GOALS, np.random.default_rng(seed)).goal
+            for perception, seen in shown.items()
+        }
         npz.save(path, compress=False, **goals)
-        log(f"seed {seed}: goals are sampled")
+        log(f"seed {seed}: goals sampled")
     return npz.load(path)
 
 
-def simulated_lives(out: Path, seed: int, scenes: Scenes, lives: Lives) -> dict[str, np.ndarray]:
-    """Return where a model's dog goes beside the recorded cat, unless that was done."""
+def rollouts(out: Path, seed: int, scenes: Scenes, takes: RecordedTakes) -> dict[str, np.ndarray]:
+    """Return rollouts of a model for each perception; cached."""
     path = out / f"lives-{seed}.npz"
     if not path.is_file():
-        ats = Ats.load(trained(out, seed), scenes, PlanSamplingConfig())
+        ats = Ats.load(train_model(out, seed), scenes, PlanSamplingConfig())
         npz.save(
             path,
             compress=False,
-            **{how: lives.lived_again(ats, aware=how == LIVED[0], seed=seed) for how in LIVED},
+            **{
+                perception: takes.rollout(ats, aware=perception == ROLLOUT_PERCEPTIONS[0], seed=seed)
+                for perception in ROLLOUT_PERCEPTIONS
+            },
         )
-        log(f"seed {seed}: lives are simulated")
+        log(f"seed {seed}: rollouts finished")
     return npz.load(path)
 
 
 def over_seeds(values: Sequence[float], form: str = ".3f") -> str:
-    """Write a mean over seeds and its range."""
+    """Format a mean over seeds and its range."""
     return f"{np.mean(values):{form}} ({min(values):{form}} to {max(values):{form}})"
 
 
 def main() -> None:
-    """Simulate, train, judge, print."""
+    """Simulate, train, evaluate and print the tables."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("out", type=Path)
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--life-seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4], help="whose dogs live")
-    parser.add_argument("--homes", type=int, default=24, help="to learn from")
+    parser.add_argument(
+        "--life-seeds",
+        type=int,
+        nargs="+",
+        default=[0, 1, 2, 3, 4],
+        help="seeds of the models that are rolled out",
+    )
+    parser.add_argument("--homes", type=int, default=24, help="training homes")
     parser.add_argument("--test-homes", type=int, default=3)
-    parser.add_argument("--test-sessions", type=int, default=4, help="in each of those")
-    asked = parser.parse_args()
+    parser.add_argument("--test-sessions", type=int, default=4, help="sessions per test home")
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
-    asked.out.mkdir(parents=True, exist_ok=True)
-    data, scenes = prepared(asked.out, asked.homes, asked.test_homes, asked.test_sessions)
-    windows, lives = data.indices(TEST)[::GOAL_STRIDE], Lives.of(data)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    data, scenes = load_data(arguments.out, arguments.homes, arguments.test_homes, arguments.test_sessions)
+    windows, takes = data.indices(TEST)[::GOAL_STRIDE], RecordedTakes.load(data)
     context, future = data.windows(windows)
     episode = episodes(data.start[windows], data.video[windows], PAST + FUTURE)
     prior = LocationPrior.fit(*data.windows(data.indices(TRAIN)))
-    blind = prior.sample(context, GOALS, np.random.default_rng(0))
+    prior_samples = prior.sample(context, GOALS, np.random.default_rng(0))
     print(
-        f"{len(windows)} windows in {episode.max() + 1} episodes; {len(lives.path)} lives of {LIFE / RATE_HZ:g} s"
+        f"{len(windows)} windows in {episode.max() + 1} episodes; {len(takes.path)} rollouts of {ROLLOUT_FRAMES / RATE_HZ:g} s"
     )
     print(
-        f"location prior: {goal_minde(blind, future).mean():.3f}, {goal_energy_score(blind, future).mean():.3f}"
+        f"location prior: {goal_minde(prior_samples, future).mean():.3f}, {goal_energy_score(prior_samples, future).mean():.3f}"
     )
-    runs = [sampled_goals(asked.out, seed, scenes, context) for seed in range(asked.seeds)]
-    print("| the cat is perceived | minDE, m | energy score, m | energy score beyond as it is, m |")
-    of = {how: [Samples(run[how]) for run in runs] for how in PERCEIVED}
-    energy = {how: [goal_energy_score(each, future) for each in of[how]] for how in PERCEIVED}
-    for how in PERCEIVED:
+    runs = [sampled_goals(arguments.out, seed, scenes, context) for seed in range(arguments.seeds)]
+    print("| the cat is perceived | minDE, m | energy score, m | difference of energy score, m |")
+    of = {perception: [Samples(run[perception]) for run in runs] for perception in PERCEIVED}
+    energy = {
+        perception: [goal_energy_score(each, future) for each in of[perception]] for perception in PERCEIVED
+    }
+    for perception in PERCEIVED:
         means = (
-            over_seeds([goal_minde(each, future).mean() for each in of[how]]),
-            over_seeds(np.mean(energy[how], 1)),
+            over_seeds([goal_minde(each, future).mean() for each in of[perception]]),
+            over_seeds(np.mean(energy[perception], 1)),
         )
-        beyond = np.mean(energy[how], 0) - np.mean(energy[LIVED[0]], 0)
-        held = bootstrapped(beyond, episode, np.random.default_rng(0))
-        print(f"| {how} | {' | '.join(means)} | {held.mean:.3f} [{held.low:.3f}, {held.high:.3f}] |")
-    runs = [simulated_lives(asked.out, seed, scenes, lives) for seed in asked.life_seeds]
+        difference = np.mean(energy[perception], 0) - np.mean(energy[ROLLOUT_PERCEPTIONS[0]], 0)
+        interval = bootstrapped(difference, episode, np.random.default_rng(0))
+        print(
+            f"| {perception} | {' | '.join(means)} | {interval.mean:.3f} [{interval.low:.3f}, {interval.high:.3f}] |"
+        )
+    runs = [rollouts(arguments.out, seed, scenes, takes) for seed in arguments.life_seeds]
     print(
-        "| beside the recorded cat | the dog itself | "
-        + " | ".join(f"perceived {how}" for how in LIVED)
+        "| beside the recorded cat | recorded dog | "
+        + " | ".join(f"perceived {perception}" for perception in ROLLOUT_PERCEPTIONS)
         + " |"
     )
-    found = {how: [lives.described(run[how]) for run in runs] for how in LIVED}
-    for name, value in lives.described(lives.path).items():
-        columns = [over_seeds([each[name].mean() for each in found[how]]) for how in LIVED]
+    found = {
+        perception: [takes.statistics(run[perception]) for run in runs] for perception in ROLLOUT_PERCEPTIONS
+    }
+    for name, value in takes.statistics(takes.path).items():
+        columns = [
+            over_seeds([each[name].mean() for each in found[perception]])
+            for perception in ROLLOUT_PERCEPTIONS
+        ]
         print(f"| {name} | {value.mean():.3f} | {' | '.join(columns)} |")
 
 

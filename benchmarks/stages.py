@@ -1,9 +1,9 @@
-"""Print what a build cost: wall and CPU seconds, seconds per frame and peak memory of every stage, from the
-records beside its artifacts.
+"""Print the cost of a build from its job records: wall and CPU seconds, seconds per frame and peak memory of every
+artifact.
 
     python -m benchmarks.stages cat
 
-Wall seconds include what else ran on the machine; CPU seconds depend on it less.
+Wall seconds depend on the load of the machine, CPU seconds less so.
 """
 
 import argparse
@@ -15,14 +15,14 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Cost:
-    """The jobs of one artifact together."""
+    """Total cost of the jobs of one artifact."""
 
     artifact: str
     jobs: int
     seconds: float
     cpu_seconds: float
     frames: int
-    """Frames of the recordings whose jobs these are; 0 for an artifact made at once."""
+    """Total frames of the recordings; 0 for an artifact that is not per recording."""
     peak_memory_mb: int
 
 
@@ -49,7 +49,7 @@ def costs(build: Path) -> list[Cost]:
 
 
 def table(found: list[Cost]) -> str:
-    """Lay the costs out as a Markdown table with a last line for the whole build."""
+    """Format costs as a Markdown table with a last row for the whole build."""
     lines = ["| artifact | jobs | seconds | CPU s | frames | CPU s / frame | peak MB |", "|---" * 7 + "|"]
     for cost in found:
         per_frame = f"{cost.cpu_seconds / cost.frames:.3f}" if cost.frames else ""
@@ -58,20 +58,20 @@ def table(found: list[Cost]) -> str:
         )
     whole, cpu = sum(cost.seconds for cost in found), sum(cost.cpu_seconds for cost in found)
     lines.append(
-        f"| all, one after another | {sum(cost.jobs for cost in found)} | {whole:.0f} | {cpu:.0f} | | | {max(cost.peak_memory_mb for cost in found)} |"
+        f"| total | {sum(cost.jobs for cost in found)} | {whole:.0f} | {cpu:.0f} | | | {max(cost.peak_memory_mb for cost in found)} |"
     )
     return "\n".join(lines)
 
 
 def main() -> None:
-    """Print the table of one agent's build."""
+    """Print the table for one build."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("agent", help="whose build, for example cat")
-    parser.add_argument("--build", type=Path, default=Path("build"), help="where builds lie")
-    given = parser.parse_args()
-    print(table(costs(given.build / given.agent)))
+    parser.add_argument("agent", help="agent of the build, for example cat")
+    parser.add_argument("--build", type=Path, default=Path("build"), help="folder of builds")
+    arguments = parser.parse_args()
+    print(table(costs(arguments.build / arguments.agent)))
 
 
 if __name__ == "__main__":

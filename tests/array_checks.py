@@ -1,8 +1,8 @@
-"""Run-time checks of the shapes and kinds of arrays in signatures, for what tests call in their own process.
+"""Run-time checks of array shapes and dtypes in signatures, for code that tests call in their own process.
 
-`install` has every module below the given folders checked by jaxtyping and beartype as it is imported: each
-call, and each dataclass that is made, must have the arrays that its signature says. All else in a signature
-is the type checker's. Modules that numba compiles are left out: it compiles what it is given.
+`install` checks every module below the given folders with jaxtyping and beartype when it is imported: the arrays
+of each call and of each new dataclass must match the annotations. Other annotations are left to the type checker,
+and modules with numba functions are skipped.
 """
 
 import typing
@@ -18,12 +18,12 @@ _check = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 
 def install(folders: Iterable[str]) -> None:
-    """Check the arrays of every module below these folders of the checkout, from its first import on."""
+    """Check the arrays of every module below these folders of the checkout when it is imported."""
     jaxtyping.install_import_hook(sorted(_modules(folders)), f"{__name__}.arrays_only")
 
 
 def arrays_only(function: Callable) -> Callable:
-    """Return a checked copy of a signature, as jaxtyping made it, with the hints alone that name arrays."""
+    """Check a function against its array annotations alone."""
     hints = function.__annotations__
     function.__annotations__ = {name: hint for name, hint in hints.items() if _names_array(hint)}
     return _check(function) if function.__annotations__ else function
@@ -32,9 +32,9 @@ def arrays_only(function: Callable) -> Callable:
 def _names_array(hint: object) -> bool:
     if isinstance(hint, type) and issubclass(hint, jaxtyping.AbstractArray):
         if hint.array_type is np.ndarray:
-            hint.array_type = (np.ndarray, np.generic)  # NumPy returns its scalars where no axis is left
+            hint.array_type = (np.ndarray, np.generic)  # NumPy returns scalars where no axis remains
         return True
-    return any([_names_array(inner) for inner in typing.get_args(hint)])  # all are prepared
+    return any([_names_array(inner) for inner in typing.get_args(hint)])  # a list: all must be prepared
 
 
 def _modules(folders: Iterable[str]) -> Iterator[str]:

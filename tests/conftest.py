@@ -1,4 +1,4 @@
-"""What tests share: the order of tests, their share of cores, and one build of the toy."""
+"""Order of tests, threads per process, and the shared build of the toy."""
 
 import importlib.util
 import os
@@ -11,10 +11,10 @@ import pytest
 import torch
 from xdist.scheduler import LoadScopeScheduling
 
-# From `make dev`; continuous integration has it. To prepare the signatures of `pipeline` takes 4 s once, and
-# checking them a fifth of the time of short tests, so that only the tests of `pipeline` itself do.
-CHECKED = importlib.util.find_spec("beartype") is not None
-if CHECKED:
+# Installed by `make dev`, and in continuous integration. Preparing the signatures of `pipeline` takes 4 s, and
+# checking them 20 % of the time of short tests, so that only the tests of `pipeline` itself are checked.
+HAS_BEARTYPE = importlib.util.find_spec("beartype") is not None
+if HAS_BEARTYPE:
     import tests.array_checks
 
     tests.array_checks.install(["pipeline"])
@@ -28,11 +28,11 @@ if WORKERS > 1:
 
 
 TOY_FILES = ("test_data_layout.py", "test_docs_example.py", "test_restart.py", "test_toy_build.py")
-"""Files with tests that build the toy: in several processes one of them runs all of these, first."""
+"""Files with tests of the toy build; with several processes, one of them runs all of these first."""
 
 
 def pytest_collection_modifyitems(items):
-    """Run unit and house tests first, then the builds of the toy; the other way round in several processes."""
+    """Run tests of the toy build last in a single process, first in several."""
     for item in items:
         assert not item.get_closest_marker("toy") or item.path.name in TOY_FILES, f"{item.path}: TOY_FILES"
     if WORKERS == 1:
@@ -43,7 +43,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """Give each process whole files, whose tests share fixtures; all builds of the toy are one unit."""
+    """Distribute whole files, whose tests share fixtures, over processes; all of `TOY_FILES` are one unit."""
 
     class Scheduler(LoadScopeScheduling):
         def _split_scope(self, nodeid):
@@ -55,18 +55,18 @@ def pytest_xdist_make_scheduler(config, log):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """Check arrays in signatures in the tests of `pipeline`."""
+    """Check array shapes only in the tests of `pipeline`."""
     jaxtyping.config.update(
-        "jaxtyping_disable", not (CHECKED and item.path.is_relative_to(ROOT / "tests/pipeline"))
+        "jaxtyping_disable", not (HAS_BEARTYPE and item.path.is_relative_to(ROOT / "tests/pipeline"))
     )
 
 
 @pytest.fixture(scope="session")
 def toy(pytestconfig) -> Path:
-    """Build the toy in the repository's own `build/` and return its folder; its progress is shown."""
+    """Build the toy in `build/` of the repository, with visible progress, and return its folder."""
     capture = pytestconfig.pluginmanager.getplugin("capturemanager")
     with capture.global_and_fixture_disabled():
         print("\nmake toy", flush=True)
-        made = subprocess.run(["make", "-j2", "toy"], cwd=ROOT)
-    assert made.returncode == 0, "the toy does not build"
+        completed = subprocess.run(["make", "-j2", "toy"], cwd=ROOT)
+    assert completed.returncode == 0, "the toy does not build"
     return ROOT / "build" / "toy"

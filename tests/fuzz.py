@@ -1,9 +1,9 @@
-"""Hand mutated files to every reader of user files: each must answer with a coded error or a result.
+"""Fuzz every reader of user files: mutated files must give a result or an `InputError`.
 
 make fuzz        or: python -m tests.fuzz --inputs 200 --seconds 120 --seed 0 [reader ...]
 
-A reader may take 20 seconds and 2 GB per input. The same seed gives the same inputs; what fails is kept in
-`build/fuzz/<reader>-<seed>-<number>/` and reported. Exit code 1 where anything failed.
+A reader may take 20 seconds and 2 GB per input. The same seed gives the same inputs; failing inputs are kept in
+`build/fuzz/<reader>-<seed>-<number>/` and reported. The exit code is 1 if any input failed.
 """
 
 import argparse
@@ -33,18 +33,18 @@ from tests.pipeline.recordings import made_formats
 from tests.stages.extract_frames.made_recordings import walk
 
 MAX_S, MAX_KB = 20, 2 << 20
-KEPT = Path("build", "fuzz")
+FAILURES = Path("build", "fuzz")
 RESET, STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
 HOSTILE = (
     b"9" * 400, b"-1", b"0", b"1e300", b"1e-320", b"nan", b"inf", b"[]", b"{}", b"null", b'"x"', b"[" * 3000, b"\xff\xfe", b"",
     b"65535", b"4294967295", b"2147483648", b"-0", b"\0" * 64, b"../x", b"true",
 )  # fmt: skip
-"""what takes the place of a number or a stretch of bytes"""
+"""replacements of numbers and byte ranges"""
 
 
 @dataclass(frozen=True)
 class Reader:
-    """One kind of user file: how a good one is made and how it is read."""
+    """One kind of user file: functions that write a valid one and read it."""
 
     make: Callable[[Path], Path]
     read: Callable[[Path], object]
@@ -133,10 +133,7 @@ READERS = {
 
 
 def mutated(data: bytes, rng: np.random.Generator) -> bytes:
-    """Return bytes with one to four faults.
-
-    Flipped bits, a cut, a doubled or replaced stretch, a hostile number.
-    """
+    """Return bytes with one to four mutations: flipped bits, deleted, duplicated or replaced ranges, hostile numbers."""
     data = bytearray(data)
     for _ in range(rng.integers(1, 5)):
         if not data:
@@ -162,7 +159,7 @@ def mutated(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _replace_number(data: bytearray, at: int, hostile: bytes) -> None:
-    """Put ``hostile`` in the place of the number that is next to ``at``, or at ``at``."""
+    """Replace the next number after ``at``, or insert at ``at``."""
     digits = b"0123456789.-+e"
     start = next((i for i in range(at, min(at + 200, len(data))) if data[i] in digits), at)
     end = start
@@ -171,8 +168,8 @@ def _replace_number(data: bytearray, at: int, hostile: bytes) -> None:
     data[start:end] = hostile
 
 
-def spoil(path: Path, rng: np.random.Generator) -> None:
-    """Mutate one file of a recording in place; of an archive a member, or the archive itself."""
+def mutate_file(path: Path, rng: np.random.Generator) -> None:
+    """Mutate a file in place: one file of a folder, or a member of an archive or the archive itself."""
     if path.is_dir():
         files = sorted(each for each in path.rglob("*") if each.is_file())
         texts = [each for each in files if each.suffix in (".txt", ".csv", ".json")]
@@ -194,29 +191,27 @@ def spoil(path: Path, rng: np.random.Generator) -> None:
 
 
 def fuzz(name: str, inputs: int, until: float, seed: int) -> tuple[int, int]:
-    """Feed a reader; return how many inputs it got and how many of them it failed on."""
+    """Run a reader on mutated inputs; return the numbers of inputs and failures."""
     reader, failed, number = READERS[name], 0, 0
     with tempfile.TemporaryDirectory() as temporary:
-        good = reader.make(Path(temporary, "good"))
-        reader.read(good)
+        valid = reader.make(Path(temporary, "good"))
+        reader.read(valid)
         while number < inputs and time.monotonic() < until:
-            bad = Path(temporary, f"bad{good.suffix}")
-            shutil.copytree(good, bad) if good.is_dir() else shutil.copy(good, bad)
-            spoil(bad, np.random.default_rng([seed, number, *name.encode()]))
-            why = _failure(reader, bad)
-            if why is not None:
+            mutated_file = Path(temporary, f"bad{valid.suffix}")
+            shutil.copytree(valid, mutated_file) if valid.is_dir() else shutil.copy(valid, mutated_file)
+            mutate_file(mutated_file, np.random.default_rng([seed, number, *name.encode()]))
+            reason = _failure(reader, mutated_file)
+            if reason is not None:
                 failed += 1
-                _keep(bad, KEPT / f"{name}-{seed}-{number}", why)
-            shutil.rmtree(bad) if bad.is_dir() else bad.unlink()
+                _save_failure(mutated_file, FAILURES / f"{name}-{seed}-{number}", reason)
+            shutil.rmtree(mutated_file) if mutated_file.is_dir() else mutated_file.unlink()
             number += 1
     return number, failed
 
 
 def _failure(reader: Reader, path: Path) -> str | None:
-    """Return why a reader failed on an input, None where it answered with a result or a coded error in
-    time.
-    """
-    RESET.write_text("5")  # the peak of memory begins anew
+    """Return why a reader failed, or None if it gave a result or an `InputError` within the limits."""
+    RESET.write_text("5")  # reset the peak memory
     signal.alarm(MAX_S)
     try:
         reader.read(path)
@@ -230,32 +225,32 @@ def _failure(reader: Reader, path: Path) -> str | None:
     return f"{peak_kb} kB of memory" if peak_kb > MAX_KB else None
 
 
-def _keep(path: Path, folder: Path, why: str) -> None:
+def _save_failure(path: Path, folder: Path, reason: str) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     shutil.copytree(path, folder / path.name) if path.is_dir() else shutil.copy(path, folder)
-    (folder / "why.txt").write_text(why)
-    print(f"{folder}: {why.strip().splitlines()[-1]}", flush=True)
+    (folder / "why.txt").write_text(reason)
+    print(f"{folder}: {reason.strip().splitlines()[-1]}", flush=True)
 
 
-def _expired(*_: object) -> None:
+def _time_out(*_: object) -> None:
     raise TimeoutError(f"longer than {MAX_S} s")
 
 
 def main(arguments: list[str]) -> int:
-    """Fuzz the named readers, or all."""
+    """Fuzz the named readers, or all of them."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("readers", nargs="*", choices=[[], *READERS], help="default: all")
-    parser.add_argument("--inputs", type=int, default=200, help="per reader")
-    parser.add_argument("--seconds", type=float, default=60.0, help="at most, per reader")
+    parser.add_argument("--inputs", type=int, default=200, help="inputs per reader")
+    parser.add_argument("--seconds", type=float, default=60.0, help="time limit per reader")
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args(arguments)
-    signal.signal(signal.SIGALRM, _expired)
+    options = parser.parse_args(arguments)
+    signal.signal(signal.SIGALRM, _time_out)
     total = 0
-    for name in given.readers or READERS:
-        count, failed = fuzz(name, given.inputs, time.monotonic() + given.seconds, given.seed)
+    for name in options.readers or READERS:
+        count, failed = fuzz(name, options.inputs, time.monotonic() + options.seconds, options.seed)
         total += failed
         print(f"{name}: {count} inputs, {failed} failures", flush=True)
     return 1 if total else 0

@@ -1,10 +1,9 @@
-"""A device that does not exist, for tests: all tensors stay on the CPU, but those "on it" refuse to meet
-others.
+"""A simulated device for tests: all tensors stay on the CPU, but those "on the device" cannot be mixed with others.
 
-Under `SimulatedDevice` tensors that were moved to `DEVICE`, or made there, and all that is computed from
-them, report `DEVICE` as theirs. What CUDA would refuse raises `MixedDevicesError`: an operation on tensors of
-both devices (but CPU scalars), indices of the other device, `numpy()` of a device's tensor, and random
-numbers from a CPU generator.
+Under `SimulatedDevice` tensors that were moved to `DEVICE` or created there, and all results computed from them,
+report `DEVICE` as their device. Operations that fail on CUDA raise `MixedDevicesError`: those on tensors of both
+devices (except CPU scalars), indices of the other device, `numpy()` of a tensor on the device, and random numbers
+from a CPU generator.
 """
 
 import threading
@@ -17,7 +16,7 @@ from torch.utils import _pytree
 
 DEVICE = "cuda"
 _MARK = "_on_simulated_device"
-_ANYWHERE = (
+_MIXING_ALLOWED = (
     "_has_compatible_shallow_copy_type",
     "copy_",
     "set_",
@@ -27,11 +26,11 @@ _ANYWHERE = (
     "promote_types",
     "data_ptr",
 )
-"""functions whose tensors may be on different devices"""
+"""functions that accept tensors of different devices"""
 
 
 class MixedDevicesError(RuntimeError):
-    """What CUDA would refuse."""
+    """An operation that fails on CUDA."""
 
 
 def is_on_device(tensor: torch.Tensor) -> bool:
@@ -55,10 +54,10 @@ def _marked(result: object, on_device: bool) -> object:
 
 
 class SimulatedDevice(TorchFunctionMode):
-    """Keeps track of which tensors are on the device."""
+    """Tracks which tensors are on the device."""
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
-        """Run one function on the CPU, as far as the device would."""
+        """Run one function on the CPU if it would succeed on the device."""
         kwargs, owner = dict(kwargs or {}), getattr(func, "__self__", None)
         name = getattr(func, "__name__", str(func))
         if owner is torch.Tensor.device and name == "__get__":
@@ -92,47 +91,51 @@ class SimulatedDevice(TorchFunctionMode):
 
     def _run(self, func, name: str, args: tuple, kwargs: dict):
         tensors = [leaf for leaf in _pytree.tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
-        there = any(map(is_on_device, tensors))
-        if there and name in ("numpy", "__array__", "from_numpy"):
+        on_device = any(map(is_on_device, tensors))
+        if on_device and name in ("numpy", "__array__", "from_numpy"):
             raise MixedDevicesError(f"{name} of a tensor on {DEVICE}")
         others = [tensor for tensor in tensors if not is_on_device(tensor)]
         scalars = name not in ("__getitem__", "__setitem__", "index_put", "cat", "stack", "gather")
         others = [tensor for tensor in others if tensor.dim() or not scalars]
-        if there and others and name not in _ANYWHERE:
+        if on_device and others and name not in _MIXING_ALLOWED:
             raise MixedDevicesError(f"{name} of tensors on {DEVICE} and cpu")
         if "device" in kwargs and kwargs["device"] is not None:
-            there = _names_device(kwargs["device"])
+            on_device = _names_device(kwargs["device"])
             kwargs["device"] = "cpu"
-        if there and kwargs.get("generator") is not None:
+        if on_device and kwargs.get("generator") is not None:
             raise MixedDevicesError(f"{name} on {DEVICE} with a generator of the cpu")
         result = func(*args, **kwargs)
         if name in ("copy_", "set_"):
-            there = is_on_device(args[0])
-        return _marked(result, there) if there or tensors or "device" in kwargs else result
+            on_device = is_on_device(args[0])
+        return _marked(result, on_device) if on_device or tensors or "device" in kwargs else result
 
 
 @contextmanager
 def simulated_device():
-    """Simulate `DEVICE` within the block; parameters are on the device of what they are made of."""
-    plain, as_array, run = torch.nn.Parameter.__new__, torch.Tensor.__array__, threading.Thread.run
+    """Simulate `DEVICE` within the block; parameters are on the device of their data."""
+    new, as_array, run = torch.nn.Parameter.__new__, torch.Tensor.__array__, threading.Thread.run
 
-    def made(cls, data=None, requires_grad=True):
-        parameter = plain(cls, data, requires_grad)
+    def new_parameter(cls, data=None, requires_grad=True):
+        parameter = new(cls, data, requires_grad)
         setattr(parameter, _MARK, data is not None and is_on_device(data))
         return parameter
 
-    def array(tensor, *args, **kwargs) -> np.ndarray:
+    def checked_array(tensor, *args, **kwargs) -> np.ndarray:
         if is_on_device(tensor):
             raise MixedDevicesError(f"an array of a tensor on {DEVICE}")
         return as_array(tensor, *args, **kwargs)
 
-    def run_there(thread: threading.Thread) -> None:
-        with SimulatedDevice():  # modes are of one thread each
+    def run_in_mode(thread: threading.Thread) -> None:
+        with SimulatedDevice():  # function modes are per thread
             run(thread)
 
-    torch.nn.Parameter.__new__, torch.Tensor.__array__, threading.Thread.run = made, array, run_there
+    torch.nn.Parameter.__new__, torch.Tensor.__array__, threading.Thread.run = (
+        new_parameter,
+        checked_array,
+        run_in_mode,
+    )
     try:
         with SimulatedDevice():
             yield
     finally:
-        torch.nn.Parameter.__new__, torch.Tensor.__array__, threading.Thread.run = plain, as_array, run
+        torch.nn.Parameter.__new__, torch.Tensor.__array__, threading.Thread.run = new, as_array, run

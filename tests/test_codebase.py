@@ -1,4 +1,4 @@
-"""How easy the code is to enter does not get worse: each count of `benchmarks.codebase_counts` has a bar."""
+"""Limits of the counts of `benchmarks.codebase_counts`."""
 
 import ast
 
@@ -6,8 +6,8 @@ import pytest
 
 from benchmarks import codebase_counts
 
-BARS = {
-    "lines": 58_310,
+LIMITS = {
+    "lines": 58_250,
     "lines over 110 columns": 0,
     "recipe keys": 318,
     "packages over 16 modules": 0,
@@ -18,25 +18,25 @@ BARS = {
     "unshaped public functions": 0,
     "modules in import cycles": 0,
 }
-"""Today's counts, rounded up. Lower a bar when a count has gone down.
+"""Current counts, rounded up. Lower a limit when its count has decreased.
 
 A new stage, backend or check of recordings raises `lines` and `recipe keys` by what it adds, in its own
-commit. 200 lines are the names of numbers that had none; nothing else goes up.
+commit; no other limit goes up.
 """
 
 
-def test_every_count_has_a_bar():
-    assert BARS.keys() == codebase_counts.COUNTS.keys()
+def test_every_count_has_a_limit():
+    assert LIMITS.keys() == codebase_counts.COUNTS.keys()
 
 
-@pytest.mark.parametrize("name", BARS)
-def test_count(name):
+@pytest.mark.parametrize("name", LIMITS)
+def test_count_is_within_its_limit(name):
     found = codebase_counts.COUNTS[name]()
-    assert len(found) <= BARS[name], found[:20]
+    assert len(found) <= LIMITS[name], found[:20]
 
 
-def test_numbers_that_count():
-    """Thresholds and weights count; what is named beside it, and what explains itself, does not."""
+def test_unnamed_numbers_are_found():
+    """Thresholds and weights count; named and self-explanatory numbers do not."""
     text = """
 LIMIT = 0.7
 def f(x):

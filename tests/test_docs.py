@@ -1,6 +1,4 @@
-"""The guides tell the truth: every command in them exists, with its options; every link and picture leads
-somewhere.
-"""
+"""Commands in the guides exist with their options; links and pictures have targets."""
 
 import re
 import shlex
@@ -21,7 +19,7 @@ TARGETS = set(re.search(r"^COMMANDS := (.*)$", (ROOT / "Makefile").read_text(), 
 
 
 def commands() -> list[tuple[str, str]]:
-    """Every line of a code block that is meant to be typed."""
+    """Return every command line in the code blocks."""
     found = []
     for page in PAGES:
         for block in BLOCK.findall(page.read_text()):
@@ -36,13 +34,15 @@ def commands() -> list[tuple[str, str]]:
 
 @cache
 def help_of(module: str) -> str:
-    told = subprocess.run([sys.executable, "-m", module, "--help"], cwd=ROOT, capture_output=True, text=True)
-    assert told.returncode == 0, told.stderr
-    return told.stdout
+    completed = subprocess.run(
+        [sys.executable, "-m", module, "--help"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert completed.returncode == 0, completed.stderr
+    return completed.stdout
 
 
 def check_make(words: list[str]) -> None:
-    """Targets and variants exist; variables are ones that the Makefile reads."""
+    """Check that targets and variants exist and that the Makefile reads the variables."""
     makefile = (ROOT / "Makefile").read_text()
     for word in words:
         if word in ("|",) or re.fullmatch(r"-j\d*", word):
@@ -85,7 +85,7 @@ def test_every_command_exists(page: str, line: str) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_link_leads_somewhere(page: Path) -> None:
+def test_link_targets_exist(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
         assert target.startswith("http") or (page.parent / target).exists(), target
     for key in re.findall(r"`(layout|scene_splats|scene_faces)", page.read_text()):
@@ -93,4 +93,4 @@ def test_every_link_leads_somewhere(page: Path) -> None:
 
 
 def test_pictures_are_small() -> None:
-    assert sum(path.stat().st_size for path in (ROOT / "docs/pictures").iterdir()) < 400_000, "bytes in all"
+    assert sum(path.stat().st_size for path in (ROOT / "docs/pictures").iterdir()) < 400_000, "bytes in total"

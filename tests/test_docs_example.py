@@ -1,6 +1,4 @@
-"""The example of docs/adding_a_stage.md works as written: its files are put into a copy of the checkout and
-run.
-"""
+"""The example of docs/adding_a_stage.md works as written in a copy of the checkout."""
 
 import re
 import shutil
@@ -18,7 +16,7 @@ CONTRACTS = re.findall(r"^```markdown\n(.*?)^```", GUIDE, re.MULTILINE | re.DOTA
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory) -> Path:
-    """A checkout with the guide's stage in it."""
+    """A checkout with the stage of the guide."""
     folder = tmp_path_factory.mktemp("checkout")
     skip = shutil.ignore_patterns("__pycache__", "node_modules", "dist")
     for name in ("pipeline", "stages", "agents"):
@@ -52,33 +50,32 @@ def python(folder: Path, *words: str) -> str:
 
 
 @pytest.mark.slow
-def test_its_own_test_passes(copy):
+def test_tests_of_the_stage_pass(copy):
     assert "3 passed" in python(copy, "-m", "pytest", "tests/stages/map_visits")
 
 
 @pytest.mark.slow
-def test_its_command_line_works(copy):
+def test_stage_has_a_command_line(copy):
     usage = python(copy, "-m", "stages.map_visits", "--help")
     assert "--reconstruction" in usage and "cell_m = 0.25" in usage
 
 
-def test_the_planner_knows_it(copy):
+def test_stage_is_planned(copy):
     python(copy, "-SE", "-m", "pipeline.workflow.plan", "plan", "toy")
     assert "visits" in (copy / "build/toy/plan/rules.mk").read_text()
 
 
 @pytest.mark.slow
-def test_it_keeps_the_rules(copy):
-    """Those of its own files, of the declaration, and the contracts of section 8."""
-    chosen = "visits or dag.py or in_the_catalogue or room_is_in_the_flow or artifact_is_told"
+def test_stage_passes_the_checks_of_the_architecture(copy):
+    chosen = "visits or dag.py or documented_in_errors or stage_is_in_the_flow or artifact_is_documented"
     files = ("tests/test_house.py", "tests/test_data_layout.py")
     done = python(copy, "-m", "pytest", "-m", "not toy", *files, "-k", chosen)
     assert " passed" in done
 
 
 @pytest.mark.toy
-def test_the_python_guide_runs(toy, tmp_path, monkeypatch):
-    """The blocks of docs/python.md, one after the other, on the toy build."""
+def test_python_guide_runs(toy, tmp_path, monkeypatch):
+    """Run the blocks of docs/python.md in order on the toy build."""
     (tmp_path / "build").mkdir()
     (tmp_path / "build/toy").symlink_to(toy)
     monkeypatch.chdir(tmp_path)

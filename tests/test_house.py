@@ -1,4 +1,4 @@
-"""The rules of the house: floors, sizes, docstrings, doors, and a declaration that fits the programs."""
+"""Rules of the architecture: imports, sizes, docstrings, command lines, and a flow that fits the programs."""
 
 import ast
 import builtins
@@ -22,7 +22,7 @@ FILES = sorted(
     for path in (ROOT / top).rglob("*.py")
     if "node_modules" not in path.parts
 )
-FRONTS = sorted((ROOT / "stages").rglob("__main__.py"))
+COMMAND_LINES = sorted((ROOT / "stages").rglob("__main__.py"))
 CONFIGS = sorted(path for path in FILES if path.name == "config.py" and path.parent.name != "core")
 PACKAGES = (
     "core",
@@ -41,18 +41,18 @@ PACKAGES = (
     "environments",
     "adapters",
 )
-"""Packages of `pipeline/` in flow order: each imports itself and earlier ones."""
-FOR_FRONTS_ONLY = "workflow"
-"""The package that knows the disk: the science of stages does not."""
+"""Packages of `pipeline/` in import order: each imports itself and earlier ones."""
+FOR_COMMAND_LINES_ONLY = "workflow"
+"""The package that accesses the disk; only `__main__` modules of stages import it."""
 
 
 def name_of(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
-def stage_of(front: Path) -> str:
-    """Return the program's name: its room, or the room and the part that is a program of its own."""
-    return ".".join(front.parent.relative_to(ROOT / "stages").parts)
+def stage_of(main_file: Path) -> str:
+    """Return the dotted name of a program below `stages`."""
+    return ".".join(main_file.parent.relative_to(ROOT / "stages").parts)
 
 
 @cache
@@ -61,7 +61,7 @@ def tree_of(path: Path) -> ast.Module:
 
 
 def imports(path: Path) -> set[str]:
-    """Return the absolute names that a file imports, wherever in the file."""
+    """Return the absolute names that a file imports anywhere."""
     names: set[str] = set()
     for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
@@ -74,21 +74,21 @@ def imports(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
-def test_imports_go_downstairs_only(path):
+def test_imports_respect_the_layers(path):
     parts = path.relative_to(ROOT).with_suffix("").parts
     for name in imports(path):
         top, *rest = name.split(".")
         if top == "stages":
-            assert parts[0] == "stages", f"the ground floor imports {name}"
-            assert rest[0] == parts[1], f"a room imports another: {name}"
+            assert parts[0] == "stages", f"pipeline imports {name}"
+            assert rest[0] == parts[1], f"a stage imports another: {name}"
         if top == "pipeline" and parts[0] == "pipeline" and parts[1] != "__init__":
             assert PACKAGES.index(rest[0]) <= PACKAGES.index(parts[1]), f"{parts[1]} comes before {rest[0]}"
         if top == "pipeline" and parts[0] == "stages" and parts[-1] != "__main__":
-            assert rest[0] != FOR_FRONTS_ONLY, f"science knows the disk: {name}"
+            assert rest[0] != FOR_COMMAND_LINES_ONLY, f"only __main__ may import {name}"
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
-def test_sizes(path):
+def test_files_and_functions_are_small(path):
     lines = path.read_text().count("\n")
     assert lines <= (80 if path.name == "__main__.py" else 400), f"{lines} lines"
     longest_function = 60 if path.is_relative_to(ROOT / "pipeline") else 69
@@ -99,7 +99,7 @@ def test_sizes(path):
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
-def test_docstrings(path):
+def test_public_names_have_docstrings(path):
     tree = tree_of(path)
     if tree.body:
         assert ast.get_docstring(tree), "the module has no docstring"
@@ -111,9 +111,9 @@ def test_docstrings(path):
 
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
-def test_names_and_marks(path):
+def test_no_catch_all_modules_markers_or_bare_excepts(path):
     assert path.name not in {"utils.py", "helpers.py", "common.py", "misc.py"}
-    assert not re.search(r"\b(TODO|FIXME|XXX)\b", path.read_text()), "no marks for later"
+    assert not re.search(r"\b(TODO|FIXME|XXX)\b", path.read_text()), "no TODO markers"
     for node in ast.walk(tree_of(path)):
         assert not (isinstance(node, ast.ExceptHandler) and node.type is None), (
             f"line {node.lineno}: bare except"
@@ -121,7 +121,7 @@ def test_names_and_marks(path):
 
 
 def undefined(table: symtable.SymbolTable, known: set[str]) -> set[str]:
-    """Return the names that a scope or one within it reads from the module, and that are not there."""
+    """Return the names that a scope or an inner one reads from the module and that it does not define."""
     here = {
         symbol.get_name() for symbol in table.get_symbols() if symbol.is_global() and symbol.is_referenced()
     }
@@ -130,7 +130,7 @@ def undefined(table: symtable.SymbolTable, known: set[str]) -> set[str]:
 
 @pytest.mark.parametrize("path", FILES, ids=name_of)
 def test_every_name_is_defined(path):
-    """The linter cannot tell: to it the shapes of arrays in annotations are names as well."""
+    """The linter cannot check this: array shapes in annotations look like undefined names."""
     module = symtable.symtable(path.read_text(), str(path), "exec")
     own = {
         symbol.get_name() for symbol in module.get_symbols() if symbol.is_assigned() or symbol.is_imported()
@@ -138,11 +138,9 @@ def test_every_name_is_defined(path):
     assert not undefined(module, {*own, *dir(builtins), "__file__"})
 
 
-@pytest.mark.parametrize("path", [*FRONTS, *CONFIGS], ids=name_of)
+@pytest.mark.parametrize("path", [*COMMAND_LINES, *CONFIGS], ids=name_of)
 def test_settings_are_documented(path):
-    """Every setting is typed, defaulted and documented beneath; its dataclass is frozen and names no
-    `Any`.
-    """
+    """Every field has a type other than `Any`, a default and a docstring; its dataclass is frozen."""
     for cls in (node for node in tree_of(path).body if isinstance(node, ast.ClassDef)):
         if path.name == "__main__.py" and cls.name != "Config":
             continue
@@ -159,9 +157,7 @@ def test_settings_are_documented(path):
 
 @pytest.mark.parametrize("path", CONFIGS, ids=name_of)
 def test_settings_are_importable_without_libraries(path):
-    """A config module imports the standard library, the ground floor without libraries, and config modules
-    alone.
-    """
+    """A config module imports only the standard library, dependency-free modules of `pipeline.core`, and config modules."""
     for name in imports(path):
         top, *rest = name.split(".")
         ours = top in ("pipeline", "stages")
@@ -169,8 +165,8 @@ def test_settings_are_importable_without_libraries(path):
         assert top in sys.stdlib_module_names or (ours and (plain or "config" in rest)), f"imports {name}"
 
 
-def test_the_planner_reads_settings_without_libraries():
-    """All config modules can be imported together where no library is installed."""
+def test_config_modules_import_without_libraries():
+    """Importing all config modules loads neither NumPy nor torch."""
     modules = [name_of(path).removesuffix(".py").replace("/", ".") for path in CONFIGS]
     code = (
         f"import importlib, sys; [importlib.import_module(name) for name in {modules!r}]; print(*sys.modules)"
@@ -193,16 +189,16 @@ for stage in sys.argv[1:]:
         found[stage] = end.code or 0, text.getvalue()
 print(json.dumps(found))
 """
-"""Prints what `--help` prints of each program. One process for all: to import the libraries takes seconds."""
+"""Prints the help of each program, in one process, since importing the libraries takes seconds."""
 
 
 @cache
 def all_help() -> dict[str, tuple[int, str]]:
     environment = {"COLUMNS": "1000", "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-c", ALL_HELP, *map(stage_of, FRONTS)]
-    told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment)
-    assert told.returncode == 0, told.stderr
-    return json.loads(told.stdout.splitlines()[-1])
+    command = [sys.executable, "-c", ALL_HELP, *map(stage_of, COMMAND_LINES)]
+    completed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment)
+    assert completed.returncode == 0, completed.stderr
+    return json.loads(completed.stdout.splitlines()[-1])
 
 
 def help_of(stage: str) -> str:
@@ -211,29 +207,26 @@ def help_of(stage: str) -> str:
     return text
 
 
-@pytest.mark.parametrize("path", FRONTS, ids=stage_of)
-def test_every_door_opens(path):
-    """`--help` works and tells what the front's docstring tells."""
+@pytest.mark.parametrize("path", COMMAND_LINES, ids=stage_of)
+def test_help_shows_the_docstring(path):
     assert ast.get_docstring(tree_of(path)).splitlines()[0] in help_of(stage_of(path))
 
 
 @pytest.mark.parametrize("node", dag.FLOW, ids=lambda node: node.artifact)
-def test_the_declaration_fits_the_program(node):
-    """What the flow hands to a program is what the program asks for, and nothing that it must have is left
-    out.
-    """
+def test_flow_fits_the_options_of_the_program(node):
+    """The flow passes only known options, and all required ones."""
     usage = help_of(node.stage).split("\n\n")[0]
-    handed = {f"--{need.option or need.artifact.replace('_', '-')}" for need in dag.needs_of(node)}
-    handed |= {"--variants" for need in dag.needs_of(node) if need.variants}
+    passed = {f"--{need.option or need.artifact.replace('_', '-')}" for need in dag.needs_of(node)}
+    passed |= {"--variants" for need in dag.needs_of(node) if need.variants}
     known = set(re.findall(r"--[a-z-]+", usage))
     required = set(re.findall(r"--[a-z-]+", re.sub(r"\[[^\]]*\]", "", usage)))
-    assert handed <= known, f"{node.stage} does not know {handed - known}"
-    assert required <= handed | {"--out"}, f"{node.stage} also needs {required - handed}"
+    assert passed <= known, f"{node.stage} does not know {passed - known}"
+    assert required <= passed | {"--out"}, f"{node.stage} also needs {required - passed}"
 
 
-def test_every_room_is_in_the_flow():
-    """Every stage program has its place in the declaration; these stand beside it."""
-    assert {stage_of(path) for path in FRONTS} == {node.stage for node in dag.FLOW} | {
+def test_every_stage_is_in_the_flow():
+    """Every program belongs to the flow, except these."""
+    assert {stage_of(path) for path in COMMAND_LINES} == {node.stage for node in dag.FLOW} | {
         "simulate",
         "check_captures",
         "annotate",
@@ -242,8 +235,8 @@ def test_every_room_is_in_the_flow():
     }
 
 
-def test_truth_is_for_evaluate_alone():
-    """No source outside the room that makes truth and the one that judges by it speaks of a truth file."""
+def test_only_synthesis_and_evaluation_use_ground_truth():
+    """No other stage mentions a truth file."""
     for path in FILES:
         if path.parts[len(ROOT.parts)] == "stages" and path.parent.name not in {
             "synthesize_capture",
@@ -258,19 +251,19 @@ def test_truth_is_for_evaluate_alone():
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "agents").rglob("*.toml")), ids=name_of)
-def test_recipes_fit_the_programs(path):
-    """Every table of every recipe loads into its stage's Config."""
+def test_recipes_load(path):
+    """Every table of every recipe loads into the `Config` of its stage."""
     nodes = {dag.table_of(node): node for node in dag.FLOW}
     for name, table in recipes.read(path)[0].items():
-        if name in ("videos", "flow"):  # no stage's
+        if name in ("videos", "flow"):  # not of a stage
             continue
         stage = nodes[name].stage
         declared = sources.config_of(stage)
         config.from_table(declared, table, where=f"{path}: [{name}]")
 
 
-def test_every_code_is_in_the_catalogue():
-    """What a user may meet is explained in one place, and nothing else is."""
+def test_every_code_is_documented_in_errors():
+    """`ERRORS.md` explains exactly the error codes of the sources, each once."""
     strings = {
         n.value
         for path in FILES
@@ -279,9 +272,9 @@ def test_every_code_is_in_the_catalogue():
     }
     codes = {text for text in strings if re.fullmatch(r"[A-Z]{3}-\d{3}", text)}
     codes |= set(re.findall(r"\b[A-Z]{3}-\d{3}\b", (ROOT / "envs/setup").read_text()))
-    told = re.findall(
+    documented = re.findall(
         r"[A-Z]{3}-\d{3}",
         "".join(re.findall(r"^\| ([^|]*) \|", (ROOT / "ERRORS.md").read_text(), re.MULTILINE)),
     )
     assert len(codes) > 70
-    assert sorted(told) == sorted(codes), f"{codes ^ set(told)}, or told twice"
+    assert sorted(documented) == sorted(codes), f"{codes ^ set(documented)}, or documented twice"

@@ -1,4 +1,4 @@
-"""What another version wrote is refused with one code: neither a traceback nor a misreading."""
+"""Artifacts of another version are refused with ART-007, without a traceback or a misinterpretation."""
 
 import json
 import re
@@ -22,16 +22,15 @@ from stages.simulate import takes
 from stages.simulate.config import Config
 from stages.simulate.inputs import Inputs
 from stages.train_behavior.export import write_contract
-from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, scaling, wandering
 from tests.stages.export import moving_tube
-from tests.stages.simulate.test_simulator import scaling
 
 QUICK = EnvironmentConfig(goal_steps=2, sequence_steps=2, candidates=1, start_m=(0.8, 1.5))
 
 
 @pytest.fixture
 def build(tmp_path):
-    """Model and data of an animal, and its glTF, as this version writes them."""
+    """Model, data and glTF of an animal, as this version writes them."""
     for name in ("behavior", "behavior_data", "simulator"):
         (tmp_path / name).mkdir()
     wandering().save(tmp_path / "behavior_data")
@@ -63,20 +62,20 @@ def with_json(path, *keys, value=None):
 
 
 CHANGES = {
-    "another exponent": (("path_encoding", "velocity_power"), 0.9),
-    "another grid": (("grid", "cell_m"), 0.3),
-    "another rate": (("rate_hz",), 30),
-    "channels in another order": (("channels", "goal"), ["z", "y", "x"]),
-    "another schedule": (("schedule", "alpha_bar"), [1.0, 0.5]),
-    "a setting of its own": (("architecture", "memory"), 4),
-    "a setting less": (("architecture", "map_lookup"), None),
-    "a scale less": (("scaling", "goal_std"), None),
-    "a part less": (("path_encoding",), None),
+    "different exponent": (("path_encoding", "velocity_power"), 0.9),
+    "different grid": (("grid", "cell_m"), 0.3),
+    "different rate": (("rate_hz",), 30),
+    "different channel order": (("channels", "goal"), ["z", "y", "x"]),
+    "different schedule": (("schedule", "alpha_bar"), [1.0, 0.5]),
+    "unknown setting": (("architecture", "memory"), 4),
+    "missing setting": (("architecture", "map_lookup"), None),
+    "missing scale": (("scaling", "goal_std"), None),
+    "missing table": (("path_encoding",), None),
 }
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_a_behavior_model_with_another_contract_is_refused(build, change):
+def test_behavior_model_with_different_contract_is_refused(build, change):
     keys, value = CHANGES[change]
     with_json(build / "behavior/behavior.json", *keys, value=value)
     for load in (
@@ -92,7 +91,7 @@ def test_a_behavior_model_with_another_contract_is_refused(build, change):
         assert "make" in raised.value.remedy
 
 
-def test_weights_of_another_network_are_refused(build):
+def test_missing_weights_are_refused(build):
     path = build / "behavior/behavior.safetensors"
     weights = load_file(path)
     save_file(dict(list(weights.items())[1:]), path)
@@ -103,13 +102,13 @@ def test_weights_of_another_network_are_refused(build):
         behavior.load(build / "behavior")
 
 
-def test_how_plans_are_drawn_is_no_part_of_the_model(build):
+def test_sampling_settings_are_not_part_of_the_contract(build):
     with_json(build / "behavior/behavior.json", "sampling", "goal_steps", value=3)
     behavior.load(build / "behavior")
 
 
 @pytest.mark.parametrize("key", ["rate_hz", "frames", "sizes", "motion_prior", "sees_scene", "units"])
-def test_a_long_term_model_with_another_document_is_refused(key, tmp_path):
+def test_long_term_model_with_missing_key_is_refused(key, tmp_path):
     sizes = {"pose": 3}
     document = {
         "units": "metres, radians, seconds", "up": [0, 1, 0], "rate_hz": 10, "frames": 21, "bones": 3,
@@ -124,7 +123,7 @@ def test_a_long_term_model_with_another_document_is_refused(key, tmp_path):
 
 @pytest.mark.parametrize("name", ["agent.glb", "scene.glb", "simulator.json"])
 @pytest.mark.parametrize("content", [b"", b"{}", b"glTF" + bytes(40), None])
-def test_a_simulator_of_another_version_is_refused(build, name, content):
+def test_invalid_simulator_files_are_refused(build, name, content):
     path = build / "simulator" / name
     if content is None:
         path.unlink()
@@ -136,9 +135,9 @@ def test_a_simulator_of_another_version_is_refused(build, name, content):
     assert "make" in raised.value.remedy
 
 
-def test_a_skin_without_what_this_version_writes_is_refused(build):
+def test_mesh_without_skin_is_refused(build):
     path = build / "simulator/agent.glb"
-    path.write_bytes((build / "simulator/scene.glb").read_bytes())  # a surface without a skin
+    path.write_bytes((build / "simulator/scene.glb").read_bytes())  # a mesh without a skin
     with pytest.raises(InputError, match="ART-007"):
         reading.agent(build / "simulator", None, 30.0)
     inputs = Inputs(build / "behavior_data", build / "behavior", build / "simulator")
@@ -146,8 +145,8 @@ def test_a_skin_without_what_this_version_writes_is_refused(build):
         takes.live(inputs, Config(), "cpu")
 
 
-def test_artifacts_name_their_version(build, monkeypatch):
-    """Files that look right, but mean something else, are known by the number of their stage."""
+def test_artifact_of_another_stage_version_is_refused(build, monkeypatch):
+    """Artifacts whose format is unchanged but whose meaning differs are detected by the version of their stage."""
     with artifact.create(build / "made", stage="train_behavior", config={}, inputs={}) as folder:
         (folder / "a.txt").write_text("a")
     assert artifact.opened(build / "made", "behavior").version == artifact.version_of("train_behavior")
@@ -159,7 +158,7 @@ def test_artifacts_name_their_version(build, monkeypatch):
         AnimalWorld.load(build, QUICK)
 
 
-def test_models_that_differ_in_nothing_but_their_numbers_are_read(build):
+def test_models_with_other_values_are_read(build):
     again = replace(scaling(), goal_std=np.array([0.2, 0.2, 0.2]))
     write_contract(build / "behavior", BehaviorNets(ARCHITECTURE), ARCHITECTURE, again, Schedule(), REST)
     np.testing.assert_array_equal(behavior.load(build / "behavior")[2].goal_std, again.goal_std)

@@ -1,6 +1,4 @@
-"""Kill the toy's build twenty times while stages write, without the truth on disk: the artifacts are the same
-bytes.
-"""
+"""Kill the toy build twenty times while stages write, without ground truth on disk; the artifacts are byte-identical."""
 
 import contextlib
 import os
@@ -24,19 +22,19 @@ KILLS = {
     "frames": 4, "flow": 3, "masks": 3, "feature_basis": 1, "features": 3, "behavior_data": 1,
     "reconstruction": 2, "splats": 1, "behavior": 2,
 }  # fmt: skip
-"""How often a build is killed while an artifact is written, or while its training writes checkpoints."""
+"""Number of kills per artifact while it, or a checkpoint of its training, is written."""
 TRAININGS = ("reconstruction", "splats", "behavior")
 BUILT = [node.artifact for node in dag.nodes_of("recordings") if not (node.on_demand or node.mapped)]
-"""What `make toy` makes."""
-JUDGING = ("reconstruction_metrics", "evaluation", "report")
-"""What is made from the truth."""
+"""Artifacts of `make toy`."""
+FROM_TRUTH = ("reconstruction_metrics", "evaluation", "report")
+"""Artifacts that depend on the ground truth."""
 LIMIT_S = 3600
-"""For the next artifact to begin to be written; a hang ends the test."""
+"""Time limit until the next artifact is written."""
 
 
 @pytest.fixture(scope="module")
 def copy(toy, tmp_path_factory) -> Path:
-    """A working copy that has the toy's recordings, and no truth."""
+    """A working copy with the recordings of the toy, without ground truth."""
     folder = tmp_path_factory.mktemp("restart")
     for name in ("pipeline", "stages", "agents", "envs"):
         shutil.copytree(
@@ -49,9 +47,9 @@ def copy(toy, tmp_path_factory) -> Path:
     return folder
 
 
-def begin(folder: Path) -> subprocess.Popen[bytes]:
-    """Build what stands before the metrics, in a process group of its own."""
-    goals = [f"toy.{name}" for name in BUILT if name not in JUDGING]
+def start_build(folder: Path) -> subprocess.Popen[bytes]:
+    """Start a build of everything that does not depend on the ground truth, in its own process group."""
+    goals = [f"toy.{name}" for name in BUILT if name not in FROM_TRUTH]
     with (folder / "build.log").open("ab") as log:
         return subprocess.Popen(
             ["make", "-j2", *goals], cwd=folder, start_new_session=True, stdout=log, stderr=log
@@ -70,16 +68,15 @@ def being_written(folder: Path, name: str) -> Iterator[Path]:
 
 
 def kill_while_writing(folder: Path, names: list[str], choice: random.Random) -> tuple[str, str]:
-    """Build until one of `names` is being written, then SIGKILL the group; return which, and what was there.
+    """Build until one of `names` is being written, then SIGKILL the group; return its name and the temporary path.
 
-    A kill a moment after the last write does not count; where a build ends before one counts, they are made
-    again.
+    A kill after the write has ended does not count; if a build ends before one counts, the artifacts are rebuilt.
     """
     end = time.monotonic() + LIMIT_S
     while time.monotonic() < end:
         left_over = {path for name in names for path in being_written(folder, name)}
         new: list[tuple[str, Path]] = []
-        build = begin(folder)
+        build = start_build(folder)
         while build.poll() is None and not new and time.monotonic() < end:
             time.sleep(0.002)
             new = [
@@ -100,11 +97,11 @@ def kill_while_writing(folder: Path, names: list[str], choice: random.Random) ->
                 shutil.rmtree(folder / "build" / "toy" / name)
         elif new[0][1].exists():
             return new[0][0], str(new[0][1].relative_to(folder))
-    raise AssertionError(f"no kill met {names} while they were written")
+    raise AssertionError(f"{names} were never killed while they were written")
 
 
 def complete(folder: Path) -> dict[str, artifact.Manifest]:
-    """Return every artifact that counts as complete, each checked against its files."""
+    """Return every complete artifact, each checked against its files."""
     found = {}
     for path in (folder / "build" / "toy").rglob(artifact.MANIFEST):
         inside = path.parent.relative_to(folder / "build" / "toy")
@@ -112,31 +109,33 @@ def complete(folder: Path) -> dict[str, artifact.Manifest]:
             continue
         manifest = artifact.read_manifest(path.parent)
         assert manifest is not None, path
-        assert manifest.files == artifact.digests(path.parent), f"{inside} is taken as complete and is not"
+        assert manifest.files == artifact.digests(path.parent), f"{inside} has a manifest but is incomplete"
         found[inside.as_posix()] = manifest
     return found
 
 
 @pytest.fixture(scope="module")
 def rebuilt(copy, toy, pytestconfig) -> Path:
-    """Rebuild the copy under kills, telling each; finish it undisturbed."""
+    """Rebuild the copy with kills, printing each, then finish the build."""
     choice = random.Random(20)
-    left = dict(KILLS)
+    remaining_kills = dict(KILLS)
     shown = pytestconfig.pluginmanager.getplugin("capturemanager").global_and_fixture_disabled
-    while any(left.values()):
-        name, there = kill_while_writing(copy, [name for name in left if left[name]], choice)
-        left[name] -= 1
-        count = sum(KILLS.values()) - sum(left.values())
+    while any(remaining_kills.values()):
+        name, there = kill_while_writing(
+            copy, [name for name in remaining_kills if remaining_kills[name]], choice
+        )
+        remaining_kills[name] -= 1
+        count = sum(KILLS.values()) - sum(remaining_kills.values())
         with shown():
             print(
                 f"kill {count:2} during {name}, beside {there}; {len(complete(copy))} artifacts complete",
                 flush=True,
             )
-    assert begin(copy).wait() == 0, (copy / "build.log").read_text()[-3000:]
+    assert start_build(copy).wait() == 0, (copy / "build.log").read_text()[-3000:]
     return copy
 
 
-def test_trainings_went_on_from_their_checkpoints(rebuilt):
+def test_trainings_resumed_from_checkpoints(rebuilt):
     log = (rebuilt / "build.log").read_text()
     for name in TRAININGS:
         steps = [
@@ -144,14 +143,14 @@ def test_trainings_went_on_from_their_checkpoints(rebuilt):
             for line in log.splitlines()
             if line.startswith(f"[{name}] resumed at step")
         ]
-        assert any(step > 0 for step in steps), f"{name} began again"
+        assert any(step > 0 for step in steps), f"{name} started from scratch"
 
 
-def test_the_artifacts_are_those_of_an_undisturbed_build_with_truth(rebuilt, toy):
-    """Byte for byte, manifests too; what stands before the metrics has never seen the truth."""
+def test_artifacts_equal_those_of_the_toy_build(rebuilt, toy):
+    """Files and manifests are byte-identical, although this build has no ground truth."""
     assert not (rebuilt / "build/toy/synthetic_capture/truth").exists()
     done = complete(rebuilt)
-    assert {name.split("/")[0] for name in done} == set(BUILT) - {"synthetic_capture", *JUDGING}
+    assert {name.split("/")[0] for name in done} == set(BUILT) - {"synthetic_capture", *FROM_TRUTH}
     assert [
         name for name, manifest in done.items() if manifest.files != artifact.opened(toy / name, name).files
     ] == []
@@ -161,7 +160,7 @@ def test_the_artifacts_are_those_of_an_undisturbed_build_with_truth(rebuilt, toy
         ).read_bytes()
 
 
-def test_nothing_is_left_over(rebuilt):
+def test_no_temporary_folders_remain(rebuilt):
     build = rebuilt / "build" / "toy"
     assert [path for pattern in (".*.tmp*", ".*.old*") for path in build.rglob(pattern)] == []
     assert list((build / "resume").iterdir()) == []

@@ -1,4 +1,4 @@
-"""A test and a second process of its own module, which meet on the loopback interface as torchrun's do."""
+"""Distributed tests with two processes on the loopback interface, configured as by torchrun."""
 
 import contextlib
 import os
@@ -19,7 +19,7 @@ TORCHRUN = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT", "T
 
 
 def join(rank: int, port: str) -> None:
-    """Enter the group of two as torchrun would start this process."""
+    """Join the process group of two with the environment of torchrun."""
     torch.set_num_threads(1)
     os.environ.update(zip(TORCHRUN, (str(rank), str(rank), "2", "127.0.0.1", port, "test"), strict=True))
     distributed.join("cpu")
@@ -28,9 +28,9 @@ def join(rank: int, port: str) -> None:
 @contextlib.contextmanager
 def started(module: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """Run ``module`` with a port and ``folder`` as the second process; yield the port."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = str(probe.getsockname()[1])
     for name in TORCHRUN:
         monkeypatch.setenv(name, "")
     other = subprocess.Popen([sys.executable, "-m", module, port, str(folder)])
@@ -42,10 +42,10 @@ def started(module: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
 
 
 def fit_both(fit: Callable[..., FitRecord]) -> Callable[..., FitRecord]:
-    """Return `training.fit` in one process on what two would draw: the mean of their losses."""
+    """Return a `training.fit` for one process that averages the losses of the batches of both."""
 
-    def fitted(*, loss: Loss, seed: int, **rest: Any) -> FitRecord:
-        def of_both(step: int, _: torch.Generator) -> dict[str, torch.Tensor]:
+    def fit_mean(*, loss: Loss, seed: int, **rest: Any) -> FitRecord:
+        def mean_loss(step: int, _: torch.Generator) -> dict[str, torch.Tensor]:
             parts = []
             for rank in range(2):
                 generator = generator_for(seed, step, rank)
@@ -55,6 +55,6 @@ def fit_both(fit: Callable[..., FitRecord]) -> Callable[..., FitRecord]:
             names = dict.fromkeys([*parts[0], *parts[1]])
             return {name: sum(part.get(name, torch.zeros(())) for part in parts) / 2 for name in names}
 
-        return fit(loss=of_both, seed=seed, **rest)
+        return fit(loss=mean_loss, seed=seed, **rest)
 
-    return fitted
+    return fit_mean

@@ -1,8 +1,8 @@
-"""Figures on public real data, each beside its peers.
+"""Metrics on public real data, with those of other methods.
 
     make real-benchmark DATA=folder
 
-`folders` states which data lies where; each other module measures one row (`walkers`, `captured_dog`, `masks`,
-`flow`, `rooms`) and returns `table.Row`; `__main__` prints the table and writes it as Markdown and JSON. What
-is not there is skipped, with the layout that is expected.
+`rows` lists the rows and the expected layout of their data; `walkers`, `captured_dog`, `masks`, `flow` and `rooms`
+measure one row each and return a `table.Row`; `__main__` prints the table and writes it as Markdown and JSON. Rows
+without data are skipped, with the expected layout.
 """

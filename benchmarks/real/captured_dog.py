@@ -1,7 +1,7 @@
-"""Goals, paths and bodies of a dog in a motion-capture studio, each clip held out once.
+"""Forecasts of goals, paths and bodies on dog motion capture, with leave-one-clip-out cross-validation.
 
-The stages are those of `agents/dog.toml`: joints become a root and bones, windows of 0.8 s + 5.6 s are cut, and
-the behaviour model learns from all clips but one.
+The stages are those of `agents/dog.toml`: joints are converted to a root and bones, sliced into windows of 0.8 s +
+5.6 s, and the behavior model is trained on all clips but one.
 """
 
 import json
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.real.forecasts import StraightToPrior
+from benchmarks.real.forecasts import LocationPriorPath
 from benchmarks.real.table import Row
 from pipeline.baselines.predictors import Ats, ConstantVelocity, LocationPrior, Samples, StandStill
 from pipeline.behavior.config import PlanSamplingConfig
@@ -31,8 +31,8 @@ from stages.train_behavior.config import Config as TrainingConfig
 
 SAMPLES = 16
 STRIDE = 4
-"""frames between the windows that are judged"""
-FIGURES = ("goal_minde_m", "goal_energy_score_m", "path_minade_m", "orientation_minade_rad")
+"""frames between evaluated windows"""
+METRICS = ("goal_minde_m", "goal_energy_score_m", "path_minade_m", "orientation_minade_rad")
 MODEL = TrainingConfig(
     export=False,
     scene="none",
@@ -40,16 +40,16 @@ MODEL = TrainingConfig(
         BehaviorOptimizerConfig(steps=260, goal_steps=60), AugmentationConfig(turn=0.0)
     ),
 )
-"""Steps as in `agents/dog.toml`. Ego frames are not turned: without a scene nothing depends on the heading, and
-two minutes of bodies in any heading would leave little to learn the turns of one from."""
+"""Steps as in `agents/dog.toml`. No rotation augmentation: without a scene nothing depends on the heading, and two
+minutes of motion are too little to learn bodies in all headings."""
 MethodScores = dict[str, dict[str, list[float]]]
-"""per method and score, one number per window"""
-TURNING_LIMIT = 2.0
-"""Turning error allowed, in parts of that of standing still."""
+"""per method and score, one value per window"""
+MAX_RELATIVE_TURNING = 2.0
+"""Limit of the orientation error, relative to that of standing still."""
 
 
-def prepared(recording: Path, folder: Path) -> dict[str, Path]:
-    """Read every clip of an NPZ file of joints as a recording of its own."""
+def read_clips(recording: Path, folder: Path) -> dict[str, Path]:
+    """Convert every clip of an NPZ file of joints to a separate recording."""
     found = {}
     for name, joints in npz.load(recording).items():
         found[name] = folder / name
@@ -60,8 +60,8 @@ def prepared(recording: Path, folder: Path) -> dict[str, Path]:
     return found
 
 
-def held_out(clip: str, clips: dict[str, Path], folder: Path, config: TrainingConfig) -> MethodScores:
-    """Learn from all clips but one and return the scores of all methods on the windows of that one."""
+def evaluate_fold(clip: str, clips: dict[str, Path], folder: Path, config: TrainingConfig) -> MethodScores:
+    """Train on all clips but one and return the scores of all methods on the windows of that clip."""
     sliced, model = folder / "behavior_data", folder / f"behavior-{config.seed}"
     for each in (sliced, model):
         shutil.rmtree(each, ignore_errors=True)
@@ -73,40 +73,40 @@ def held_out(clip: str, clips: dict[str, Path], folder: Path, config: TrainingCo
     scenes = Scenes.load(sliced, data.videos)
     train = data.windows(data.indices(TRAIN))
     context, future = data.windows(data.indices(TEST)[::STRIDE])
-    prior = StraightToPrior(LocationPrior.fit(*train), data.future)
+    prior = LocationPriorPath(LocationPrior.fit(*train), data.future)
     methods = {
         "ours": Ats.load(model, scenes, PlanSamplingConfig(avoid_solid=False)),
         "standing still": StandStill.fit(*train),
         "constant velocity": ConstantVelocity.fit(*train),
         "location prior": prior,
     }
-    drawn = {
+    samples_by_method = {
         name: method.sample(context, SAMPLES, np.random.default_rng(config.seed))
         for name, method in methods.items()
     }
     return {
         name: {
-            score: SCORES[score](samples, future).tolist() for score in FIGURES if predicts(samples, score)
+            score: SCORES[score](samples, future).tolist() for score in METRICS if predicts(samples, score)
         }
-        for name, samples in drawn.items()
+        for name, samples in samples_by_method.items()
     }
 
 
 def predicts(samples: Samples, score: str) -> bool:
-    """Return whether a method predicts what a score judges."""
+    """Return whether a method predicts the quantity that a score evaluates."""
     needed = {"path_minade_m": samples.path, "orientation_minade_rad": samples.rotation}
     return score not in needed or needed[score] is not None
 
 
 def row(recording: Path, out: Path, *, seeds: int = 1) -> Row:
-    """Hold every clip out once, and average over all windows and seeds."""
-    clips = prepared(recording, out / "dog" / "trajectories")
+    """Evaluate on every clip in turn, and average over all windows and seeds."""
+    clips = read_clips(recording, out / "dog" / "trajectories")
     found: MethodScores = {}
     for seed in range(seeds):
         for clip in clips:
             done = out / "dog" / clip / f"figures-{seed}.json"
             if not done.is_file():
-                scores = held_out(clip, clips, done.parent, replace(MODEL, seed=seed))
+                scores = evaluate_fold(clip, clips, done.parent, replace(MODEL, seed=seed))
                 done.write_text(json.dumps(scores) + "\n")
             for method, scores in json.loads(done.read_text()).items():
                 log(
@@ -119,11 +119,13 @@ def row(recording: Path, out: Path, *, seeds: int = 1) -> Row:
         for method, scores in found.items()
     }
     ours, baselines = mean["ours"], [scores for method, scores in mean.items() if method != "ours"]
-    ahead = all(ours[name] < other[name] for other in baselines for name in ("goal_minde_m", "path_minade_m"))
+    beats_baselines = all(
+        ours[name] < other[name] for other in baselines for name in ("goal_minde_m", "path_minade_m")
+    )
     still = mean["standing still"]["orientation_minade_rad"]
-    turning = ours["orientation_minade_rad"] < TURNING_LIMIT * still
+    turning_ok = ours["orientation_minade_rad"] < MAX_RELATIVE_TURNING * still
     cells = {
-        method: " / ".join(f"{scores[name]:.3f}" if name in scores else "-" for name in FIGURES)
+        method: " / ".join(f"{scores[name]:.3f}" if name in scores else "-" for name in METRICS)
         for method, scores in mean.items()
     }
     return Row(
@@ -133,7 +135,7 @@ def row(recording: Path, out: Path, *, seeds: int = 1) -> Row:
         cells.pop("ours") + (" (one seed)" if seeds == 1 else f" (mean of {seeds} seeds)"),
         cells,
         {},
-        "goal and path ahead of all; turning below twice that of standing still",
-        bool(ahead and turning),
+        "goal and path better than all baselines; turning below twice that of standing still",
+        bool(beats_baselines and turning_ok),
         {"means": mean, "windows": len(found["ours"]["goal_minde_m"]) // seeds},
     )

@@ -1,6 +1,6 @@
-"""People who were tracked from above: the text files of ETH/UCY as the SGAN splits ship them.
+"""Pedestrian tracks of ETH/UCY, in the text format of the SGAN splits.
 
-Each row is `frame person x y`, metres, 0.4 s from one frame number to the next. `Crowd.read` reads a file,
+Each row is `frame person x y`, metres, with 0.4 s between consecutive frame numbers. `Crowd.read` reads a file,
 `table` writes it as the CSV that `stages.read_trajectories` reads, `walks` lists the windows of the protocol.
 """
 
@@ -15,19 +15,19 @@ STEP_S = 0.4
 PAST, FUTURE = 8, 12
 """steps of the protocol (Alahi et al. 2016)"""
 HEADING_M = 0.2
-"""Shortest way that defines a heading: positions err by centimetres."""
+"""Shortest displacement that defines a heading: positions have errors of centimetres."""
 MIN_PEOPLE = 2
-"""People who must be there throughout a window for the protocol of SGAN to count it (Gupta et al. 2018)."""
+"""People present throughout a window for it to count in the protocol of SGAN (Gupta et al. 2018)."""
 
 
 @dataclass(frozen=True)
 class Walk:
-    """One window: a person and its first step."""
+    """A window of one person."""
 
     person: int
     """column of `Crowd.position`"""
     start: int
-    """row of it"""
+    """row of `Crowd.position`"""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Crowd:
     """One recording."""
 
     position: Float[np.ndarray, "step person 2"]
-    """metres; NaN where somebody is not there"""
+    """metres; NaN where a person is absent"""
 
     @classmethod
     def read(cls, path: Path) -> "Crowd":
@@ -50,7 +50,7 @@ class Crowd:
         return cls(position)
 
     def walks(self, steps: int = PAST + FUTURE) -> list[Walk]:
-        """Return all windows of people who are there throughout, ordered by person and time."""
+        """Return all windows of people who are present throughout, ordered by person and time."""
         known = np.isfinite(self.position[..., 0])
         if len(known) < steps:
             return []
@@ -58,24 +58,24 @@ class Crowd:
         return [Walk(int(person), int(start)) for person, start in zip(*np.nonzero(whole.T), strict=True)]
 
     def accompanied(self, walks: list[Walk]) -> Bool[np.ndarray, "walk"]:
-        """Return through which windows others walk as well."""
+        """Return whether others are present throughout the same window."""
         start = np.array([walk.start for walk in walks], int)
         return np.bincount(start, minlength=1)[start] >= MIN_PEOPLE
 
     def heading(self, person: int) -> Float[np.ndarray, "step"]:
-        """Return where somebody heads, radians about +y from +z, from no later step than the one at hand.
+        """Return the causal heading per step, radians about +y from +z.
 
-        Steps before the first way of `HEADING_M` take its direction as far as they share every window with
-        it, and 0 otherwise.
+        Steps before the first displacement of `HEADING_M` take its direction if every window that contains them
+        contains it too, and 0 otherwise.
         """
         found = np.full(len(self.position), np.nan)
         place = self.position[:, person]
         steps = np.flatnonzero(np.isfinite(place[:, 0]))
         for order, step in enumerate(steps):
-            way = place[step] - place[steps[max(order - PAST, 0) : order]][::-1]
-            far = np.flatnonzero(np.linalg.norm(way, axis=-1) >= HEADING_M)
+            displacement = place[step] - place[steps[max(order - PAST, 0) : order]][::-1]
+            far = np.flatnonzero(np.linalg.norm(displacement, axis=-1) >= HEADING_M)
             if len(far):
-                found[step] = np.arctan2(*way[far[0]])
+                found[step] = np.arctan2(*displacement[far[0]])
             elif order:
                 found[step] = found[steps[order - 1]]
         first = np.flatnonzero(np.isfinite(found[steps]))[:1]
@@ -84,7 +84,7 @@ class Crowd:
         return found
 
     def table(self, path: Path) -> None:
-        """Write a table of people, who all perceive each other, person after person."""
+        """Write a CSV table of people who all perceive each other, sorted by person."""
         with open(path, "w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(("id", "time", "x", "y", "z", "heading", "kind"))

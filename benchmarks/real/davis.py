@@ -1,4 +1,4 @@
-"""Animals of DAVIS 2016 as recordings: pictures without depth, flow between them, true masks, joints of BADJA.
+"""Animal sequences of DAVIS 2016 as recordings: pictures without depth, flow, true masks, joints of BADJA.
 
 `animals` lists the sequences that a folder holds, `DavisSequence` opens one; `frames` and `flow` write its artifacts as
 `extract_frames` and `estimate_flow` do.
@@ -20,12 +20,12 @@ ANIMALS = frozenset(
     "bear blackswan camel cows dog dog-agility elephant flamingo goat horsejump-high horsejump-low libby "
     "mallard-fly mallard-water rhino".split()
 )
-"""Sequences of DAVIS 2016 in which the annotated object is an animal (with its rider, where it has one)."""
+"""Sequences of DAVIS 2016 whose annotated object is an animal (with its rider, if any)."""
 RATE_HZ = 24.0
 FULL_SIZE_PX = np.array([1920.0, 1080.0])
-"""width and height of the pictures in which BADJA gives joints"""
-NO_DEPTH = (60, 107)
-"""size of a depth picture in which nothing is known"""
+"""width and height of the pictures for which BADJA annotates joints"""
+DEPTH_SIZE = (60, 107)
+"""size of the empty depth pictures"""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class DavisSequence:
         return images.read_gray(self.masks[frame]) > 0
 
     def joints_by_frame(self) -> dict[int, Joints]:
-        """Read the joints that BADJA annotates, by frame; it gives (row, column) of the full resolution."""
+        """Read the joints that BADJA annotates, by frame; stored as (row, column) at full resolution."""
         assert self.joints is not None, self.name
         height, width = self.mask(0).shape
         number_of = {path.stem: number for number, path in enumerate(self.pictures)}
@@ -65,7 +65,7 @@ class DavisSequence:
 
 
 def animals(davis: Path) -> dict[str, DavisSequence]:
-    """Return the sequences of animals that a DAVIS folder holds with pictures and masks."""
+    """Return the animal sequences of a DAVIS folder that have pictures and masks."""
     found = {}
     for folder in sorted((davis / "JPEGImages" / "480p").glob("*")):
         pictures = tuple(sorted(folder.glob("*.jpg")))
@@ -79,7 +79,7 @@ def animals(davis: Path) -> dict[str, DavisSequence]:
 
 
 def frames(sequence: DavisSequence, folder: Path) -> Path:
-    """Write the pictures as the frames of a recording without depth, poses and lens."""
+    """Write the pictures as the frames of a recording without depth, poses and intrinsics."""
     if (folder / "frames.npz").is_file():
         return folder
     shutil.rmtree(folder, ignore_errors=True)
@@ -87,7 +87,7 @@ def frames(sequence: DavisSequence, folder: Path) -> Path:
         (folder / name).mkdir(parents=True)
     for number, picture in enumerate(sequence.pictures):
         shutil.copy(picture, folder / "color" / f"{number:06d}.jpg")
-        images.write_depth(folder / "depth" / f"{number:06d}.exr", np.zeros(NO_DEPTH))
+        images.write_depth(folder / "depth" / f"{number:06d}.exr", np.zeros(DEPTH_SIZE))
     count = len(sequence.pictures)
     eye = np.tile(np.eye(3), (count, 1, 1))
     npz.save(
@@ -102,7 +102,7 @@ def frames(sequence: DavisSequence, folder: Path) -> Path:
 
 
 def flow(recording: Path, folder: Path) -> Path:
-    """Run `estimate_flow` on frames, unless that was done."""
+    """Run `estimate_flow` on frames; cached."""
     if not (folder / "qa.json").is_file():
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)

@@ -1,9 +1,9 @@
-"""Registration in a real room: the template of one half of a walk, cameras of the other half in it, without odometry.
+"""Registration in a real room: one half of a sequence is registered to the template of the other, without odometry.
 
-The halves of a 7-Scenes style folder become recordings without poses: `extract_frames` reads them, the first is
-mapped as a walk-through, the second is registered to it as a session. All poses are compared with two references,
-each brought to the template's world by the first half's cameras: the folder's own poses (KinectFusion), and
-structure from motion on the colour pictures alone.
+The halves of a 7-Scenes style folder are converted to recordings without poses: `extract_frames` reads them, the first
+is mapped as a walk-through, the second is registered to it as a session. All poses are compared with two references,
+each aligned to the template by the cameras of the first half: the poses of the folder (KinectFusion), and structure
+from motion on the colour pictures alone.
 """
 
 import json
@@ -38,20 +38,20 @@ from stages.train_localizer import training
 from stages.train_localizer.config import Config as LocalizerConfig
 
 BAR_M, BAR_DEG = 0.01, 0.3
-EVERY_FRAME = RegistrationConfig(
+DENSE_REGISTRATION = RegistrationConfig(
     animal=False,
     vote=VoteConfig(every_frames=1),
     alignment=AlignmentConfig(flow_every_frames=1, feature_every_frames=0),
     confidence=ConfidenceConfig(every_frames=1),
 )
-"""Short recordings: every frame votes and is aligned by flow."""
+"""For short recordings: every frame votes and is aligned by flow."""
 PUBLISHED = {"hloc, all of 7-Scenes": "1.10 / 0.14", "DSAC* RGB-D, all of 7-Scenes": "1.58 / 0.44"}
-"""cm / deg against structure from motion, on the official splits: other queries than these"""
+"""cm / deg against structure from motion, on the official splits, whose queries differ from these"""
 
 
 @dataclass(frozen=True)
 class Half:
-    """One half as a recording, and where its cameras were by the folder's own poses."""
+    """One half as a recording, with the camera poses of the folder."""
 
     clip: Clip
     world_from_camera: Float[np.ndarray, "frame 4 4"]
@@ -59,12 +59,12 @@ class Half:
 
 
 def numbers(scene: Path) -> list[int]:
-    """Return the numbers of the frames of a 7-Scenes style folder."""
+    """Return the frame numbers of a 7-Scenes style folder."""
     return sorted(int(re.findall(r"\d+", path.name)[0]) for path in scene.glob("frame-*.pose.txt"))
 
 
 def half(scene: Path, chosen: list[int], folder: Path) -> Half:
-    """Extract some frames as a recording that has no poses."""
+    """Extract some frames as a recording without poses."""
     recording, frames = folder / "recording", folder / "frames"
     for each in (recording, frames):
         shutil.rmtree(each, ignore_errors=True)
@@ -88,8 +88,8 @@ def halves(scene: Path, folder: Path) -> tuple[Half, Half]:
     return half(scene, known[:middle], folder / "a"), half(scene, known[middle:], folder / "b")
 
 
-def nobody(clip: Clip, folder: Path) -> Masks:
-    """Write masks of a recording that shows no animal."""
+def empty_masks(clip: Clip, folder: Path) -> Masks:
+    """Write empty masks for a recording without an animal."""
     folder.mkdir(parents=True, exist_ok=True)
     for frame in range(len(clip)):
         images.write_gray(folder / f"{frame:06d}.png", np.zeros(clip.color_size, np.uint8))
@@ -98,44 +98,58 @@ def nobody(clip: Clip, folder: Path) -> Masks:
     return Masks.open(folder)
 
 
-def registered(
-    made: SceneTemplate, walk: Clip, localizer: Localizer, session: Clip, masks: Masks
+def register_session(
+    scene_template: SceneTemplate, walk: Clip, localizer: Localizer, session: Clip, masks: Masks
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Register the second half; NaN where it is rejected."""
-    found = made.world_from_camera, walk.intrinsics, made.registered, made.keyframe
+    """Register the second half; NaN if it is rejected."""
+    found = (
+        scene_template.world_from_camera,
+        walk.intrinsics,
+        scene_template.registered,
+        scene_template.keyframe,
+    )
     cameras = SceneCameras(walk.timestamp_s, *found).world_from_keyframe
-    maps = registration.Maps(made.mesh, made.mesh, localizer, localizer, walk=Walkthrough(walk, cameras))
-    rng = np.random.default_rng(EVERY_FRAME.seed)
-    result = registration.register(session, masks, maps, EVERY_FRAME, rng)
+    maps = registration.Maps(
+        scene_template.mesh, scene_template.mesh, localizer, localizer, walk=Walkthrough(walk, cameras)
+    )
+    rng = np.random.default_rng(DENSE_REGISTRATION.seed)
+    result = registration.register(session, masks, maps, DENSE_REGISTRATION, rng)
     if isinstance(result, registration.Rejected):
         log(f"rejected: {result.reason}")
         return np.full((len(session), 4, 4), np.nan)
     return result.aligned.world_from_camera
 
 
-def measured(scene: Path, folder: Path) -> dict[str, dict[str, dict[str, float]]]:
-    """Return median errors (metres, degrees) of all methods on the second half, by both references."""
+def evaluate(scene: Path, folder: Path) -> dict[str, dict[str, dict[str, float]]]:
+    """Return median errors (metres, degrees) of all methods on the second half, for both references."""
     walk, session = halves(scene, folder)
     workspace = folder / "workspace"
     shutil.rmtree(workspace, ignore_errors=True)
     workspace.mkdir(parents=True)
     none = np.zeros((len(walk.clip), 4, 4, 2), np.float16)
-    made, _ = template.build(walk.clip, none, TemplateConfig(), workspace)
+    scene_template, _ = template.build(walk.clip, none, TemplateConfig(), workspace)
     config, rng = LocalizerConfig(), np.random.default_rng(0)
-    shown = training.scene_views(
-        made.mesh, made.world_from_camera, made.floor_m, walk.clip, config.scene, rng
+    views = training.scene_views(
+        scene_template.mesh,
+        scene_template.world_from_camera,
+        scene_template.floor_m,
+        walk.clip,
+        config.scene,
+        rng,
     )
-    localizer, _ = training.train(shown, config, Describer(), "cpu", rng)
+    localizer, _ = training.train(views, config, Describer(), "cpu", rng)
     frames, clip = range(len(session.clip)), session.clip
-    hide = [np.zeros(clip.color_size, bool)] * len(clip)
-    points = localizing.sift_map(walk.clip, made.world_from_camera, range(len(walk.clip)))
+    no_animal = [np.zeros(clip.color_size, bool)] * len(clip)
+    points = localizing.sift_map(walk.clip, scene_template.world_from_camera, range(len(walk.clip)))
     poses = {
-        "ours": registered(made, walk.clip, localizer, clip, nobody(clip, folder / "masks")),
-        "ours, single frames": localizing.placed_by_localizer(localizer, clip, frames, hide)[0],
+        "ours": register_session(
+            scene_template, walk.clip, localizer, clip, empty_masks(clip, folder / "masks")
+        ),
+        "ours, single frames": localizing.placed_by_localizer(localizer, clip, frames, no_animal)[0],
         "SIFT, PnP on the template's walk": localizing.placed_by_sift(points, clip, frames),
     }
     known = structure.cameras(scene, [*walk.number.tolist(), *session.number.tolist()], folder / "structure")
-    own = dict(
+    kinect_fusion = dict(
         zip(
             [*walk.number, *session.number],
             [*walk.world_from_camera, *session.world_from_camera],
@@ -143,12 +157,16 @@ def measured(scene: Path, folder: Path) -> dict[str, dict[str, dict[str, float]]
         )
     )
     return {
-        "structure from motion": compared(made.world_from_camera, walk, session, poses, known, resize=True),
-        "KinectFusion": compared(made.world_from_camera, walk, session, poses, own, resize=False),
+        "structure from motion": median_errors(
+            scene_template.world_from_camera, walk, session, poses, known, resize=True
+        ),
+        "KinectFusion": median_errors(
+            scene_template.world_from_camera, walk, session, poses, kinect_fusion, resize=False
+        ),
     }
 
 
-def compared(
+def median_errors(
     template_cameras: Float[np.ndarray, "frame 4 4"],
     walk: Half,
     session: Half,
@@ -157,32 +175,32 @@ def compared(
     *,
     resize: bool,
 ) -> dict[str, dict[str, float]]:
-    """Return median errors of all methods in the frames that the reference has; it is brought to the
-    template's world by the walk's cameras, to its scale too with ``resize``.
+    """Return median errors of all methods in the frames of the reference, which is aligned to the template by the
+    cameras of the walk-through, including its scale with ``resize``.
     """
-    both, seen = (
+    walk_rows, session_rows = (
         [row for row, number in enumerate(half.number) if number in reference] for half in (walk, session)
     )
-    fitted = template_cameras[both], np.stack([reference[walk.number[row]] for row in both])
+    fitted = template_cameras[walk_rows], np.stack([reference[walk.number[row]] for row in walk_rows])
     truth = structure.in_world(
-        *fitted, np.stack([reference[session.number[row]] for row in seen]), resize=resize
+        *fitted, np.stack([reference[session.number[row]] for row in session_rows]), resize=resize
     )
-    found = {name: medians(pose_errors(each[seen], truth)) for name, each in poses.items()}
-    walked = structure.in_world(*fitted, fitted[1], resize=resize)
-    return found | {"the template's own cameras": medians(pose_errors(fitted[0], walked))}
+    found = {name: medians(pose_errors(each[session_rows], truth)) for name, each in poses.items()}
+    walk_truth = structure.in_world(*fitted, fitted[1], resize=resize)
+    return found | {"the template's own cameras": medians(pose_errors(fitted[0], walk_truth))}
 
 
 def medians(errors: PoseErrors) -> dict[str, float]:
-    """Return the medians; failures count as infinite."""
+    """Return the medians; failures count as infinite errors."""
     return {"m": float(np.median(errors.meters)), "deg": float(np.median(errors.degrees))}
 
 
 def row(scene: Path, out: Path) -> Row:
-    """Measure one folder of frames."""
+    """Evaluate on one folder of frames."""
     folder = out / "rooms" / scene.name
     done = folder / "figures.json"
     if not done.is_file():
-        found = measured(scene, folder)
+        found = evaluate(scene, folder)
         done.write_text(json.dumps(found, indent=1) + "\n")
     found = json.loads(done.read_text())
     cells = {

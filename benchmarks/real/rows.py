@@ -1,4 +1,4 @@
-"""Which rows there are, where their data lies in the folder, and who measures them."""
+"""The rows of the table: location of their data and the functions that measure them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,35 +13,35 @@ class RowKind:
     """One row of the table."""
 
     layout: str
-    """what the folder must hold, for the message that a row is skipped"""
+    """expected layout of the folder, for the message that a row is skipped"""
     source: str
-    """where the data is published"""
-    found: Callable[[Path], Path | None]
-    """from the folder to the row's own data in it; None where that is not complete"""
+    """publication of the data"""
+    find: Callable[[Path], Path | None]
+    """from the folder to the data of the row; None if incomplete"""
     measure: Callable[[Path, Path, int], Row]
-    """from the row's data, the output folder and the number of seeds to the row"""
+    """from (data of the row, output folder, number of seeds) to the row"""
 
 
 def first(pattern: str) -> Callable[[Path], Path | None]:
-    """Return a finder of the first path that matches."""
+    """Return a function that finds the first matching path."""
     return lambda data: next(iter(sorted(data.glob(pattern))), None)
 
 
 def crowds_in(data: Path) -> Path | None:
-    """Return the folder of the SGAN splits where all scenes are there."""
+    """Return the folder of the SGAN splits if it has all scenes."""
     folder = data / "eth_ucy"
     parts = [folder / scene / part for scene in walkers.SCENES for part in ("train", "test")]
     return folder if all(any(part.glob("*.txt")) for part in parts) else None
 
 
 def animals_in(data: Path) -> Path | None:
-    """Return the folder of DAVIS where it holds an animal."""
+    """Return the folder of DAVIS if it has an animal sequence."""
     folder = data / "davis"
     return folder if davis.animals(folder) else None
 
 
-def jointed_in(data: Path) -> Path | None:
-    """Return the folder of DAVIS where it holds an animal whose joints are annotated."""
+def joints_in(data: Path) -> Path | None:
+    """Return the folder of DAVIS if it has an animal sequence with annotated joints."""
     folder = data / "davis"
     return folder if any(sequence.joints for sequence in davis.animals(folder).values()) else None
 
@@ -68,7 +68,7 @@ ROWS = {
     "flow": RowKind(
         f"{DAVIS}, and davis/joint_annotations/<sequence>.json",
         "DAVIS 2016 (480p) and BADJA",
-        jointed_in,
+        joints_in,
         lambda data, out, seeds: flow.row(data, out),
     ),
     "masks": RowKind(DAVIS, "DAVIS 2016 (480p)", animals_in, lambda data, out, seeds: masks.row(data, out)),

@@ -1,6 +1,4 @@
-"""The table that the benchmark prints: one line per row, ours beside peers that were measured on the same data
-and peers that others published.
-"""
+"""The table of the benchmark: per row our result, results of other methods on the same data, and published results."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -12,35 +10,35 @@ HEADER = ("what", "data", "figures", "ours", "measured on the same data", "publi
 
 @dataclass(frozen=True)
 class Row:
-    """What was measured on one kind of data."""
+    """Results on one data set."""
 
     what: str
     data: str
     figures: str
-    """names and units of the figures, in the order in which all cells give them"""
+    """names and units of the metrics, in the order of all cells"""
     ours: str
     measured: Mapping[str, str] = field(default_factory=dict)
-    """of other methods on the same data, by their names"""
+    """other methods on the same data, by name"""
     published: Mapping[str, str] = field(default_factory=dict)
-    """of other methods, as their authors or later corrections state them"""
+    """other methods, as published by their authors or later corrected"""
     bar: str = ""
     met: bool | None = None
     detail: Mapping[str, object] = field(default_factory=dict)
-    """all numbers, for the JSON file"""
+    """all values, for the JSON file"""
 
     def cells(self) -> tuple[str, ...]:
-        """Return the row's line."""
+        """Return the cells of the row."""
         met = "-" if self.met is None else "yes" if self.met else "no"
-        others = (_listed(self.measured), _listed(self.published))
+        others = (_joined(self.measured), _joined(self.published))
         return (self.what, self.data, self.figures, self.ours, *others, self.bar, met)
 
 
-def _listed(methods: Mapping[str, str]) -> str:
+def _joined(methods: Mapping[str, str]) -> str:
     return "; ".join(f"{name} {figures}" for name, figures in methods.items()) or "-"
 
 
 def markdown(rows: Sequence[Row], skipped: Mapping[str, str], stamp: str) -> str:
-    """Return the whole report: the table, what was skipped and why, and the command, date and commit."""
+    """Return the report: the table, skipped rows with reasons, and command, date and commit."""
     lines = [HEADER, ["---"] * len(HEADER), *(row.cells() for row in rows)]
     text = [f"| {' | '.join(line)} |" for line in lines]
     text += ["", *(f"- {name}: skipped. {why}" for name, why in skipped.items())]

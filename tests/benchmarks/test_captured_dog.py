@@ -1,4 +1,4 @@
-"""The dog's row on joints that the test makes up: every clip is held out once."""
+"""Cross-validation over clips on synthetic dog joints."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from stages.train_behavior.config import BehaviorOptimizerConfig
 
 
 def walk(seed: int, frames: int = 500) -> np.ndarray:
-    """Five joints of a body that walks in an arc at 60 Hz."""
+    """Synthesize five joints of a body that walks along an arc at 60 Hz."""
     rng = np.random.default_rng(seed)
     angle = rng.uniform(0, 6) + np.linspace(0, rng.uniform(-1, 1), frames)
     forward = np.stack([np.sin(angle), np.zeros(frames), np.cos(angle)], axis=-1)
@@ -34,7 +34,7 @@ def test_every_clip_is_held_out(tmp_path, monkeypatch):
     row = captured_dog.row(tmp_path / "dog.npz", tmp_path / "out")
     means = row.detail["means"]
     assert means.keys() == {"ours", "standing still", "constant velocity", "location prior"}
-    assert set(means["ours"]) == set(captured_dog.FIGURES)
+    assert set(means["ours"]) == set(captured_dog.METRICS)
     assert all(np.isfinite(value) for scores in means.values() for value in scores.values())
     assert "orientation_minade_rad" not in means["location prior"]
     assert (tmp_path / "out" / "dog" / "clip1" / "figures-0.json").is_file()

@@ -1,4 +1,4 @@
-"""Flow and masks of DAVIS on a drawn sequence: what is read, and scores whose answer is known."""
+"""Flow and mask metrics on a synthetic DAVIS sequence with known results."""
 
 import json
 
@@ -15,7 +15,7 @@ SHIFT_PX = 3
 
 @pytest.fixture
 def sequence(tmp_path):
-    """A textured square that moves to the right before a textured wall, with two joints in two frames."""
+    """A textured square that moves to the right in front of a textured wall, with two joints in three frames."""
     rng = np.random.default_rng(0)
     wall, animal = rng.integers(0, 255, (*SIZE, 3), np.uint8), rng.integers(0, 255, (20, 20, 3), np.uint8)
     pictures, annotated = tmp_path / "JPEGImages/480p/cows", tmp_path / "Annotations/480p/cows"
@@ -36,27 +36,29 @@ def sequence(tmp_path):
 
 
 def test_sequences_and_joints_are_read(sequence):
-    (footage,) = davis.animals(sequence).values()
-    joints = footage.joints_by_frame()
+    (davis_sequence,) = davis.animals(sequence).values()
+    joints = davis_sequence.joints_by_frame()
     assert sorted(joints) == [0, 2, 3]
     np.testing.assert_allclose(joints[2].position_px, [[21, 25], [31, 35]])
     assert joints[0].visible.tolist() == [True, False]
-    assert footage.mask(1).sum() == 400
+    assert davis_sequence.mask(1).sum() == 400
     (sequence / "Annotations/480p/cows/00003.png").unlink()
     assert davis.animals(sequence) == {}
 
 
-def test_joints_follow_true_flow_and_not_none(sequence):
-    (footage,) = davis.animals(sequence).values()
+def test_joint_errors_vanish_with_true_flow_and_not_with_zero_flow(sequence):
+    (davis_sequence,) = davis.animals(sequence).values()
     true = np.zeros((*SIZE, 2), np.float32)
     true[..., 0] = SHIFT_PX
-    np.testing.assert_allclose(flow.errors(flow.chained(lambda first, last: true), footage), 0, atol=1e-6)
-    none = flow.errors(lambda points, first, last: points, footage)
-    np.testing.assert_allclose(none * 20, [6, 3, 3], rtol=1e-5)
+    np.testing.assert_allclose(
+        flow.errors(flow.chained(lambda first, last: true), davis_sequence), 0, atol=1e-6
+    )
+    without_motion = flow.errors(lambda points, first, last: points, davis_sequence)
+    np.testing.assert_allclose(without_motion * 20, [6, 3, 3], rtol=1e-5)
 
 
-def test_points_take_the_most_certain_path():
-    """Steps of one frame are wrong at the second point; one of four frames is right there and unsure elsewhere."""
+def test_most_certain_selects_the_correct_path():
+    """Flow over one frame is wrong at the second point; flow over four frames is correct only there."""
 
     def step(first, last):
         found, confidence = np.zeros((*SIZE, 2), np.float32), np.full(SIZE, 0.9, np.float32)
@@ -66,19 +68,19 @@ def test_points_take_the_most_certain_path():
         return found, confidence
 
     points = np.array([[10.0, 20], [70, 20]])
-    there = flow.most_certain(step)(points, 0, 4)
-    np.testing.assert_allclose(there, points + np.array([4 * SHIFT_PX, 0]))
+    predicted = flow.most_certain(step)(points, 0, 4)
+    np.testing.assert_allclose(predicted, points + np.array([4 * SHIFT_PX, 0]))
     assert np.array_equal(flow.chained(lambda first, last: step(first, last)[0])(points, 0, 4)[1], points[1])
 
 
-def test_every_frame_is_a_picture_without_depth(sequence, tmp_path):
-    (footage,) = davis.animals(sequence).values()
-    clip = Clip.open(davis.frames(footage, tmp_path / "frames"))
+def test_frames_have_color_and_no_depth(sequence, tmp_path):
+    (davis_sequence,) = davis.animals(sequence).values()
+    clip = Clip.open(davis.frames(davis_sequence, tmp_path / "frames"))
     assert len(clip) == 4 and clip.color_size == SIZE
     assert not any(clip.depth(frame).any() for frame in range(len(clip)))
 
 
-def test_overlap():
+def test_iou():
     half = np.zeros((4, 4), bool)
     half[:2] = True
     assert masks.iou(half, half) == 1.0

@@ -1,4 +1,4 @@
-"""Halves of a 7-Scenes style folder become recordings without poses, with their true cameras kept apart."""
+"""Splitting a 7-Scenes style folder into two recordings without poses."""
 
 import cv2
 import numpy as np
@@ -10,8 +10,8 @@ FRAMES = tuple(range(0, 200, 20))
 
 
 @pytest.mark.slow
-def test_halves_have_pictures_and_truth_but_no_poses(tmp_path):
-    scene, rng = tmp_path / "7scenes_drawn", np.random.default_rng(0)
+def test_halves_have_pictures_and_true_cameras_but_no_odometry(tmp_path):
+    scene, rng = tmp_path / "7scenes_synthetic", np.random.default_rng(0)
     scene.mkdir()
     np.savetxt(scene / "camera-intrinsics.txt", np.array([[585.0, 0, 320], [0, 585, 240], [0, 0, 1]]))
     poses = np.tile(np.eye(4), (len(FRAMES), 1, 1))
@@ -25,5 +25,5 @@ def test_halves_have_pictures_and_truth_but_no_poses(tmp_path):
     assert len(first.clip) == len(second.clip) == len(FRAMES) // 2
     np.testing.assert_array_equal(second.world_from_camera, poses[len(FRAMES) // 2 :])
     assert first.clip.odometry_from_camera is None
-    masks = rooms.nobody(first.clip, tmp_path / "masks")
+    masks = rooms.empty_masks(first.clip, tmp_path / "masks")
     assert not masks.visible.any() and not masks[0].any()

@@ -1,4 +1,4 @@
-"""The reference of structure from motion is brought to our world by one similarity."""
+"""Alignment of structure from motion to our world by a similarity."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ def cameras(rng: np.random.Generator, count: int = 12) -> np.ndarray:
     return rigid.make(rigid.rotation_from_vector(rng.normal(size=(count, 3))), rng.normal(size=(count, 3)))
 
 
-def test_a_similarity_is_undone_for_frames_that_it_was_not_fitted_to():
+def test_alignment_undoes_a_similarity_on_held_out_frames():
     rng = np.random.default_rng(0)
     ours = cameras(rng)
     reference = cameras(rng, 1)[0] @ ours
@@ -19,10 +19,10 @@ def test_a_similarity_is_undone_for_frames_that_it_was_not_fitted_to():
     np.testing.assert_allclose(found, ours, atol=1e-9)
 
 
-def test_unregistered_frames_do_not_count():
+def test_scale_ignores_unregistered_frames():
     rng = np.random.default_rng(1)
     ours = cameras(rng)
     reference = ours.copy()
     reference[:, :3, 3] *= 3
     ours[2] = np.nan
-    assert np.isclose(structure.scaled(ours, reference), 1 / 3)
+    assert np.isclose(structure.scale_to(ours, reference), 1 / 3)

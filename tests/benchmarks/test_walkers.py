@@ -1,4 +1,4 @@
-"""People on ETH/UCY-like files that the tests write: windows, headings, and that no future leaks."""
+"""Pedestrian forecasting on synthetic ETH/UCY files: windows, headings, no leakage from the future."""
 
 import shutil
 from dataclasses import replace
@@ -16,7 +16,7 @@ STEPS = 30
 
 
 def position(seed: int) -> np.ndarray:
-    """Five people who walk nearly straight; the last comes late, the fourth leaves early."""
+    """Five people who walk nearly straight; the last appears late, the fourth disappears early."""
     rng = np.random.default_rng(seed)
     velocity = rng.normal(0, 0.4, (5, 2)) + rng.normal(0, 0.03, (STEPS, 5, 2))
     places = rng.normal(0, 2, (5, 2)) + velocity.cumsum(0)
@@ -44,15 +44,15 @@ def data(tmp_path_factory):
 def fold(data, tmp_path_factory):
     folder = tmp_path_factory.mktemp("fold")
     train, test = walkers.crowds(data / "train"), walkers.crowds(data / "test")
-    return walkers.prepared(train, test, folder / "trajectories", folder), folder
+    return walkers.prepare_fold(train, test, folder / "trajectories", folder), folder
 
 
-def tiny():
+def tiny_config():
     optimization = BehaviorOptimizerConfig(steps=4, goal_steps=2, batch=8, goal_batch=8)
     return replace(walkers.MODEL, training=replace(walkers.MODEL.training, optimization=optimization))
 
 
-def test_windows_of_the_protocol(tmp_path):
+def test_windows_contain_people_who_are_present_throughout(tmp_path):
     write(tmp_path / "a.txt", position(0))
     crowd = Crowd.read(tmp_path / "a.txt")
     np.testing.assert_allclose(crowd.position, position(0))
@@ -64,7 +64,7 @@ def test_windows_of_the_protocol(tmp_path):
     assert not alone.accompanied(alone.walks()).any()
 
 
-def test_headings_ask_for_nothing_later(tmp_path):
+def test_headings_are_causal(tmp_path):
     crowd = Crowd(position(0))
     for step in range(PAST, STEPS - 1):
         changed = crowd.position.copy()
@@ -73,28 +73,28 @@ def test_headings_ask_for_nothing_later(tmp_path):
         np.testing.assert_array_equal(Crowd(changed).heading(0)[: step + 1], known)
 
 
-def test_no_future_leaks(fold, data, tmp_path):
-    """What is forecast stays the same when everybody does something else from then on."""
+def test_forecasts_do_not_depend_on_the_future(fold, data, tmp_path):
+    """Forecasts do not change if all future positions change."""
     true, folder = fold
-    known = 3 + PAST  # steps that windows know that begin at step 3
+    known = 3 + PAST  # steps known to windows that start at step 3
     places = true.crowds["here"].position.copy()
     places[known:] = np.where(np.isfinite(places[known:]), 5.0 - places[known:], np.nan)
-    reads = tmp_path / "trajectories"
-    shutil.copytree(folder / "trajectories" / "elsewhere", reads / "elsewhere")
+    trajectories = tmp_path / "trajectories"
+    shutil.copytree(folder / "trajectories" / "elsewhere", trajectories / "elsewhere")
     crowds = {"here": Crowd(places)}
-    changed = walkers.prepared(walkers.crowds(data / "train"), crowds, reads, tmp_path)
-    model, drawn, futures = walkers.trained(folder, tiny()), [], []
+    changed = walkers.prepare_fold(walkers.crowds(data / "train"), crowds, trajectories, tmp_path)
+    model, forecasts, futures = walkers.train_model(folder, tiny_config()), [], []
     for each in (true, changed):
         number = [window.number for window in each.forecast_windows() if window.walk.start == 3]
         context, future = each.data.windows(np.array(number))
-        drawn.append(walkers.forecast(each, model, context, np.random.default_rng(0)).path)
+        forecasts.append(walkers.forecast(each, model, context, np.random.default_rng(0)).path)
         futures.append(future.path_world)
-    assert len(drawn[0]) == 3 and np.abs(futures[0] - futures[1]).max() > 1.0
-    np.testing.assert_allclose(drawn[0], drawn[1], atol=1e-6)
+    assert len(forecasts[0]) == 3 and np.abs(futures[0] - futures[1]).max() > 1.0
+    np.testing.assert_allclose(forecasts[0], forecasts[1], atol=1e-6)
 
 
-def test_tables_hold_what_was_read(fold):
-    """The windows of the behaviour data are those of the file, at its own times."""
+def test_behavior_data_has_the_windows_of_the_recording(fold):
+    """Windows agree with the file in number, time and position."""
     true, _ = fold
     windows, crowd = true.forecast_windows(), true.crowds["here"]
     assert len(windows) == len(true.data.indices(TEST)) == len(crowd.walks())
@@ -111,10 +111,9 @@ def test_tables_hold_what_was_read(fold):
 
 
 @pytest.mark.slow
-def test_a_row_from_files(fold, data, monkeypatch):
-    """Of one scene, whose recordings are read and sliced already."""
+def test_row_is_computed_from_files(fold, data, monkeypatch):
     _, folder = fold
-    monkeypatch.setattr(walkers, "MODEL", tiny())
+    monkeypatch.setattr(walkers, "MODEL", tiny_config())
     monkeypatch.setattr(walkers, "SCENES", ("eth",))
     (folder / "in").mkdir()
     (folder / "in" / "eth").symlink_to(data)

@@ -1,6 +1,4 @@
-"""Fifty frames of a real kitchen (7-Scenes): the first half a walk-through, the second a session, both
-without odometry.
-"""
+"""Fifty frames of a real kitchen (7-Scenes): a walk-through and a session, without odometry."""
 
 import os
 import shutil
@@ -22,7 +20,7 @@ RATE_HZ = 30.0
 
 @dataclass(frozen=True)
 class Half:
-    """One half as a recording, and where its cameras truly were."""
+    """One half as a recording, and its true cameras."""
 
     clip: Clip
     world_from_camera: Float[np.ndarray, "frame 4 4"]
@@ -48,12 +46,12 @@ def _half(folder, numbers):
             folder / "depth" / f"{index:06d}.exr", np.where(depth < 10, depth, 0).astype(np.float32)
         )
         images.write_gray(folder / "confidence" / f"{index:06d}.png", np.full(depth.shape, 2, np.uint8))
-    told = np.repeat(np.loadtxt(SCENE / "camera-intrinsics.txt")[None], len(numbers), axis=0)
+    intrinsics = np.repeat(np.loadtxt(SCENE / "camera-intrinsics.txt")[None], len(numbers), axis=0)
     npz.save(
         folder / "frames.npz",
         timestamp_s=(np.array(numbers) - numbers[0]) / RATE_HZ,
-        intrinsics=told,
-        depth_intrinsics=told,
+        intrinsics=intrinsics,
+        depth_intrinsics=intrinsics,
         gravity_known=np.array(False),
         quality=np.ones(len(numbers), np.float32),
     )

@@ -1,4 +1,4 @@
-"""A real dog (DAVIS): masks from one box without weights or depth, and flow beside OpenCV's own."""
+"""A real dog (DAVIS): masks from one box without weights or depth, and flow compared with OpenCV."""
 
 import json
 import os
@@ -27,7 +27,7 @@ def dog(tmp_path_factory):
     """The frames as an artifact without depth, true masks, and our flow of all gaps."""
     if not DOG.exists():
         pytest.skip(f"no real recordings at {DOG.parent} (set ATS_REALDATA)")
-    cv2.setNumThreads(1)  # the search divides its work, and its result, by threads
+    cv2.setNumThreads(1)  # the result of the search depends on the number of threads
     folder = tmp_path_factory.mktemp("dog")
     for name in ("color", "depth", "confidence"):
         (folder / name).mkdir()
@@ -84,12 +84,12 @@ def _opencv_medium(clip, first, second):
 
 
 def _dense(flow, size):
-    """Ours at every pixel."""
+    """Our flow at every pixel."""
     return cv2.resize(flow.astype(np.float32), size[::-1], interpolation=cv2.INTER_LINEAR)
 
 
 def _joint_hits(move, joints, masks, pairs):
-    """Share of joints carried to within 0.2 sqrt(area) of where they truly go (BADJA)."""
+    """Fraction of BADJA joints propagated to within 0.2 sqrt(area) of their annotation."""
     hits = []
     for first, second in pairs:
         both = joints[first][1] & joints[second][1]
@@ -101,8 +101,8 @@ def _joint_hits(move, joints, masks, pairs):
 
 
 @pytest.mark.slow
-def test_flow_is_not_below_opencv(dog):
-    """On joints and on the whole mask carried for five frames."""
+def test_flow_is_at_least_as_good_as_opencv(dog):
+    """On joints, and on masks propagated over five frames."""
     _, clip, masks, found = dog
     size = masks.shape[1:]
     joints = {}

@@ -1,6 +1,4 @@
-"""A real kitchen from its colours alone: path, lens and depth of a walk against what a depth camera
-measured.
-"""
+"""A real kitchen from colour alone: camera path, intrinsics and depth compared with a depth camera."""
 
 from dataclasses import dataclass
 
@@ -19,18 +17,18 @@ from tests.pipeline.recordings import made_formats
 from tests.real.seven_scenes import SCENE, Half, halves
 
 COLOR_FOCAL_PX = (515.0, 565.0)
-"""of the colour camera, README of the sample: nearer 525-555 than the depth camera's 585"""
+"""of the colour camera, by the README of the sample closer to 525-555 than to the 585 of the depth camera"""
 
 
 @dataclass(frozen=True)
 class Walk:
-    """The first half, as a video alone, beside what was measured."""
+    """The first half as a plain video, with the measured depth and cameras."""
 
     clip: Clip
     truth: Half
     kept: np.ndarray
     scale: float
-    """metres per unit, by the cameras' centres"""
+    """metres per unit, from the camera centres"""
     gap_m: np.ndarray
     """distance of each camera from the truth after the similarity"""
 
@@ -58,7 +56,7 @@ def walk(tmp_path_factory) -> Walk:
 
 
 @pytest.mark.slow
-def test_path_and_lens_are_found(walk: Walk):
+def test_path_and_intrinsics_are_estimated(walk: Walk):
     assert len(walk.clip) >= 22
     assert np.sqrt((walk.gap_m**2).mean()) <= 0.08
     assert COLOR_FOCAL_PX[0] < walk.clip.intrinsics[0, 0, 0] < COLOR_FOCAL_PX[1]
@@ -85,8 +83,8 @@ def test_depth_agrees_with_the_depth_camera(walk: Walk):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("turns", range(4))
-def test_a_kitchen_stored_sideways_is_turned_upright(turns):
-    """No gravity is told; the room and how the camera was held tell what is up."""
+def test_sideways_video_is_rotated_upright(turns):
+    """Without gravity, the room and the orientation of the camera determine the up direction."""
     if not SCENE.exists():
         pytest.skip(f"no real kitchen at {SCENE} (set ATS_REALDATA)")
     recording = open_recording(SCENE)

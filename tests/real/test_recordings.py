@@ -1,4 +1,4 @@
-"""Real recordings: the importers' reading of the poses agrees with the depth."""
+"""Importers interpret the poses of real recordings consistently with depth."""
 
 import dataclasses
 import json
@@ -16,7 +16,7 @@ from pipeline.recordings.recording import pose_from_matrix
 
 REAL = Path(os.environ.get("ATS_REALDATA", Path(__file__).parents[3] / "shared" / "realdata"))
 LIMIT_M = 0.015
-"""the app's documented convention explains real LiDAR depth within 15 mm"""
+"""the documented convention of the app agrees with real LiDAR depth within 15 mm"""
 
 
 def _sample(name: str) -> Path:
@@ -27,16 +27,16 @@ def _sample(name: str) -> Path:
 
 def test_exr_pictures_are_paired_with_their_rows():
     recording = open_recording(_sample("record3d_exr12"))
-    told = json.loads((_sample("record3d_exr12") / "EXR_RGBD" / "metadata.json").read_text())
-    assert len(told["poses"]) == 345
+    metadata = json.loads((_sample("record3d_exr12") / "EXR_RGBD" / "metadata.json").read_text())
+    assert len(metadata["poses"]) == 345
     assert recording.index.tolist() == [0, 30, 59, *range(90, 331, 30)]
     for row, number in enumerate(recording.index):
-        np.testing.assert_array_equal(recording.pose[row], told["poses"][number])
-        assert recording.timestamp_s[row] == told["frameTimestamps"][number]
+        np.testing.assert_array_equal(recording.pose[row], metadata["poses"][number])
+        assert recording.timestamp_s[row] == metadata["frameTimestamps"][number]
 
 
 @pytest.mark.slow
-def test_seven_scenes_pass_the_self_check():
+def test_seven_scenes_pass_the_pose_check():
     path = _sample("7scenes_AB50")
     assert format_of(path).name == "7-Scenes RGB-D"
     recording = open_recording(path)
@@ -45,13 +45,13 @@ def test_seven_scenes_pass_the_self_check():
     assert plan.pose_check.verdict == "documented"
     assert (
         plan.pose_check.residual_m < 2 * LIMIT_M
-    )  # a first Kinect, whose own truth is good to some centimetres
+    )  # a Kinect v1, whose poses are accurate to some centimetres
     assert not plan.gravity_known
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("turn", range(1, 4))
-def test_turned_seven_scenes_are_found_out(turn):
+def test_rotated_seven_scenes_are_detected(turn):
     recording = open_recording(_sample("7scenes_AB50"))
     turned = cameras.turn_camera(conventions.odometry_from_pose(recording.pose, conventions.OPENCV), turn)
     recording = dataclasses.replace(recording, pose=pose_from_matrix(turned))
@@ -67,12 +67,12 @@ def test_stray_odometry_is_read():
     assert rows.coefficients[6, 0] == 1604.2147
     odometry = conventions.odometry_from_pose(rows.pose, conventions.OPENCV)
     turned = np.degrees(rigid.rotation_angle(odometry[6, :3, :3], odometry[7, :3, :3]))
-    assert abs(turned - 4.07) < 0.02  # although the quaternion's sign flips between the two
-    assert odometry[0, 1, 0] < -0.8  # held upright: the stored picture's right points down
+    assert abs(turned - 4.07) < 0.02  # although the sign of the quaternion flips between the two
+    assert odometry[0, 1, 0] < -0.8  # held upright: the right side of the stored picture points down
     assert upright.quarter_turns_from_gravity(odometry[:6]) == 1
 
 
-def test_exr_export_passes_the_self_check():
+def test_exr_export_passes_the_pose_check():
     recording = open_recording(_sample("record3d_exr12"))
     plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, max_side_px=640)
     assert plan.pose_check.verdict == "documented"
@@ -86,13 +86,13 @@ def test_exr_export_passes_the_self_check():
     assert min(frame.depth_valid for frame in frames) > 0.9
 
 
-def test_archive_of_the_2022_app_is_understood_although_its_pictures_are_gone():
+def test_archive_of_the_2022_app_is_read_without_pictures():
     with pytest.raises(InputError, match="CAP-006"):
         open_recording(_sample("record3d_r3d_metadata") / "data.r3d")
 
 
 @pytest.mark.parametrize("turn", range(1, 4))
-def test_turned_readings_are_refuted_by_real_depth(turn):
+def test_rotated_poses_are_rejected_by_real_depth(turn):
     recording = open_recording(_sample("record3d_exr12"))
     wrong = conventions.odometry_from_pose(recording.pose, conventions.Convention(quarter_turns=turn))
     wxyz = rigid.quaternion_from_rotation(cameras.opencv_from_opengl(wrong)[:, :3, :3])

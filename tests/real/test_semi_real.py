@@ -1,6 +1,4 @@
-"""The built-in animal drawn into fifty frames of a real kitchen: truth, occlusion, and what reads the
-recording.
-"""
+"""The built-in animal rendered into fifty frames of a real kitchen: ground truth, occlusion, and extraction."""
 
 import numpy as np
 import pytest
@@ -22,7 +20,7 @@ def drawn(tmp_path_factory):
     return sequence, out
 
 
-def test_the_recording_is_read_and_its_truth_belongs_to_it(drawn):
+def test_recording_is_extracted_with_its_ground_truth(drawn):
     sequence, out = drawn
     recording = open_recording(out / "recordings" / "session-1")
     truth = semi_real.read_truth(out / "truth" / "session-1.npz", recording.index)
@@ -31,7 +29,7 @@ def test_the_recording_is_read_and_its_truth_belongs_to_it(drawn):
     assert 0.15 < there.mean() < 0.9, "the animal comes and goes"
 
 
-def test_the_animal_changes_colour_and_depth_where_it_is_and_hardly_elsewhere(drawn):
+def test_animal_changes_colour_and_depth_only_in_its_mask(drawn):
     sequence, out = drawn
     recording = open_recording(out / "recordings" / "session-1")
     truth = semi_real.read_truth(out / "truth" / "session-1.npz", recording.index)
@@ -46,14 +44,14 @@ def test_the_animal_changes_colour_and_depth_where_it_is_and_hardly_elsewhere(dr
         )
 
 
-def test_figures_count_what_the_bars_ask():
+def test_mask_metrics_have_known_values():
     truth = np.zeros((4, 10, 10), bool)
     truth[:2, 2:6, 2:6] = True
     labels = np.where(truth, 255, 0)
     labels[0, 5, 2:6] = 0
     labels[1, 0, 0] = 128
     labels[2, 0, :8] = 255
-    found = semi_real.figures(labels, truth)
+    found = semi_real.mask_metrics(labels, truth)
     assert found["false_frames"] == 0.5
     assert found["found_frames"] == 1.0
     assert found["precision"] == pytest.approx(28 / 36)

@@ -1,6 +1,4 @@
-"""A real kitchen: a template from one half of a walk, single frames of the other half on it, without
-odometry.
-"""
+"""A real kitchen: the template from one half of a walk, single frames of the other half localized in it."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,18 +21,18 @@ from tests.real.seven_scenes import Half, halves
 
 FRAMES = range(25)
 NEAR = (7.0, 0.15)
-"""degrees and metres of the share that methods are compared by"""
+"""degrees and metres of the recall by which methods are compared"""
 
 
 @dataclass(frozen=True)
 class Kitchen:
-    """The template of the first half and the second half beside it."""
+    """The template of the first half, and the second half."""
 
     made: template.SceneTemplate
     walk: Half
     session: Half
     truth: Float[np.ndarray, "frame 4 4"]
-    """the session's cameras in the template's world"""
+    """cameras of the session in the world of the template"""
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +72,7 @@ def test_template_is_metric_without_odometry(kitchen: Kitchen):
 
 
 @pytest.mark.slow
-def test_single_frames_are_placed_better_than_by_sift(kitchen: Kitchen):
+def test_single_frames_are_localized_better_than_by_sift(kitchen: Kitchen):
     made, walk, clip = kitchen.made, kitchen.walk.clip, kitchen.session.clip
     localizer = _trained(made, walk, Config(scene=SceneConfig(held_out=40)), np.random.default_rng(0))
     hide = [np.zeros(clip.color_size, bool)] * len(clip)
@@ -87,8 +85,8 @@ def test_single_frames_are_placed_better_than_by_sift(kitchen: Kitchen):
 
 
 @pytest.mark.slow
-def test_doubtful_answers_are_told_from_good_ones(kitchen: Kitchen):
-    """A frame of noise finds no believable place in the kitchen."""
+def test_confidence_separates_wrong_poses(kitchen: Kitchen):
+    """A frame of noise has no confident pose."""
     made, rng = kitchen.made, np.random.default_rng(0)
     config = Config(scene=SceneConfig(views=60, held_out=40, frames=25))
     localizer = _trained(made, kitchen.walk.clip, config, rng)

@@ -1,4 +1,4 @@
-"""A small rendered recording with truth: a furnished box room and a blocky animal, written as a frames
+"""A small rendered recording with ground truth: a furnished box-shaped room and a blocky animal, as a frames
 artifact.
 """
 
@@ -27,7 +27,7 @@ def box(size, at) -> trimesh.Trimesh:
 
 
 def room() -> trimesh.Trimesh:
-    """4 x 2.4 x 3.4 m, floor at 0, three pieces of furniture."""
+    """Room of 4 x 2.4 x 3.4 m, floor at 0, with three pieces of furniture."""
     walls = box((4, 2.4, 3.4), (0, 1.2, 0))
     walls.invert()
     furniture = [
@@ -39,7 +39,7 @@ def room() -> trimesh.Trimesh:
 
 
 def animal() -> trimesh.Trimesh:
-    """Body, head, tail and four legs as overlapping boxes; root in the body, +y up, head towards +z, paws at
+    """Overlapping boxes for body, head, tail and legs; root in the body, +y up, head towards +z, paws at
     -0.22.
     """
     parts = [
@@ -52,7 +52,7 @@ def animal() -> trimesh.Trimesh:
 
 
 def person() -> trimesh.Trimesh:
-    """Two legs, a body and a head, 1.7 m tall; the middle of the feet at the origin."""
+    """Two legs, a body and a head, 1.7 m tall; the origin is between the feet."""
     legs = [box((0.15, 0.8, 0.18), (x, 0.4, 0)) for x in (-0.1, 0.1)]
     return trimesh.util.concatenate(
         [*legs, box((0.44, 0.6, 0.25), (0, 1.1, 0)), box((0.2, 0.3, 0.2), (0, 1.55, 0))]
@@ -61,7 +61,7 @@ def person() -> trimesh.Trimesh:
 
 @dataclass(frozen=True)
 class Recording:
-    """What was rendered."""
+    """The rendered recording."""
 
     world_from_camera: np.ndarray
     world_from_agent: np.ndarray
@@ -79,8 +79,8 @@ def record(
     world_from_other: np.ndarray | None = None,
     other_body: trimesh.Trimesh | None = None,
 ) -> Recording:
-    """Render a frames artifact into ``folder``; a pose of NaN leaves the animal out, or the other one, which
-    is green and another animal unless it has a body of its own.
+    """Render a frames artifact into ``folder``. NaN poses omit an animal; the other animal is green unless it
+    has its own body.
     """
     rng = np.random.default_rng(seed)
     still, bodies = room(), (animal(), other_body or animal())
@@ -131,7 +131,7 @@ def record(
 
 
 def drifted(world_from_camera: np.ndarray, seed: int = 1) -> np.ndarray:
-    """Odometry with its own heading and origin that drifts 2 mm and 0.05 degrees a frame."""
+    """Odometry with its own origin and heading and a drift of 2 mm and 0.05 degrees per frame."""
     rng = np.random.default_rng(seed)
     relative = rigid.inverse(world_from_camera[:-1]) @ world_from_camera[1:]
     noise = rigid.exp(rng.normal(0, [0.0009] * 3 + [0.002] * 3, (len(relative), 6)))
@@ -154,8 +154,8 @@ def turnaround(count: int = 40) -> tuple[np.ndarray, np.ndarray]:
 
 
 def session(count: int = 40) -> tuple[np.ndarray, np.ndarray]:
-    """The animal walks, rests for the middle half, walks on, and is away in the last frames; the phone sways
-    and follows.
+    """The animal walks, rests in the middle half, walks on, and is absent in the last frames; the camera
+    sways and follows.
     """
     time = np.linspace(0, 1, count)
     along = np.interp(time, [0, 0.25, 0.75, 0.95], [-0.7, 0.0, 0.0, 0.7])

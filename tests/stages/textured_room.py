@@ -1,4 +1,4 @@
-"""A small furnished room with a texture everywhere, and recordings of it held in memory with their truth."""
+"""A small furnished room with texture everywhere, and in-memory recordings with ground truth."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +16,7 @@ UP = np.array([0.0, 1.0, 0.0])
 
 
 def textured_room(seed: int = 0, edge_m: float = 0.04) -> Mesh:
-    """3 x 2.2 x 2.6 m, floor at 0, three boxes; each vertex has a colour of smooth noise at several
+    """Room of 3 x 2.2 x 2.6 m, floor at 0, with three boxes; vertex colours are smooth noise at several
     scales.
     """
     walls = trimesh.creation.box((3.0, 2.2, 2.6), rigid.make(np.eye(3), np.array([0, 1.1, 0.0])))
@@ -48,7 +48,7 @@ def noise_color(points: np.ndarray, seed: int) -> np.ndarray:
 
 
 def walk(frames: int, seed: int = 0) -> np.ndarray:
-    """Return cameras that go half around the room and look across it, down."""
+    """Return cameras that move half around the room and look across it, downwards."""
     phase = np.random.default_rng(seed).uniform(0, 2 * np.pi)
     poses = []
     for angle in phase + np.linspace(0, 1.1 * np.pi, frames):
@@ -59,7 +59,7 @@ def walk(frames: int, seed: int = 0) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MemoryClip:
-    """A `Clip` whose pictures are rendered on demand; `truth` is what it must not be asked for by science."""
+    """A `Clip` whose pictures are rendered on demand; `truth` is for tests only."""
 
     caster: RayCaster
     truth: np.ndarray
@@ -111,7 +111,7 @@ class MemoryClip:
         return np.full(SIZE, 2, np.uint8)
 
     def write_color(self, folder: Path) -> None:
-        """Write the pictures where COLMAP looks for them."""
+        """Write the pictures to the folder that COLMAP reads."""
         (folder / "color").mkdir(parents=True)
         for frame in range(len(self)):
             images.write_color(folder / "color" / f"{frame:06d}.jpg", self.color(frame))
@@ -128,7 +128,7 @@ class NoAgent:
 
 
 def drifting(truth: np.ndarray, seed: int, *, deg: float = 0.1, m: float = 0.004) -> np.ndarray:
-    """Return odometry with its own origin and heading whose steps err at random."""
+    """Return odometry with its own origin and heading and random errors per step."""
     rng = np.random.default_rng(seed)
     start = rigid.make(rigid.rotation_from_vector(UP * rng.uniform(-3, 3)), rng.uniform(-1, 1, 3))
     steps = (
@@ -143,7 +143,7 @@ def drifting(truth: np.ndarray, seed: int, *, deg: float = 0.1, m: float = 0.004
 
 
 def aligned_errors(poses: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rotation errors in degrees and position errors in metres after one rigid motion of all poses."""
+    """Return rotation errors in degrees and position errors in metres after rigid alignment of all poses."""
     rotation = rigid.mean_rotation(truth[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], 1, 2))
     moved = rigid.make(rotation, (truth[:, :3, 3] - poses[:, :3, 3] @ rotation.T).mean(0)) @ poses
     angle = np.rad2deg(rigid.rotation_angle(moved[:, :3, :3], truth[:, :3, :3]))

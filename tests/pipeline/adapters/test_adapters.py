@@ -1,5 +1,5 @@
-"""Adapters to programs with clocks of their own: time passes as they say, bodies are where the simulator has
-them.
+"""Adapters to programs with their own clocks: poses are interpolated to any time and set in the other
+program.
 """
 
 from dataclasses import dataclass, field
@@ -10,42 +10,23 @@ import pytest
 
 from pipeline.adapters.live_animal import ZUP_FROM_WORLD, LiveAnimal
 from pipeline.adapters.ros2_animal import AnimalNode
-from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
-from pipeline.behavior.diffusion import Schedule
-from pipeline.behavior.model import Architecture, BehaviorNets
-from pipeline.behavior.planning import Sampler, TorchNetworks
-from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.simulator import Simulator
 from pipeline.core.errors import InputError
 from pipeline.data.glb import Action, Skin
 from pipeline.geometry import rigid
 from stages.export import mjcf, reading, usd
-from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
+from tests.pipeline.behavior.wandering import REST, untrained_simulator
 from tests.stages.export_simulator import small_world
-from tests.stages.simulate.test_simulator import scaling
 
 PERSON = np.array([0.5, 1.3, 0.5])
 
 
-def simulator(architecture: Architecture = ARCHITECTURE) -> Simulator:
-    volume = room()
-    return Simulator(
-        Sampler(TorchNetworks(BehaviorNets(architecture)), Schedule(), scaling()),
-        wandering(),
-        Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int)),
-        "yaw",
-        sampling=PlanSamplingConfig(goal_steps=2, sequence_steps=2),
-        chaining=ReplanningConfig(candidates=1),
-    )
-
-
 @pytest.fixture(scope="module")
 def animal() -> LiveAnimal:
-    return LiveAnimal(simulator(), seed=3)
+    return LiveAnimal(untrained_simulator(goal_steps=2, candidates=1), seed=3)
 
 
-def exported() -> reading.Agent:
-    """A tube on the three bones of the animal."""
+def exported_agent() -> reading.Agent:
+    """An exported tube with the three bones of the animal."""
     mesh, _ = small_world.tube()
     skin = Skin(
         np.tile(np.arange(4, dtype=np.uint8) % 3, (len(mesh.vertices), 1)),
@@ -57,7 +38,7 @@ def exported() -> reading.Agent:
     return reading.Agent(mesh, skin, [still], {})
 
 
-def test_time_passes_in_steps_of_any_length(animal):
+def test_poses_are_interpolated_for_any_step_length(animal):
     animal.reset(3)
     frames = [animal.simulator.reset(3)] + [animal.simulator.step(PERSON) for _ in range(10)]
     animal.reset(3)
@@ -73,17 +54,17 @@ def test_time_passes_in_steps_of_any_length(animal):
 
 
 @pytest.mark.parametrize(("seconds", "place"), [(np.nan, PERSON), (0.1, PERSON * np.nan), (-0.1, PERSON)])
-def test_what_is_no_time_or_place_is_refused(animal, seconds, place):
+def test_invalid_times_and_positions_are_refused(animal, seconds, place):
     with pytest.raises(InputError, match="SIM-012"):
         animal.advance(seconds, place)
 
 
-def test_mujoco_steps_with_a_robot_that_the_animal_sees(animal, tmp_path):
+def test_mujoco_moves_the_animal_with_a_robot_as_observer(animal, tmp_path):
     mujoco = pytest.importorskip("mujoco")
     from pipeline.adapters.mujoco_animal import MujocoAnimal
 
     occupancy = reading.Occupancy(np.pad(np.ones((40, 1, 40), bool), ((0, 0), (0, 5), (0, 0))), np.array([-2.0, -0.1, -2]), 0.1)  # fmt: skip
-    mjcf.write(tmp_path, exported(), occupancy)
+    mjcf.write(tmp_path, exported_agent(), occupancy)
     home = mujoco.MjSpec.from_file(str(tmp_path / "agent.xml"))
     ball = home.worldbody.add_body(name="robot", pos=[1.0, 0.5, 0.4])
     ball.add_freejoint()
@@ -96,21 +77,19 @@ def test_mujoco_steps_with_a_robot_that_the_animal_sees(animal, tmp_path):
     np.testing.assert_allclose(moving.observer_world, [1.0, 0.4, -0.5])
     pose = moving.step(100)
     assert data.time == pytest.approx(0.5) and pose.time_s == pytest.approx(0.5)
-    assert data.body("robot").xpos[2] == pytest.approx(0.1, abs=0.02), (
-        "it fell onto the floor, which carries it"
-    )
+    assert data.body("robot").xpos[2] == pytest.approx(0.1, abs=0.02), "it fell onto the floor"
     mujoco.mj_forward(model, data)
     bone = ZUP_FROM_WORLD @ pose.world_from_agent @ pose.agent_from_bone[1]
     np.testing.assert_allclose(data.body("bone_01").xpos, bone[:3, 3], atol=1e-9)
 
 
-def test_usd_has_the_pose_of_now(animal, tmp_path):
+def test_usd_has_the_current_pose(animal, tmp_path):
     pytest.importorskip("pxr")
     from pxr import Usd, UsdSkel
 
     from pipeline.adapters.usd_animal import UsdAnimal
 
-    usd.write(tmp_path, exported(), small_world.room())
+    usd.write(tmp_path, exported_agent(), small_world.room())
     stage = Usd.Stage.Open(str(tmp_path / "agent_still.usdc"))
     animal.reset(3)
     pose = UsdAnimal(stage, animal).step(0.25, PERSON)
@@ -123,15 +102,15 @@ def test_usd_has_the_pose_of_now(animal, tmp_path):
 
 @dataclass
 class Message:
-    """A message of ROS with the fields that the node fills."""
+    """A ROS message with the fields that the node sets."""
 
     pose: object = None
     poses: object = None
     header: SimpleNamespace = field(default_factory=SimpleNamespace)
 
 
-class Topics:
-    """What a node of ROS offers, as far as the adapter asks for it."""
+class FakeNode:
+    """The part of a ROS node that the adapter uses."""
 
     def __init__(self):
         self.sent, self.heard, self.period_s = {}, {}, None
@@ -150,7 +129,7 @@ class Topics:
 
 
 def test_ros_messages_have_the_axes_of_rep_103(animal):
-    """ROS itself is no wheel; its messages are plain records."""
+    """Uses fake messages, since ROS is not available as a wheel."""
     animal.reset(3)
     messages = SimpleNamespace(
         PoseStamped=Message,
@@ -159,7 +138,7 @@ def test_ros_messages_have_the_axes_of_rep_103(animal):
         Pose=SimpleNamespace,
         Quaternion=SimpleNamespace,
     )
-    topics = Topics()
+    topics = FakeNode()
     node = AnimalNode(topics, messages, animal)
     topics.heard["observer"](Message(pose=SimpleNamespace(position=SimpleNamespace(x=1.0, y=2.0, z=1.4))))
     np.testing.assert_allclose(node.observer_world, [1.0, 1.4, -2.0])

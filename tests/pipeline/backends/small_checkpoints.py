@@ -1,4 +1,4 @@
-"""Small checkpoints of foundation models with random weights, as `save_pretrained` writes them."""
+"""Small checkpoints of foundation models with random weights, in the format of `save_pretrained`."""
 
 import json
 from pathlib import Path
@@ -7,11 +7,11 @@ import pytest
 
 NEEDS = "the extra is not installed (make extras)"
 SIDE = 64
-"""pixels, of SAM 2's pictures"""
+"""size of pictures of SAM 2, pixels"""
 
 
 def library():
-    """Skip, visibly, where the extra is not installed."""
+    """Import transformers, or skip the test if the extra is not installed."""
     return pytest.importorskip("transformers", reason=NEEDS)
 
 
@@ -74,7 +74,7 @@ def sam2(folder: Path) -> Path:
         memory_fuser_num_layers=1,
     )
     model = transformers.Sam2VideoModel(config)
-    for part in model.parameters():  # as strong as trained ones: what is remembered must show in the masks
+    for part in model.parameters():  # as large as trained ones, so that the memory influences the masks
         if part.dim() > 1:
             torch.nn.init.normal_(part, std=1.5 / part[0].numel() ** 0.5)
     model.save_pretrained(folder)
@@ -131,7 +131,7 @@ def grounding_dino(folder: Path) -> Path:
 
 
 def depth_anything(folder: Path, kind: str) -> Path:
-    """Depth Anything V2 that answers in inverse depth (`relative`) or metres (`metric`)."""
+    """Depth Anything V2 with inverse depth (`relative`) or metric depth (`metric`)."""
     transformers = library()
     import torch
 

@@ -1,4 +1,4 @@
-"""DINOv2 as a backend gives what transformers gives, on a small checkpoint with random weights."""
+"""The DINOv2 backend agrees with transformers on a small checkpoint with random weights."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def checkpoint(tmp_path_factory):
     return small_checkpoints.dinov2(tmp_path_factory.mktemp("dinov2"))
 
 
-def test_it_equals_transformers_preprocessing_included(checkpoint):
+def test_features_equal_those_of_transformers(checkpoint):
     import torch
     import transformers
     from transformers.models.bit.image_processing_pil_bit import BitImageProcessorPil
@@ -35,26 +35,26 @@ def test_it_equals_transformers_preprocessing_included(checkpoint):
     np.testing.assert_allclose(ours, torch.nn.functional.normalize(tokens, dim=-1).numpy(), atol=1e-4)
 
 
-def test_the_choice_travels_with_the_basis(checkpoint, tmp_path):
+def test_descriptor_choice_is_saved(checkpoint, tmp_path):
     Describer("dinov2", str(checkpoint)).save(tmp_path)
     describe = Describer.load(tmp_path).open("cpu")
     assert describe(np.zeros((32, 48, 3), np.uint8), 16).shape == (2, 3, 24)
 
 
-def test_another_model_is_refused(checkpoint, tmp_path):
+def test_other_model_type_is_refused(checkpoint, tmp_path):
     (tmp_path / "config.json").write_text('{"model_type": "bert"}')
     with pytest.raises(InputError, match="MOD-003"):
         Dinov2(str(tmp_path), "cpu")
 
 
-def test_missing_weights_are_told_by_name(tmp_path):
+def test_missing_weights_are_named(tmp_path):
     for weights in ("", str(tmp_path)):
         with pytest.raises(InputError, match="MOD-001.*config.json") as refused:
             Dinov2(weights, "cpu")
         assert "facebook/dinov2-small" in refused.value.remedy
 
 
-def test_a_missing_library_is_told_with_its_remedy(monkeypatch):
+def test_missing_library_is_refused_with_a_remedy(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "transformers", None)
     with pytest.raises(InputError, match="MOD-002") as refused:
         checkpoints.library()

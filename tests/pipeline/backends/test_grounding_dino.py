@@ -1,4 +1,4 @@
-"""Grounding DINO as a backend finds what transformers finds, on a small checkpoint with random weights."""
+"""The Grounding DINO backend agrees with transformers on a small checkpoint with random weights."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ def checkpoint(tmp_path_factory):
 
 
 @pytest.mark.parametrize("size", [(90, 66), (60, 120)])
-def test_it_equals_transformers_preprocessing_included(checkpoint, size):
+def test_detections_equal_those_of_transformers(checkpoint, size):
     import torch
     import transformers
     from transformers.models.grounding_dino.image_processing_pil_grounding_dino import (
@@ -38,7 +38,7 @@ def test_it_equals_transformers_preprocessing_included(checkpoint, size):
     assert len(GroundingDino(str(checkpoint), "cpu").find(color, "a cat", 1.0).score) == 0
 
 
-def test_sizes_are_fitted_as_transformers_fits_them():
+def test_resized_shapes_equal_those_of_transformers():
     pytest.importorskip("transformers", reason=small_checkpoints.NEEDS)
     from transformers.image_transforms import get_size_with_aspect_ratio
 

@@ -1,4 +1,4 @@
-"""Networks for depth from one picture give what transformers gives, on small checkpoints with random weights."""
+"""Monocular depth backends agree with transformers on small checkpoints with random weights."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ COLOR = np.random.default_rng(0).integers(0, 255, (90, 66, 3), dtype=np.uint8)
 
 
 @pytest.mark.parametrize("kind", ["relative", "metric"])
-def test_depth_anything_equals_transformers_up_to_what_it_answers_in(kind, tmp_path):
+def test_depth_anything_equals_transformers(kind, tmp_path):
     path = small_checkpoints.depth_anything(tmp_path, kind)
     import torch
     import transformers
@@ -30,13 +30,13 @@ def test_depth_anything_equals_transformers_up_to_what_it_answers_in(kind, tmp_p
     np.testing.assert_allclose(ours, expected, rtol=1e-3, atol=1e-4)
 
 
-def test_depth_pro_answers_for_every_pixel_of_its_square(tmp_path):
+def test_depth_pro_is_finite_everywhere(tmp_path):
     path = small_checkpoints.depth_pro(tmp_path)
     found = MonocularDepth("depth_pro", str(path), "cpu").inverse_depth(COLOR)
     assert found.shape[0] == found.shape[1] and np.isfinite(found).all() and np.ptp(found) > 0
 
 
-def test_missing_and_foreign_checkpoints_are_named(tmp_path):
+def test_missing_and_other_checkpoints_are_refused(tmp_path):
     small_checkpoints.library()
     with pytest.raises(InputError, match="MOD-001"):
         MonocularDepth("depth_pro", str(tmp_path), "cpu")

@@ -1,6 +1,4 @@
-"""RAFT's parts against plain formulas, its parameters against the official count, its weights against their
-names.
-"""
+"""Parts of RAFT against reference formulas, its parameter count, and loading of official weights."""
 
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ from pipeline.backends import raft
 from pipeline.core.errors import InputError
 
 OFFICIAL_PARAMETERS = 5_257_536
-"""as the authors print for their basic network"""
+"""as printed by the authors for the basic network"""
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +18,7 @@ def network():
 
 
 def official_names(network) -> dict[str, torch.Tensor]:
-    """The state as the authors save it: behind a wrapper, and with norms of shortcuts named twice."""
+    """The state dict as the authors save it: with a wrapper, and with shortcut norms under two names."""
     stored = {}
     for name, value in network.state_dict().items():
         stored[f"module.{name}"] = value
@@ -29,7 +27,7 @@ def official_names(network) -> dict[str, torch.Tensor]:
     return stored
 
 
-def test_it_has_the_official_parameters(network):
+def test_parameter_count_is_official(network):
     assert sum(part.numel() for part in network.parameters()) == OFFICIAL_PARAMETERS
     expected = {
         "fnet.layer2.0.downsample.0.weight",
@@ -42,7 +40,7 @@ def test_it_has_the_official_parameters(network):
     assert expected <= set(network.state_dict())
 
 
-def test_official_weights_are_loaded_and_others_refused(network, tmp_path):
+def test_official_weights_load_and_others_are_refused(network, tmp_path):
     torch.save(official_names(network), tmp_path / "raft.pth")
     loaded = raft.load(tmp_path / "raft.pth")
     assert all(torch.equal(value, loaded.state_dict()[name]) for name, value in network.state_dict().items())
@@ -55,7 +53,7 @@ def test_official_weights_are_loaded_and_others_refused(network, tmp_path):
         assert "raft-things" in refused.value.remedy
 
 
-def test_look_up_reads_what_is_there():
+def test_correlation_lookup_reads_the_volume():
     rng = torch.Generator().manual_seed(0)
     here, there = (torch.randn(1, 5, 16, 24, generator=rng) for _ in range(2))
     target = raft._cell_index(16, 24, torch.device("cpu")) + torch.tensor([1.0, -2.0])[None, :, None, None]
@@ -82,7 +80,7 @@ def test_look_up_reads_what_is_there():
     )
 
 
-def test_upsampling_keeps_a_constant_flow():
+def test_upsampling_preserves_constant_flow():
     flow = torch.tensor([1.5, -0.5])[None, :, None, None].expand(1, 2, 4, 5)
     mask = torch.full((1, 576, 4, 5), -30.0).view(1, 9, 64, 4, 5)
     mask[:, 4] = 30
@@ -91,7 +89,7 @@ def test_upsampling_keeps_a_constant_flow():
     torch.testing.assert_close(whole[0, :, 7, 9], torch.tensor([12.0, -4.0]))
 
 
-def test_pictures_of_any_size_are_padded_alike(network):
+def test_pictures_of_any_size_are_padded(network):
     rng = np.random.default_rng(0)
     first, second = rng.integers(0, 255, (2, 66, 75, 3), dtype=np.uint8)
     flow = raft.flow_between(network, first, second, 1)

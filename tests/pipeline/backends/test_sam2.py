@@ -1,4 +1,4 @@
-"""SAM 2 frame by frame with a short memory gives what transformers gives on the whole video."""
+"""SAM 2 frame by frame with bounded memory agrees with transformers on the whole video."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def video() -> np.ndarray:
 
 
 def whole_video(checkpoint, frames: np.ndarray, order: list[int]) -> list[torch.Tensor]:
-    """Let transformers see the whole video at once and keep everything."""
+    """Masks by transformers on the whole video with unbounded memory."""
     import transformers
     from transformers.models.sam2_video.modeling_sam2_video import Sam2VideoInferenceSession
 
@@ -51,7 +51,7 @@ def whole_video(checkpoint, frames: np.ndarray, order: list[int]) -> list[torch.
 
 
 @pytest.mark.parametrize("order", [range(FRAMES), range(FRAMES - 1, -1, -1)], ids=["forwards", "backwards"])
-def test_a_short_memory_changes_nothing(checkpoint, order):
+def test_bounded_memory_gives_the_same_masks(checkpoint, order):
     from pipeline.backends.sam2 import Sam2
 
     frames = video()
@@ -66,7 +66,7 @@ def test_a_short_memory_changes_nothing(checkpoint, order):
         np.testing.assert_allclose(mask, expected.numpy(), atol=1e-4 * float(expected.abs().max()))
 
 
-def test_memory_does_not_grow_with_the_video(checkpoint, monkeypatch):
+def test_memory_is_bounded(checkpoint, monkeypatch):
     from pipeline.backends.sam2 import Sam2
 
     tracker, sessions = Sam2(str(checkpoint), "cpu"), []

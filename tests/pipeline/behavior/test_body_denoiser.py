@@ -10,13 +10,13 @@ from pipeline.geometry import rigid_torch
 FRAMES = 40
 
 
-def plain(channels: int) -> GaussianPrior:
-    """A prior without bones, which leaves its input as it is."""
+def identity_prior(channels: int) -> GaussianPrior:
+    """A prior without bones, which returns its input."""
     return GaussianPrior(channels, 0, 0, FRAMES)
 
 
 def walk(turns: torch.Tensor, speed_m_s: float) -> torch.Tensor:
-    """A path whose direction turns by so much in each frame, and that stops after three quarters."""
+    """A path that turns by a fixed angle per frame and stops after three quarters of its length."""
     yaw = turns.cumsum(0)
     pace = torch.where(torch.arange(FRAMES) < 30, speed_m_s / 10, 0.0)
     return torch.stack([yaw.sin() * pace, 0 * yaw, yaw.cos() * pace]).cumsum(1)[None], yaw
@@ -27,29 +27,31 @@ def columns(yaw: torch.Tensor) -> torch.Tensor:
     return rigid_torch.rotation_to_6d(turn).mT[None]
 
 
-def test_a_body_is_held_to_look_where_it_goes_and_to_stay_as_it_is():
-    net = BodyDenoiser(SequenceDenoiser(Schedule()), plain(6), 6, FRAMES)
+def test_roots_face_the_path_and_keep_the_posture():
+    net = BodyDenoiser(SequenceDenoiser(Schedule()), identity_prior(6), 6, FRAMES)
     for first, speed in ((0.4, 0.8), (0.4, 0.0)):
         path, yaw = walk(torch.full((FRAMES,), 0.03), speed)
         held = columns(torch.full((FRAMES,), first))
         looks = rotated_to_heading(held, net.headings(net.steps(path, torch.zeros(1), path), held))
-        told = torch.atan2(-looks[0, 2], looks[0, 0])  # of the x axis
+        angle = torch.atan2(-looks[0, 2], looks[0, 0])  # of the x axis
         if speed:
-            assert (told - yaw)[10:30].abs().max() < 0.1
-            assert (told[30:] - told[29]).abs().max() < 1e-4
+            assert (angle - yaw)[10:30].abs().max() < 0.1
+            assert (angle[30:] - angle[29]).abs().max() < 1e-4
         else:
-            assert (told - first).abs().max() < 1e-4
+            assert (angle - first).abs().max() < 1e-4
 
 
-def test_a_one_stage_body_has_the_heading_of_its_own_path():
-    """The same steps, whether the path is given or denoised along with the body; none where noise hides it."""
+def test_one_stage_body_has_the_heading_of_its_path():
+    """The heading is the same for given and for jointly denoised paths, and unknown where noise hides it."""
     net, std = (
-        OneStageDenoiser(SequenceDenoiser(Schedule()), plain(10), 6, FRAMES),
+        OneStageDenoiser(SequenceDenoiser(Schedule()), identity_prior(10), 6, FRAMES),
         torch.tensor([0.4, 0.1, 0.4, 1.0]),
     )
     net.velocity_std[:] = std
     path, _ = walk(torch.full((FRAMES,), 0.03), 0.8)
-    given = BodyDenoiser(SequenceDenoiser(Schedule()), plain(6), 6, FRAMES).steps(path, torch.zeros(1), path)
+    given = BodyDenoiser(SequenceDenoiser(Schedule()), identity_prior(6), 6, FRAMES).steps(
+        path, torch.zeros(1), path
+    )
     strides = velocity_channels_from_path(path.mT, path[..., 0] - given[..., 0]) / std
     whole = torch.cat([strides.mT, torch.randn(1, 6, FRAMES)], dim=1)
     clean, noisy = (
@@ -60,13 +62,13 @@ def test_a_one_stage_body_has_the_heading_of_its_own_path():
     assert (noisy.norm(dim=1) < given.norm(dim=1))[..., :30].all()
 
 
-def test_what_is_denoised_is_the_departure_from_the_posture():
-    class Noted(SequenceDenoiser):
+def test_residual_from_the_current_posture_is_denoised():
+    class RecordingNetwork(SequenceDenoiser):
         def velocity(self, x, t, condition, control, keep):
             self.x = x
             return x
 
-    net = BodyDenoiser(Noted(Schedule()), plain(9), 9, FRAMES)
+    net = BodyDenoiser(RecordingNetwork(Schedule()), identity_prior(9), 9, FRAMES)
     posture = torch.cat([columns(torch.zeros(1))[0, :, 0], torch.tensor([0.3, -0.2, 0.1])])[None]
     clean, noise, t = (
         posture[..., None].expand(-1, -1, FRAMES),
@@ -83,10 +85,10 @@ def test_what_is_denoised_is_the_departure_from_the_posture():
     )
     torch.testing.assert_close(
         net.unet.x, np.sqrt(1 - share).astype(np.float32) * noise, atol=6e-3, rtol=0
-    )  # a heading is told by vectors a little shorter than 1
+    )  # the heading channel is a vector slightly shorter than 1
 
 
-def test_gates_multiply_the_noisy_bones_and_nothing_else():
+def test_gates_scale_only_the_noisy_bones():
     net = BodyDenoiser(SequenceDenoiser(Schedule()), GaussianPrior(6, 12, 5, FRAMES), 18, FRAMES)
     velocity, whitened = torch.randn(2, 1, 11, FRAMES)
     gate = torch.randn(1, 5, FRAMES)

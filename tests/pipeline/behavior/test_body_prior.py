@@ -10,7 +10,7 @@ FRAMES, BONES, ROOT = 16, 12, 6
 
 
 def motion(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Slow sequences of three components that begin with a posture and forget it, in all channels."""
+    """Gaussian sequences of three components, in all channels, that start at a posture and forget it slowly."""
     generator = torch.Generator().manual_seed(seed)
     mixing = 0.5 * torch.randn(ROOT + BONES, 3, generator=torch.Generator().manual_seed(9))
     mixing[:ROOT] *= 0.2
@@ -30,7 +30,7 @@ def fitted(components: int = 4) -> GaussianPrior:
 
 
 def noisy_residual(prior: GaussianPrior, t: int, count: int = 2048):
-    """Residuals of unseen sequences at a step, and their noise."""
+    """Noised residuals of held-out sequences at a step, and their noise."""
     posture, clean = motion(count, seed=1)
     noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(2))
     share = torch.tensor(Schedule().alpha_bar[t]).float()
@@ -38,7 +38,7 @@ def noisy_residual(prior: GaussianPrior, t: int, count: int = 2048):
     return x - share.sqrt() * prior.mean(posture), noise, torch.full((count,), float(t))
 
 
-def test_a_prior_that_is_not_fitted_is_v_prediction_of_the_residual():
+def test_unfitted_prior_is_v_prediction_of_the_residual():
     prior = GaussianPrior(ROOT, BONES, BONES, FRAMES)
     x, velocity = torch.randn(2, 3, ROOT + BONES, FRAMES)
     t = torch.tensor([0.0, 20.0, 49.0])
@@ -48,7 +48,7 @@ def test_a_prior_that_is_not_fitted_is_v_prediction_of_the_residual():
     torch.testing.assert_close(prior.noise(prior.coefficients(x), velocity, t), expected, atol=1e-5, rtol=0)
 
 
-def test_the_unet_reads_leading_components_of_unit_variance():
+def test_unet_reads_unit_variance_components():
     prior = fitted()
     for t in (0, 20, 49):
         residual, _, step = noisy_residual(prior, t)
@@ -57,8 +57,8 @@ def test_the_unet_reads_leading_components_of_unit_variance():
         assert (whitened[:, ROOT:].var((0, 2)) - 1).abs().max() < 0.15
 
 
-def test_without_a_correction_the_noise_is_the_best_linear_estimate():
-    """Far less noise is left than that of independent channels of unit variance leave."""
+def test_uncorrected_noise_is_the_best_linear_estimate():
+    """Its residual is much smaller than for independent channels of unit variance."""
     prior, plain = fitted(), GaussianPrior(ROOT, BONES, BONES, FRAMES)
     for t in (5, 15, 30):
         residual, noise, step = noisy_residual(prior, t)
@@ -70,7 +70,7 @@ def test_without_a_correction_the_noise_is_the_best_linear_estimate():
 
 
 def test_samples_have_the_covariance_of_the_data():
-    """By the solver in many steps, with the linear estimate alone; the data are Gaussian."""
+    """With the linear estimate alone and many solver steps; the data are Gaussian."""
     schedule = Schedule(steps=400, beta_last=0.04)
     prior = GaussianPrior(ROOT, BONES, 4, FRAMES, schedule)
     prior.fit(*motion(4096))
@@ -84,8 +84,8 @@ def test_samples_have_the_covariance_of_the_data():
     noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(4))
     drawn = sample(denoise, noise, schedule, method="dpm_solver", count=100)
     for each in (drawn, clean), (drawn.diff(dim=-1), clean.diff(dim=-1)):
-        told, true = (torch.cov(sequence[:, ROOT:].transpose(0, 1).flatten(1)) for sequence in each)
-        assert (told - true).norm() < 0.15 * true.norm()
+        sampled, true = (torch.cov(sequence[:, ROOT:].transpose(0, 1).flatten(1)) for sequence in each)
+        assert (sampled - true).norm() < 0.15 * true.norm()
 
 
 def test_other_channels_keep_unit_variance():

@@ -8,8 +8,8 @@ from pipeline.behavior.diffusion import Schedule, guided, noised, sample
 SCHEDULE = Schedule()
 
 
-def perfect(mean: float, std: float):
-    """The noise that a perfect network predicts when the data are N(mean, std^2)."""
+def ideal_network(mean: float, std: float):
+    """The noise that an ideal network predicts when the data are N(mean, std^2)."""
 
     def denoise(x, t):
         share = SCHEDULE.alpha_bar[int(t)]
@@ -26,23 +26,25 @@ def test_samplers_reproduce_a_gaussian(method, count, tolerance):
     rng = np.random.default_rng(0)
     noise = rng.standard_normal(20000)
     x = sample(
-        perfect(0.7, 0.5),
+        ideal_network(0.7, 0.5),
         noise,
         SCHEDULE,
         method=method,
         count=count,
         draw=lambda: rng.standard_normal(20000),
     )
-    assert abs(x.mean() - 0.7) < tolerance  # 50 steps of the posterior's variance narrow, few large ones blur
+    assert (
+        abs(x.mean() - 0.7) < tolerance
+    )  # 50 steps with the posterior variance shrink the variance, few steps with the large one increase it
     assert abs(x.std() - 0.5) < tolerance
 
 
-def test_the_forward_variance_keeps_the_spread_of_unit_data_in_few_steps():
+def test_forward_variance_keeps_unit_variance_in_few_steps():
     rng = np.random.default_rng(0)
     spread = {}
     for method in ("ddpm", "ddpm_large"):
         x = sample(
-            perfect(0.0, 1.0),
+            ideal_network(0.0, 1.0),
             rng.standard_normal(40000),
             SCHEDULE,
             method=method,
@@ -55,8 +57,8 @@ def test_the_forward_variance_keeps_the_spread_of_unit_data_in_few_steps():
 
 
 @pytest.mark.parametrize(("std", "tolerance"), [(1.5, 0.02), (1.0, 0.02), (0.5, 0.02), (0.3, 0.04)])
-def test_in_ten_steps_the_solver_keeps_the_spread(std, tolerance):
-    x = sample(perfect(0.0, std), np.ones(1), SCHEDULE, method="dpm_solver", count=10)
+def test_solver_keeps_the_variance_in_ten_steps(std, tolerance):
+    x = sample(ideal_network(0.0, std), np.ones(1), SCHEDULE, method="dpm_solver", count=10)
     assert x[0] == pytest.approx(std, rel=tolerance)
 
 
@@ -66,7 +68,7 @@ def test_noising_keeps_unit_variance():
     assert noised(clean, noise, 0.3).std() == pytest.approx(1, abs=0.01)
 
 
-def test_schedule_ends_in_noise_and_every_sampler_visits_both_ends():
+def test_schedule_ends_in_noise_and_samplers_use_both_end_points():
     assert SCHEDULE.alpha_bar[0] > 0.999
     assert SCHEDULE.alpha_bar[-1] < 0.01
     for count in (4, 10, 50):
@@ -84,7 +86,7 @@ def test_guidance_is_linear_in_its_scale():
     assert guided((lambda x, t: 3.0, lambda x, t: 1.0), (0.0,))(0.0, 0) == 1.0
 
 
-def test_control_enters_every_block_and_can_be_dropped():
+def test_control_affects_every_block_and_can_be_dropped():
     torch.manual_seed(0)
     net = ControlUNet(4, 3, condition=8, width=8, multipliers=(1, 2)).eval()
     x, t, code = torch.randn(2, 4, 56), torch.tensor([3.0, 40.0]), torch.randn(2, 8)
@@ -92,7 +94,7 @@ def test_control_enters_every_block_and_can_be_dropped():
     first, second = torch.randn(2, 3), torch.randn(2, 3)
     torch.testing.assert_close(
         net(x, t, code, first, keep), net(x, t, code, second, keep)
-    )  # begins without influence
+    )  # initialized to zero
     assert len(net.inject) == 5
     for zero in net.inject:
         torch.nn.init.normal_(zero.weight)
@@ -102,7 +104,7 @@ def test_control_enters_every_block_and_can_be_dropped():
     torch.testing.assert_close(net(x, t, code, first, keep), net(x, t, code, sequence, keep))
 
 
-def test_nothing_steers_a_free_network_which_is_a_controlled_one_without_control():
+def test_uncontrolled_network_equals_controlled_one_without_control():
     torch.manual_seed(0)
     steered = ControlUNet(4, 3, condition=8, width=8, multipliers=(1, 2)).eval()
     free = UncontrolledUNet(4, torch.nn.Linear(8, EMBEDDING), width=8, multipliers=(1, 2)).eval()
@@ -120,7 +122,7 @@ def test_nothing_steers_a_free_network_which_is_a_controlled_one_without_control
 
 
 @pytest.mark.parametrize("course", ["linear", "rectified"])
-def test_the_solver_needs_no_fresh_noise_and_ends_corrected(course):
+def test_solver_is_deterministic_and_returns_the_corrected_estimate(course):
     """For any number of steps; corrected estimates are extrapolated, and the last one is returned."""
     schedule = Schedule(course=course)
     for count in (1, 2, 3, 10):

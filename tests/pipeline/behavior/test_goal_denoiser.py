@@ -1,4 +1,4 @@
-"""Goal networks learn where goals are, from a code and from a map, and average their minds."""
+"""Goal networks learn the distribution of goals from codes and from maps, and average their ensemble."""
 
 import torch
 
@@ -10,7 +10,7 @@ CELLS = 4
 
 
 def trained(net: GoalMLP, draw, steps: int) -> GoalMLP:
-    """Fit a network to goals and what is perceived before them, both from ``draw``."""
+    """Fit a network to pairs of goals and perception codes from ``draw``."""
     alpha_bar = torch.from_numpy(STANDARD.alpha_bar).float()
     optimizer = torch.optim.AdamW(net.parameters(), 3e-3)
     for _ in range(steps):
@@ -26,7 +26,7 @@ def trained(net: GoalMLP, draw, steps: int) -> GoalMLP:
 
 
 def goals(net: GoalMLP, perceived: torch.Tensor, count: int) -> torch.Tensor:
-    """Sample goals of every row of what is perceived."""
+    """Sample goals for every perception code."""
     shape = (len(perceived) * count, 3)
     with torch.inference_mode():
         x = sample(
@@ -36,7 +36,7 @@ def goals(net: GoalMLP, perceived: torch.Tensor, count: int) -> torch.Tensor:
     return x.unflatten(0, (-1, count))
 
 
-def test_goal_network_learns_where_goals_are():
+def test_goal_network_learns_the_distribution():
     torch.manual_seed(0)
 
     def draw(size):
@@ -48,7 +48,7 @@ def test_goal_network_learns_where_goals_are():
     assert (found.mean((0, 1)) - torch.tensor([1.0, -1.0, 1.0])).abs().max() < 0.25
 
 
-def test_goals_are_found_on_the_map():
+def test_goals_follow_the_map():
     torch.manual_seed(0)
     net = GoalMLP(code=1, hidden=32, map_cells=CELLS)
     places = net.map.power
@@ -67,7 +67,7 @@ def test_goals_are_found_on_the_map():
     assert (found - clean[:, None]).norm(dim=-1).median() < 0.4  # neighbouring cells are some 1.2 apart
 
 
-def test_local_heads_look_where_the_goal_may_be():
+def test_local_heads_read_the_map_at_candidate_goals():
     attention = MapAttention(CELLS, 2, 1)
     torch.nn.init.zeros_(attention.query.weight)
     torch.nn.init.zeros_(attention.query.bias)
@@ -82,7 +82,7 @@ def test_local_heads_look_where_the_goal_may_be():
     torch.testing.assert_close(looked[:, -1], torch.zeros(2, 2), atol=1e-5, rtol=0)
 
 
-def test_minds_are_averaged_and_read_their_own_codes():
+def test_ensemble_members_are_averaged_and_read_their_own_codes():
     torch.manual_seed(0)
     net = GoalMLP(code=6, hidden=16, ensemble_size=2)
     x, t, code = torch.randn(5, 3), torch.full((5,), 7.0), torch.randn(5, 12)

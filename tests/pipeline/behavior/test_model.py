@@ -33,7 +33,7 @@ def ats():
     return Ats(sampler, room(), REST, "yaw", PlanSamplingConfig(goal_steps=4, sequence_steps=2))
 
 
-def test_bones_survive_their_channels(data):
+def test_bone_encoding_is_inverted(data):
     bones = data.trajectories["v000"].agent_from_bone
     channels = channels_from_bones(bones, REST)
     assert channels.shape == (len(bones), 18)
@@ -41,7 +41,7 @@ def test_bones_survive_their_channels(data):
     np.testing.assert_allclose(channels_from_bones(REST, REST), 0, atol=1e-9)
 
 
-def test_plan_returns_to_the_world(data):
+def test_plan_is_transformed_to_the_world(data):
     _, future = data.windows(np.array([5]))
     frame = rigid.make(rigid.rotation_from_vector(np.array([[0, 0.4, 0]])), np.array([[1.0, 0, 2]]))
     ego = rigid.inverse(frame)[:, None] @ future.world_from_agent
@@ -52,7 +52,7 @@ def test_plan_returns_to_the_world(data):
     np.testing.assert_allclose(plan.world_from_agent(frame), future.world_from_agent, atol=1e-9)
 
 
-def test_same_noise_gives_the_same_plan_and_conditions_can_be_switched_off(ats, data):
+def test_plans_are_deterministic_and_conditions_can_be_dropped(ats, data):
     context, _ = data.windows(np.array([0, 40]))
     observation = observe(context, room(), REST, "yaw")
 
@@ -73,7 +73,7 @@ def test_same_noise_gives_the_same_plan_and_conditions_can_be_switched_off(ats, 
     assert np.abs(full - ignoring).max() > np.abs(half - ignoring).max() > 0
 
 
-def test_given_goal_and_path_replace_their_levels(ats, data):
+def test_given_goal_and_path_are_kept(ats, data):
     context, _ = data.windows(np.array([0]))
     observation = observe(context, room(), REST, "yaw")
     goal, path = np.array([[0.3, 0.0, 0.7]]), np.linspace(0, 1, 56)[None, :, None] * [0.3, 0.0, 0.7]
@@ -82,7 +82,7 @@ def test_given_goal_and_path_replace_their_levels(ats, data):
     np.testing.assert_allclose(plan.path, path, atol=1e-6)
 
 
-def test_paths_that_miss_their_goals_are_drawn_again(ats, data):
+def test_paths_that_miss_their_goals_are_resampled(ats, data):
     context, _ = data.windows(data.indices(TEST)[::20])
     codes = ats.sampler.codes(
         observe(context, room(), REST, "yaw"), replace(ats.sampling, avoid_solid=False), 8
@@ -106,35 +106,37 @@ def test_paths_that_miss_their_goals_are_drawn_again(ats, data):
     np.testing.assert_array_equal(misses(max_path_draws=4, goal=False), misses(max_path_draws=1, goal=False))
 
 
-def test_bodies_spread_as_far_as_they_are_told(ats, data):
+def test_body_variance_scales_with_the_noise(ats, data):
     context, _ = data.windows(np.array([0]))
     codes = ats.sampler.codes(observe(context, room(), REST, "yaw"), ats.sampling, 40)
     path = np.tile(np.linspace(0, 1, 56)[None, :, None] * [0.3, 0.0, 0.7], (40, 1, 1))
-    spread = [
-        ats.sampler.bodies(codes, path, replace(ats.sampling, body_noise_std=told), np.random.default_rng(0))
-        .std(0)
-        .mean()
-        for told in (0.0, 0.3, 1.0)
-    ]
-    assert spread[0] < 1e-6 < spread[1] < spread[2]
-
-
-def test_paths_without_noise_are_a_function_of_their_goal(ats, data):
-    context, _ = data.windows(np.array([0]))
-    codes = ats.sampler.codes(observe(context, room(), REST, "yaw"), ats.sampling, 40)
-    goal = np.tile([[0.3, 0.0, 0.7]], (40, 1))
-    spread = [
-        ats.sampler.draw_paths(
-            codes, goal, replace(ats.sampling, path_noise_std=told), np.random.default_rng(0)
+    std = [
+        ats.sampler.bodies(
+            codes, path, replace(ats.sampling, body_noise_std=noise_std), np.random.default_rng(0)
         )
         .std(0)
         .mean()
-        for told in (0.0, 1.0)
+        for noise_std in (0.0, 0.3, 1.0)
     ]
-    assert spread[0] < 1e-6 < 1e-3 < spread[1]
+    assert std[0] < 1e-6 < std[1] < std[2]
 
 
-def test_predictors_share_one_call(ats, data):
+def test_paths_without_noise_are_determined_by_the_goal(ats, data):
+    context, _ = data.windows(np.array([0]))
+    codes = ats.sampler.codes(observe(context, room(), REST, "yaw"), ats.sampling, 40)
+    goal = np.tile([[0.3, 0.0, 0.7]], (40, 1))
+    std = [
+        ats.sampler.draw_paths(
+            codes, goal, replace(ats.sampling, path_noise_std=noise_std), np.random.default_rng(0)
+        )
+        .std(0)
+        .mean()
+        for noise_std in (0.0, 1.0)
+    ]
+    assert std[0] < 1e-6 < 1e-3 < std[1]
+
+
+def test_all_predictors_have_the_same_interface(ats, data):
     train = data.windows(data.indices(TRAIN))
     context, _ = data.windows(data.indices(TEST)[::20])
     for predictor in (ats, StandStill.fit(*train), ConstantVelocity.fit(*train), LocationPrior.fit(*train)):
@@ -148,13 +150,13 @@ def test_predictors_share_one_call(ats, data):
             np.testing.assert_allclose(np.linalg.det(first.rotation), 1, atol=1e-4)
 
 
-def test_goals_alone_are_those_of_whole_plans(ats, data):
+def test_goals_equal_those_of_full_plans(ats, data):
     context, _ = data.windows(data.indices(TEST)[:3])
     whole, alone = (draw(context, 4, np.random.default_rng(0)).goal for draw in (ats.sample, ats.goals))
     np.testing.assert_allclose(alone, whole, atol=1e-6)
 
 
-def test_baseline_noise_is_that_of_training(data):
+def test_standing_still_has_the_standard_deviation_of_training_goals(data):
     train = data.windows(data.indices(TRAIN))
     still = StandStill.fit(*train)
     moved = train[1].goal_world - train[0].world_from_agent[:, -1, :3, 3]
@@ -166,7 +168,7 @@ def test_baseline_noise_is_that_of_training(data):
     assert drawn[..., 0].std() == pytest.approx(still.std[-1, 0], rel=0.05)
 
 
-def test_location_prior_draws_training_goals(data):
+def test_location_prior_samples_training_goals(data):
     context, future = data.windows(data.indices(TRAIN)[:40])
     prior = LocationPrior.fit(context, future)
     goals = prior.sample(context[:1], 500, np.random.default_rng(0)).goal[0]
@@ -176,7 +178,7 @@ def test_location_prior_draws_training_goals(data):
     assert nearest.max() < 0.1 * np.sqrt(3) + 1e-6
 
 
-def test_data_survive_their_files(data, tmp_path):
+def test_data_survive_saving(data, tmp_path):
     data.save(tmp_path)
     loaded = BehaviorData.load(tmp_path)
     assert loaded.videos == data.videos

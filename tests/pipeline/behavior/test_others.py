@@ -1,4 +1,4 @@
-"""A set of others: order plays no part, nobody is as good as somebody far away, and nothing is known early."""
+"""Encoding of companions: invariant to order, continuous at the range limit, and causal."""
 
 from dataclasses import replace
 
@@ -15,8 +15,7 @@ from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import AnimalBatch, as_companions
 from pipeline.behavior.trajectories import ABSENT_M, KINDS, MAX_COMPANIONS, PAST, BehaviorData, nearest
 from stages.train_behavior.objective import with_some_absent
-from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
-from tests.stages.simulate.test_simulator import scaling
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, scaling, wandering
 
 ANIMAL = float(KINDS.index("animal"))
 
@@ -30,15 +29,15 @@ def encoder():
     return net.eval()
 
 
-def beings(count, seed=0):
-    """Beings within two metres of the agent, every other one an animal."""
+def companions_nearby(count, seed=0):
+    """Companions within two metres of the agent, alternately animals and people."""
     drawn = torch.randn(2, count, 8, 10, generator=torch.Generator().manual_seed(seed)) * 0.5
     drawn[..., 9] = torch.arange(count)[:, None] % 2
     return drawn
 
 
-def test_order_plays_no_part_and_everybody_counts(encoder):
-    set_of_four, keep = beings(4), torch.ones(2)
+def test_code_is_permutation_invariant_and_depends_on_each_companion(encoder):
+    set_of_four, keep = companions_nearby(4), torch.ones(2)
     code = encoder(set_of_four, keep)
     torch.testing.assert_close(encoder(set_of_four[:, [2, 0, 3, 1]], keep), code)
     for gone in range(4):
@@ -46,17 +45,17 @@ def test_order_plays_no_part_and_everybody_counts(encoder):
         assert (encoder(set_of_four[:, left], keep) - code).abs().max() > 1e-3
 
 
-def test_somebody_absent_is_as_good_as_nobody(encoder):
-    alone, keep = beings(1), torch.ones(2)
+def test_absent_companions_do_not_change_the_code(encoder):
+    alone, keep = companions_nearby(1), torch.ones(2)
     absent = torch.zeros(2, 3, 8, 10)
     absent[..., 0], absent[:, 1:, :, 9] = ABSENT_M, ANIMAL
     torch.testing.assert_close(encoder(torch.cat([alone, absent], 1), keep), encoder(alone, keep))
     torch.testing.assert_close(encoder(absent, keep), encoder(alone, torch.zeros(2)))
-    torch.testing.assert_close(encoder(beings(3), torch.zeros(2)), encoder(alone, torch.zeros(2)))
+    torch.testing.assert_close(encoder(companions_nearby(3), torch.zeros(2)), encoder(alone, torch.zeros(2)))
 
 
-def test_who_leaves_fades_out(encoder):
-    pair, keep = beings(2), torch.ones(2)
+def test_departing_companions_fade_out(encoder):
+    pair, keep = companions_nearby(2), torch.ones(2)
     pair[:, 1, :, :3] = torch.tensor([0.0, 0.0, 1.0])
     inside, outside = pair.clone(), pair.clone()
     inside[:, 1, :, 2], outside[:, 1, :, 2] = 3.999, 4.001
@@ -64,19 +63,19 @@ def test_who_leaves_fades_out(encoder):
     torch.testing.assert_close(encoder(inside, keep), encoder(outside, keep), atol=2e-3, rtol=0)
 
 
-def test_an_animal_is_not_a_person(encoder):
-    person = beings(1)
+def test_kind_of_companion_changes_the_code(encoder):
+    person = companions_nearby(1)
     animal = person.clone()
     animal[..., 9] = ANIMAL
     assert (encoder(person, torch.ones(2)) - encoder(animal, torch.ones(2))).abs().max() > 1e-2
 
 
-def test_the_nearest_are_perceived():
+def test_nearest_companions_are_perceived():
     rng = np.random.default_rng(0)
     others = rng.uniform(-5, 5, (3, MAX_COMPANIONS + 5, PAST, 4))
     others[0] = np.nan
-    others[1, 3, -1] = np.nan  # has gone
-    others[2, 4, :-1] = np.nan  # has just come
+    others[1, 3, -1] = np.nan  # has left
+    others[2, 4, :-1] = np.nan  # has just arrived
     others[2, 4, -1, :3] = 0.1
     agent = np.zeros((3, 3))
     some = nearest(others, agent)
@@ -89,7 +88,9 @@ def test_the_nearest_are_perceived():
 
 
 def with_companions(data: BehaviorData) -> BehaviorData:
-    """Give each recording the animal of the next one as a companion, and one who is there now and then."""
+    """Give each recording the animal of the next one as a companion, and a second one that is present at
+    times.
+    """
     tracks = list(data.trajectories.values())
     trajectories = {}
     for number, (name, track) in enumerate(data.trajectories.items()):
@@ -101,7 +102,7 @@ def with_companions(data: BehaviorData) -> BehaviorData:
     return replace(data, trajectories=trajectories)
 
 
-def test_companions_are_read_back_and_put_into_the_ego_frame(tmp_path):
+def test_companions_survive_saving_and_are_in_the_ego_frame(tmp_path):
     data = with_companions(wandering())
     data.save(tmp_path)
     again = BehaviorData.load(tmp_path)
@@ -116,8 +117,8 @@ def test_companions_are_read_back_and_put_into_the_ego_frame(tmp_path):
     assert companion.any(1).all() and (seen[:, 1:, :, 9] <= ANIMAL).all()
 
 
-def test_several_are_left_out_one_by_one_but_not_an_oversampled_observer():
-    others = beings(3).repeat(200, 1, 1, 1)
+def test_companions_are_dropped_independently_but_not_an_oversampled_observer():
+    others = companions_nearby(3).repeat(200, 1, 1, 1)
     left = with_some_absent(others, torch.ones(400, dtype=torch.bool), torch.Generator().manual_seed(0))
     absent = left[:, :, -1, 0] == ABSENT_M
     assert not absent[:, 0].any()
@@ -126,7 +127,7 @@ def test_several_are_left_out_one_by_one_but_not_an_oversampled_observer():
     assert with_some_absent(one, torch.zeros(400, dtype=torch.bool), torch.Generator()) is one
 
 
-def test_each_of_two_kinds_of_others_has_a_scale_of_its_own():
+def test_guidance_scales_of_observer_and_companions_are_independent():
     denoisers = [lambda x, t, e=e: x + e for e in (7.0, 3.0, 1.0)]  # observer +4, companions +2, alone 1
     for observer, companions in ((1.0, 1.0), (0.5, 1.0), (1.0, 0.0), (0.3, 0.7), (0.0, 0.0)):
         expected = 1 + 2 * companions + 4 * observer
@@ -155,7 +156,7 @@ def test_guidance_of_companions_changes_plans(sampler):
     assert np.abs(goals[0] - goals[2]).max() > 1e-4
 
 
-def test_animals_of_one_life_perceive_each_other_and_keep_clear(sampler):
+def test_simulated_animals_perceive_and_avoid_each_other(sampler):
     volume = room()
     scenes = Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int))
     sampling = PlanSamplingConfig(goal_steps=4, sequence_steps=2)
@@ -177,7 +178,7 @@ def test_animals_of_one_life_perceive_each_other_and_keep_clear(sampler):
     assert animals.plans_drawn > 4
 
 
-def test_companions_from_outside_of_the_batch_are_perceived_and_kept_clear_of(sampler):
+def test_external_companions_are_perceived_and_avoided(sampler):
     volume = room()
     scenes = Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int))
     sampling = PlanSamplingConfig(goal_steps=4, sequence_steps=2)

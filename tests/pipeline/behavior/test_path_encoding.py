@@ -13,7 +13,7 @@ from pipeline.behavior.path_encoding import (
 
 
 def stroll(seed=0, count=20):
-    """Paths that walk for a while at 0.1 to 2 m/s, in curves, and rest before and after."""
+    """Curved paths at 0.1 to 2 m/s with rests before and after."""
     rng = np.random.default_rng(seed)
     turn = rng.normal(0, 0.2, (count, 56)).cumsum(1)
     pace = rng.uniform(0.1, 2.0, (count, 1)) * ((np.arange(56) > 10) & (np.arange(56) < 40))
@@ -26,14 +26,14 @@ def strides_of(path, start):
     return velocity_channels_from_path(torch.from_numpy(path), torch.from_numpy(start)).numpy()
 
 
-def test_paths_survive_their_strides_and_rest_is_told():
+def test_stride_encoding_is_inverted_and_marks_rest():
     path, start = stroll()
     strides = strides_of(path, start)
     np.testing.assert_allclose(path_from_velocity_channels(strides, start), path, atol=1e-6)
     assert (strides[:, 11:40, 3] == 1).all() and (strides[:, :11, 3] == -1).all()
 
 
-def test_what_sampling_leaves_of_noise_does_not_move_an_animal_that_stays():
+def test_residual_noise_does_not_move_a_resting_animal():
     path, start = stroll()
     noisy = strides_of(path, start) + 0.05 * np.random.default_rng(1).standard_normal((20, 56, 4))
     speed = np.linalg.norm(np.diff(path_from_velocity_channels(noisy, start), axis=1), axis=-1) * 10
@@ -42,7 +42,7 @@ def test_what_sampling_leaves_of_noise_does_not_move_an_animal_that_stays():
     assert np.median(np.linalg.norm(np.diff(places, axis=1), axis=-1) * 10) > 1
 
 
-def test_a_path_is_led_to_its_goal_and_rests_where_it_rested():
+def test_warped_path_reaches_its_goal_and_keeps_rests():
     path, start = stroll()
     goal = path[:, -1] + np.random.default_rng(2).normal(0, 0.05, (20, 3))
     there = snapped_to_goal(path, start, goal, 1.0)
@@ -59,7 +59,7 @@ def test_a_path_is_led_to_its_goal_and_rests_where_it_rested():
     ).all()
 
 
-def test_strides_bend_along_a_path_that_was_moved():
+def test_strides_follow_a_warped_path():
     path, start = stroll()
     strides, moved = strides_of(path, start), path + np.linspace(0, 0.2, 56)[:, None]
     np.testing.assert_allclose(
@@ -68,7 +68,7 @@ def test_strides_bend_along_a_path_that_was_moved():
 
 
 @pytest.mark.parametrize("power", [0.5, GOAL_LENGTH_POWER])
-def test_powers_of_ways_are_undone(power):
+def test_velocity_power_is_inverted(power):
     way = np.random.default_rng(0).standard_normal((50, 3))
     np.testing.assert_allclose(
         with_powered_length(with_powered_length(way, power), 1 / power), way, atol=1e-9

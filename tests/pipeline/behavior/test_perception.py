@@ -18,19 +18,19 @@ def heading(yaw: float, pitch: float = 0.0) -> np.ndarray:
     return rigid.make(turn, np.array([1.0, 0.2, -0.5]))
 
 
-def test_ego_frame_keeps_the_heading_and_stands_upright():
+def test_ego_frame_has_the_heading_and_is_upright():
     frame = world_from_ego(heading(0.7, pitch=-0.5), "yaw")
     np.testing.assert_allclose(frame[:3, 1], [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(frame, heading(0.7), atol=1e-9)
     np.testing.assert_allclose(world_from_ego(heading(0.7, -0.5), "full"), heading(0.7, -0.5))
 
 
-def test_heading_survives_a_head_that_points_straight_up_or_down():
+def test_heading_is_defined_for_vertical_roots():
     for pitch in (-np.pi / 2, np.pi / 2):
         np.testing.assert_allclose(world_from_ego(heading(0.7, pitch), "yaw"), heading(0.7), atol=1e-6)
 
 
-def test_grid_reads_the_voxel_at_its_place():
+def test_grid_reads_the_voxel_at_each_point():
     features = np.zeros((2, 20, 20, 20), np.float16)
     features[1, 12, 3, 15] = 0.5
     volume = FeatureVolume(features, np.zeros((20, 20, 20), np.uint8), np.zeros(3), 0.1)
@@ -40,7 +40,7 @@ def test_grid_reads_the_voxel_at_its_place():
     assert grid[0, 1].max() == 0.5
 
 
-def test_turning_and_moving_the_world_changes_no_observation():
+def test_observations_are_invariant_to_the_world_frame():
     data, volume = wandering(), room()
     context, _ = data.windows(np.array([3, 50]))
     quarter = rigid.make(rigid.rotation_from_vector(np.array([0, np.pi / 2, 0])), np.zeros(3))
@@ -56,16 +56,14 @@ def test_turning_and_moving_the_world_changes_no_observation():
     before, after = observe(context, volume, REST, "yaw"), observe(turned, turned_volume, REST, "yaw")
     np.testing.assert_allclose(after.others, before.others, atol=1e-5)
     np.testing.assert_allclose(after.past, before.past, atol=1e-5)
-    assert (
-        after.scene_grid == before.scene_grid
-    ).mean() > 0.999  # points on the border of two voxels may fall either way
+    assert (after.scene_grid == before.scene_grid).mean() > 0.999  # points on voxel borders are ambiguous
 
 
 def person(track: torch.Tensor, kind: float = 0.0) -> torch.Tensor:
     return torch.nn.functional.pad(track, (0, 7), value=kind)[None, None]
 
 
-def test_far_observer_equals_none_and_a_near_one_does_not():
+def test_distant_observer_equals_none_and_a_near_one_does_not():
     nets = BehaviorNets(ARCHITECTURE).eval()
     encode = next(iter(nets.perception)).others
     track = torch.linspace(1, 0, 8)[:, None] * torch.tensor([[0.5, 0.0, 0.5]]) + torch.tensor(
@@ -78,7 +76,7 @@ def test_far_observer_equals_none_and_a_near_one_does_not():
     assert (encode(near, torch.ones(1)) - none).abs().max() > 1e-3
 
 
-def test_where_an_observer_looks_counts_only_where_poses_are_read():
+def test_observer_rotation_matters_only_with_pose_observers():
     context, _ = wandering().windows(np.array([3]))
     known = replace(context, observer_world=context.world_from_agent[..., :3, 3] + [0.8, 1.0, 0.3])
     unknown = replace(known, observer_rotation=None)
@@ -98,7 +96,7 @@ def test_where_an_observer_looks_counts_only_where_poses_are_read():
     assert (codes["poses"][0] - codes["poses"][1]).abs().max() > 1e-3
 
 
-def test_an_observer_of_unknown_rotation_looks_at_the_agent():
+def test_observer_without_rotation_faces_the_agent():
     context, _ = wandering().windows(np.array([3, 50]))
     unknown = replace(context, observer_rotation=None)
     pose, agent = unknown.world_from_observer, context.world_from_agent[..., :3, 3]
@@ -108,9 +106,9 @@ def test_an_observer_of_unknown_rotation_looks_at_the_agent():
     assert (pose[..., 1, 1] < 0).all(), "the camera's y axis points down"
 
 
-def alike(code: torch.Tensor) -> list[bool]:
-    """Tell of scene, observer and past whether two agents' codes are alike; pace and posture must be so where
-    the past is.
+def equal_codes(code: torch.Tensor) -> list[bool]:
+    """Return whether the codes of two agents agree in scene, observer and past; speed and posture agree where
+    the past does.
     """
     now = VELOCITY_CHANNELS + ARCHITECTURE.body_channels
     maps = ARCHITECTURE.condition_length - ARCHITECTURE.code_length
@@ -122,7 +120,7 @@ def alike(code: torch.Tensor) -> list[bool]:
     return same
 
 
-def test_a_blind_model_never_sees_its_condition():
+def test_ablated_input_does_not_reach_the_code():
     inputs = [
         torch.randn(2, 16, 64, 8, 64),
         torch.rand(2, 1, 8, 10),
@@ -131,7 +129,7 @@ def test_a_blind_model_never_sees_its_condition():
     ]
     for number, blind in enumerate(("scene", "observer", "past")):
         whole = BehaviorNets(replace(ARCHITECTURE, ablated_input=blind)).perception(*inputs)
-        assert alike(whole) == [k == number for k in range(3)]
+        assert equal_codes(whole) == [k == number for k in range(3)]
 
 
 def test_dropped_conditions_do_not_reach_the_code():
@@ -142,4 +140,4 @@ def test_dropped_conditions_do_not_reach_the_code():
     for number in range(3):
         keep = torch.zeros(2, 3)
         keep[:, number] = 1
-        assert alike(nets.perception(*inputs, keep)) == [k != number for k in range(3)]
+        assert equal_codes(nets.perception(*inputs, keep)) == [k != number for k in range(3)]

@@ -8,7 +8,7 @@ from pipeline.geometry import rigid
 from tests.pipeline.behavior.wandering import room
 
 
-def test_points_are_cleared_by_the_shortest_way_and_free_ones_stay():
+def test_points_are_projected_to_the_nearest_free_space():
     scenes, rng = Scenes.of(room()), np.random.default_rng(0)
     points = rng.uniform([-3, -0.5, -3], [3, 1.5, 3], (2, 400, 3))
     moved, solid = scenes.out_of_solid(points, None), scenes.inside_solid(points, None)
@@ -22,7 +22,7 @@ def test_points_are_cleared_by_the_shortest_way_and_free_ones_stay():
     ].all()  # the edges of two voxels
 
 
-def test_ground_clears_in_every_agents_own_frame():
+def test_free_space_projection_uses_the_frame_of_each_agent():
     world_from_ego = rigid.make(
         rigid.rotation_from_vector(np.array([[0, 0.5, 0], [0, -2.0, 0]])),
         np.array([[1, 0.3, 0], [-1, 0.3, 1]]),
@@ -35,7 +35,7 @@ def test_ground_clears_in_every_agents_own_frame():
     np.testing.assert_allclose(out_of_solid[:, :5], away[:, :5], atol=1e-9)
 
 
-def test_goals_rest_and_paths_tread_on_what_carries_in_every_agents_own_frame():
+def test_goals_and_paths_are_placed_on_support_in_the_frame_of_each_agent():
     scene, range_m = room(), np.array([[0.15, 0.2], [0.18, 0.2]])
     marks = mark_supported(scene.occupancy != 1, scene.occupancy)
     scenes = replace(Scenes.of(scene), supports=(Support.of(scene, marks, range_m),))
@@ -54,10 +54,10 @@ def test_goals_rest_and_paths_tread_on_what_carries_in_every_agents_own_frame():
     on_support = rigid.apply(plans, ground.on_support(path, start))
     assert (on_support[:, :, 1] >= 0.15 - 1e-9).all() and (
         on_support[:, 5:, 1] <= 0.2 + 1e-9
-    ).all()  # it begins in the air
+    ).all()  # starts in the air
 
 
-def test_goals_in_walls_are_turned_to_free_places_as_far_away():
+def test_goals_in_walls_are_rotated_to_free_space_at_the_same_distance():
     scenes = Scenes.of(room())  # 4 m by 4 m about the origin
     start = np.tile([1.5, 0.3, 0.0], (2, 1))
     goals = start + np.array([[1.0, 0.0, 0.1], [9.0, 0.0, 0.0]])
@@ -67,4 +67,4 @@ def test_goals_in_walls_are_turned_to_free_places_as_far_away():
     assert wall[2] > 0.1, "to the side that is nearer"
     np.testing.assert_allclose(
         outside, [2.0, 0.3, 0.0], atol=0.01
-    )  # nowhere is as far away: the nearest place
+    )  # no free space at that distance: the nearest is used

@@ -1,6 +1,4 @@
-"""Roots stand on what carries them: nearest top, within the range that recordings know, with jumps between
-tops.
-"""
+"""Support of roots: the nearest surface within the recorded height range, with jumps between surfaces."""
 
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ RANGE_M = np.array([[0.15, 0.25], [0.2, 0.25]])
 
 
 def volume() -> FeatureVolume:
-    """A floor whose top is at 0, and on half of it a table: a board from 0.4 to 0.5."""
+    """A floor at height 0 and, on half of it, a table top from 0.4 to 0.5."""
     occupancy = np.zeros((20, 15, 20), np.uint8)
     occupancy[:, :2] = 1
     occupancy[10:, 6] = 1
@@ -28,7 +26,7 @@ def support() -> Support:
     return Support.of(scene, mark_supported(scene.occupancy == 0, scene.occupancy), RANGE_M)
 
 
-def test_marks_lie_right_above_what_is_solid():
+def test_support_lies_directly_above_solid_voxels():
     scene = volume()
     marks = mark_supported(scene.occupancy == 0, scene.occupancy)
     assert (marks[:, 2] == 2).all() and (marks[10:, 7] == 2).all()
@@ -36,7 +34,7 @@ def test_marks_lie_right_above_what_is_solid():
     assert (marks[scene.occupancy == 1] == 0).all()
 
 
-def test_roots_go_to_the_nearest_top(support):
+def test_roots_move_to_the_nearest_surface(support):
     points = np.array(
         [
             [0.5, 0.4, 1.0],
@@ -54,7 +52,7 @@ def test_roots_go_to_the_nearest_top(support):
     )
 
 
-def test_nothing_is_known_beyond_the_scene_and_where_nothing_carries(support):
+def test_support_is_unknown_outside_the_scene_and_without_surface(support):
     beyond = np.array([[-1.0, 0.7, 0.5], [5.0, 0.7, 0.5]])
     np.testing.assert_allclose(support.heights(beyond, np.zeros(2, bool)), 0.7)
     scene = volume()
@@ -63,7 +61,7 @@ def test_nothing_is_known_beyond_the_scene_and_where_nothing_carries(support):
     assert Support.of(scene, marks, np.full((2, 2), np.nan)) is None
 
 
-def test_ranges_are_those_of_recordings():
+def test_height_range_is_that_of_recordings():
     rng = np.random.default_rng(0)
     points = rng.uniform([0.1, 0.15, 0.1], [0.9, 0.25, 1.9], (4000, 3))
     moves = rng.random(4000) < 0.5
@@ -76,7 +74,7 @@ def test_ranges_are_those_of_recordings():
     assert np.isnan(height_ranges([])).all()
 
 
-def test_steps_become_jumps_that_never_cut_an_edge():
+def test_height_steps_become_jumps_that_clear_edges():
     height = np.r_[np.full(10, 0.7), np.full(10, 0.2)]
     jump = smoothed_jumps(height, np.array(0.7))
     assert (jump >= height).all()

@@ -1,4 +1,4 @@
-"""What is for the test stays for the test, whatever the horizon."""
+"""The split into training and test is the same for all horizons."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ def test_recordings_without_windows_have_none_at_any_horizon():
     assert len(shorter.start) > len(data.start)
 
 
-def test_recordings_keep_their_part_at_any_horizon():
+def test_split_is_independent_of_the_horizon():
     data = wandering()
     shorter = data.with_horizon(FUTURE // 2)
     assert np.array_equal(shorter.split == TEST, shorter.video == 2)

@@ -1,4 +1,4 @@
-"""A model without a scene encoder: no map, no grid, and what it refuses."""
+"""Models without a scene encoder: no map, no grid, no export."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from stages.train_behavior.refusals import check_settings
 from tests.pipeline.behavior.wandering import wandering
 
 
-def test_nothing_of_a_scene_is_perceived():
+def test_scene_is_not_perceived():
     architecture = Architecture(bones=1, scene="none", scene_channels=0, ensemble_size=2)
     nets = BehaviorNets(architecture)
     assert architecture.map_cells == 0 and nets.goal.map is None
@@ -27,7 +27,7 @@ def test_nothing_of_a_scene_is_perceived():
     torch.testing.assert_close(code, kept)
 
 
-def test_scenes_without_features_keep_what_is_solid():
+def test_scenes_without_features_keep_occupancy():
     occupancy = np.zeros((4, 4, 4), np.uint8)
     occupancy[1] = 1
     scenes = Scenes.of(FeatureVolume(np.ones((5, 4, 4, 4), np.float16), occupancy, np.zeros(3), 0.1))
@@ -38,7 +38,7 @@ def test_scenes_without_features_keep_what_is_solid():
     assert less.inside_solid(points, None) == scenes.inside_solid(points, None)
 
 
-def test_it_cannot_be_exported():
+def test_export_is_refused():
     data: BehaviorData = wandering()
     architecture = Architecture(bones=1, scene="none", scene_channels=0)
     with pytest.raises(InputError, match="without a scene encoder"):

@@ -1,12 +1,15 @@
-"""A small truth for behaviour tests: an animal that wanders in a walled room with an observer who walks
-about.
-"""
+"""Synthetic data for behavior tests: an animal that wanders in a walled room with a walking observer."""
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from pipeline.behavior.model import Architecture
+from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
+from pipeline.behavior.diffusion import Schedule
+from pipeline.behavior.model import Architecture, BehaviorNets, Scaling
 from pipeline.behavior.perception import FeatureVolume
+from pipeline.behavior.planning import Sampler, TorchNetworks
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.simulator import Simulator
 from pipeline.behavior.trajectories import FUTURE, PAST, RATE_HZ, BehaviorData, Trajectory
 from pipeline.geometry import rigid
 
@@ -29,7 +32,7 @@ ARCHITECTURE = Architecture(
 
 
 def room() -> FeatureVolume:
-    """A floor and four walls of 4 x 4 m around the origin, each with its own feature."""
+    """A room of 4 x 4 m around the origin: floor and four walls, each with its own feature."""
     shape = (44, 12, 44)
     occupancy = np.zeros(shape, np.uint8)
     features = np.zeros((16, *shape), np.float16)
@@ -42,7 +45,7 @@ def room() -> FeatureVolume:
 
 
 def wander(rng: np.random.Generator, seconds: float = 12.0) -> Trajectory:
-    """One recording: smooth random motion inside the room, swaying bones."""
+    """One recording: smooth random motion inside the room and periodic bone motion."""
     count = round(seconds * RATE_HZ)
     course = gaussian_filter1d(rng.standard_normal((count, 2)), 12, axis=0, mode="wrap")
     course *= 1.4 / np.abs(course).max()
@@ -67,7 +70,7 @@ def wander(rng: np.random.Generator, seconds: float = 12.0) -> Trajectory:
 
 
 def wandering(seed: int = 0, videos: int = 3) -> BehaviorData:
-    """Several recordings, the last for testing, with all their windows."""
+    """Several recordings with all their windows; the last is the test recording."""
     rng = np.random.default_rng(seed)
     trajectories = {f"v{number:03d}": wander(rng) for number in range(videos)}
     per_video = len(trajectories["v000"].timestamp_s) - PAST - FUTURE + 1
@@ -75,3 +78,29 @@ def wandering(seed: int = 0, videos: int = 3) -> BehaviorData:
     start = np.tile(np.arange(per_video), videos).astype(np.int32)
     split = (video == videos - 1).astype(np.uint8)
     return BehaviorData(trajectories, REST.astype(np.float32), video, start, split, tuple(trajectories))
+
+
+def scaling() -> Scaling:
+    """Return a plausible normalization of goals, paths and bodies."""
+    channels = ARCHITECTURE.body_channels
+    mean = np.concatenate([[1.0, 0, 0, 0, 1, 0], np.zeros(channels - 6)])
+    return Scaling(
+        np.array([0.3, 0.01, 0.3]),
+        np.array([[0.5, 0.1, 0.5, 1.0]]),
+        np.linspace(0.01, 0.3, 56) * np.ones((3, 1)) * [[1], [0.02], [1]],
+        mean,
+        np.full(channels, 0.05),
+    )
+
+
+def untrained_simulator(goal_steps: int, candidates: int) -> Simulator:
+    """Return a simulator of untrained networks in `room`."""
+    volume = room()
+    return Simulator(
+        Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling()),
+        wandering(),
+        Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int)),
+        "yaw",
+        sampling=PlanSamplingConfig(goal_steps=goal_steps, sequence_steps=2),
+        chaining=ReplanningConfig(candidates=candidates),
+    )

@@ -1,4 +1,4 @@
-"""Configuration is strict, and says what it knows."""
+"""Strict parsing of configuration, with errors that name the known keys."""
 
 import functools
 from dataclasses import dataclass, field
@@ -10,8 +10,8 @@ from pipeline.core import config
 from pipeline.core.errors import InputError
 
 HUGE = int("9" * 400)
-DEEP = functools.reduce(lambda inner, _: {"a": inner}, range(5000), {})
-"""What TOML makes of a key of 5,000 parts."""
+DEEPLY_NESTED = functools.reduce(lambda inner, _: {"a": inner}, range(5000), {})
+"""The table of a TOML key with 5,000 parts."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Outer:
     side_px: int = 640
 
 
-def test_a_table_becomes_a_dataclass():
+def test_table_is_converted_to_a_dataclass():
     made = config.from_table(
         Outer, {"steps": 5, "sizes": [3], "inner": {"width_m": 2}, "name": "x"}, where="recipe"
     )
@@ -57,24 +57,24 @@ def test_a_table_becomes_a_dataclass():
         ({"inner": {"width_m": HUGE}}, "REC-002"),
         ({"sizes": [HUGE]}, "REC-002"),
         ({"name": HUGE}, "REC-002"),
-        ({"name": DEEP}, "REC-002"),
-        ({"seed": DEEP}, "REC-002"),
-        ({"inner": DEEP}, "REC-001"),
+        ({"name": DEEPLY_NESTED}, "REC-002"),
+        ({"seed": DEEPLY_NESTED}, "REC-002"),
+        ({"inner": DEEPLY_NESTED}, "REC-001"),
     ],
 )
-def test_what_does_not_fit_is_refused(table, code):
+def test_wrong_values_are_refused(table, code):
     with pytest.raises(InputError) as caught:
         config.from_table(Outer, table, where="recipe")
     assert caught.value.code == code
     assert len(str(caught.value)) < 500
 
 
-def test_a_file_that_an_editor_began_with_a_mark_is_read(tmp_path):
+def test_file_with_byte_order_mark_is_read(tmp_path):
     (tmp_path / "luna.toml").write_text("steps = 5\n", "utf-8-sig")
     assert config.read_table(tmp_path / "luna.toml") == {"steps": 5}
 
 
-def test_an_unknown_key_is_answered_with_the_known_ones():
+def test_error_of_an_unknown_key_lists_the_known_ones():
     with pytest.raises(InputError, match="steps"):
         config.from_table(Outer, {"step": 5}, where="recipe")
 
@@ -82,7 +82,7 @@ def test_an_unknown_key_is_answered_with_the_known_ones():
 @pytest.mark.parametrize(
     "text", ["[", "a = ", '"\x00', "seed = " + "[" * 5000 + "]" * 5000, "seed = " + "9" * 5000]
 )
-def test_a_broken_file_is_named(tmp_path, text):
+def test_invalid_file_is_named(tmp_path, text):
     path = tmp_path / "recipe.toml"
     path.write_text(text)
     with pytest.raises(InputError, match="REC-003.*recipe.toml"):

@@ -1,4 +1,4 @@
-"""Work in several processes, and how it ends."""
+"""Work in several processes, and its interruption."""
 
 import os
 import signal
@@ -14,7 +14,7 @@ import signal
 import time
 from pipeline.core import processes
 
-# As in a terminal: what a script leaves in the background ignores it.
+# Restore the default of a terminal: background processes of a shell script ignore SIGINT.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 try:
     for _ in processes.unordered(time.sleep, [(0,), (60,), (60,)], 2):
@@ -24,16 +24,16 @@ except KeyboardInterrupt:
 """
 
 
-def test_every_job_is_done_once():
+def test_every_job_runs_once():
     assert sorted(processes.unordered(pow, [(2, 3), (3, 2), (5, 1)], workers=2)) == [(0, 8), (1, 9), (2, 5)]
 
 
-def test_an_interrupt_ends_all_and_only_the_caller_tells():
+def test_interrupt_ends_all_processes_with_one_message():
     command = [sys.executable, "-c", PROGRAM]
     running = subprocess.Popen(
         command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
     assert running.stdout.readline() == "begun\n"
     os.killpg(running.pid, signal.SIGINT)
-    told, errors = running.communicate(timeout=30)
-    assert (told, errors, running.returncode) == ("stopped\n", "", 0)
+    output, errors = running.communicate(timeout=30)
+    assert (output, errors, running.returncode) == ("stopped\n", "", 0)

@@ -1,4 +1,4 @@
-"""Work in threads comes back in order, is not begun too early, and its errors are not lost."""
+"""Results of threads arrive in order, with bounded look-ahead, and errors are raised."""
 
 import threading
 import time
@@ -9,7 +9,7 @@ import torch
 from pipeline.core.threads import ordered
 
 
-def test_results_come_in_order_and_few_wait():
+def test_results_are_ordered_and_buffering_is_bounded():
     lock, busy, most = threading.Lock(), 0, 0
 
     def slow(number: int) -> int:
@@ -25,27 +25,27 @@ def test_results_come_in_order_and_few_wait():
     assert 1 < most <= 3
 
 
-def test_items_are_asked_for_only_as_results_are_taken():
+def test_items_are_consumed_lazily():
     asked = []
     found = ordered(lambda number: number, (asked.append(number) or number for number in range(10)), 2)
     next(found)
     assert len(asked) <= 3
 
 
-def test_errors_are_raised_and_what_waits_is_dropped():
+def test_errors_are_raised_and_pending_items_dropped():
     done = []
 
-    def picky(number: int) -> None:
+    def failing(number: int) -> None:
         if number == 1:
             raise SystemExit(75)
         done.append(number)
 
     with pytest.raises(SystemExit, match="75"):
-        list(ordered(picky, range(100), 2))
+        list(ordered(failing, range(100), 2))
     assert len(done) < 5
 
 
-def test_each_works_with_one_thread_and_ours_are_as_before():
+def test_workers_use_one_thread_and_settings_are_restored():
     before = torch.get_num_threads()
     assert set(ordered(lambda _: torch.get_num_threads(), range(4), 2)) == {1}
     assert torch.get_num_threads() == before

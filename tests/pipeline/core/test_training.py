@@ -1,6 +1,4 @@
-"""The training loop: resumes with the same bits, skips and rolls back broken steps, gives up with a
-diagnosis.
-"""
+"""The training loop resumes bit-exactly, skips and rolls back non-finite steps, and stops with a diagnosis."""
 
 import math
 import subprocess
@@ -42,10 +40,10 @@ def run(resume, *, loss_of=lambda loss: loss, steps=60, **options):
     return record, torch.cat([p.detach().flatten() for p in net.parameters()])
 
 
-def test_an_interrupted_run_ends_with_the_same_bits(tmp_path):
+def test_resumed_run_is_bit_identical(tmp_path):
     record, whole = run(tmp_path / "whole")
 
-    def dying(loss):
+    def interrupted(loss):
         def inner(step, generator):
             if step == 31:
                 raise KeyboardInterrupt
@@ -54,14 +52,14 @@ def test_an_interrupted_run_ends_with_the_same_bits(tmp_path):
         return inner
 
     with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "cut", loss_of=dying)
+        run(tmp_path / "cut", loss_of=interrupted)
     resumed_record, resumed = run(tmp_path / "cut")
     assert torch.equal(whole, resumed)
     assert (record.total() == resumed_record.total()).all()
     assert record.total()[-10:].mean() < record.total()[:10].mean()
 
 
-def test_a_damaged_checkpoint_falls_back_to_the_one_before(tmp_path):
+def test_damaged_checkpoint_falls_back_to_the_previous_one(tmp_path):
     _, whole = run(tmp_path)
     newest = max(tmp_path.glob("step*.pt"))
     newest.write_bytes(newest.read_bytes()[:100])
@@ -69,7 +67,7 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(tmp_path):
     assert torch.equal(whole, again)
 
 
-def broken_at(steps_broken):
+def nonfinite_at(steps_broken):
     def wrap(loss):
         return lambda step, generator: {
             "fit": loss(step, generator)["fit"] * (math.nan if step in steps_broken() else 1.0)
@@ -78,13 +76,13 @@ def broken_at(steps_broken):
     return wrap
 
 
-def test_one_broken_step_is_skipped_and_recorded():
-    record, weights = run(None, loss_of=broken_at(lambda: {5}))
+def test_one_nonfinite_step_is_skipped_and_recorded():
+    record, weights = run(None, loss_of=nonfinite_at(lambda: {5}))
     assert math.isnan(record.total()[5]) and record.rolled_back == 0
     assert torch.isfinite(weights).all()
 
 
-def test_three_broken_steps_fall_back_once_then_go_on(tmp_path):
+def test_three_nonfinite_steps_roll_back_once(tmp_path):
     calls = {"left": 3}
 
     def wrap(loss):
@@ -99,9 +97,9 @@ def test_three_broken_steps_fall_back_once_then_go_on(tmp_path):
     assert record.rolled_back == 1 and torch.isfinite(weights).all() and len(record.total()) == 60
 
 
-def test_a_loss_that_stays_broken_ends_with_a_diagnosis(tmp_path):
+def test_persistently_nonfinite_loss_stops_with_a_diagnosis(tmp_path):
     with pytest.raises(SystemExit) as end:
-        run(tmp_path, loss_of=broken_at(lambda: range(20, 1000)))
+        run(tmp_path, loss_of=nonfinite_at(lambda: range(20, 1000)))
     assert end.value.code == fitting.EXIT_DIVERGED
     assert "terms" in (tmp_path / "diagnosis.json").read_text()
 
@@ -133,8 +131,8 @@ except InputError as error:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("what", ["checkpoint", "tensors"])
-def test_a_full_disk_is_told_and_leaves_no_half_checkpoint(tmp_path, what):
-    """A file may have 1 MB here, which is what a full disk is to its writer."""
+def test_full_disk_is_reported_and_leaves_no_partial_checkpoint(tmp_path, what):
+    """A file size limit of 1 MB fails like a full disk."""
     command = [sys.executable, "-c", FULL, str(tmp_path), what]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert ended.returncode == 2, ended.stderr

@@ -1,4 +1,4 @@
-"""File formats: what is written comes back, equal data gives equal bytes, damage is refused with a code."""
+"""File formats: round trips, deterministic bytes, and refusal of damaged files."""
 
 import struct
 
@@ -10,7 +10,7 @@ from pipeline.data import images, npz, ply
 from pipeline.geometry.meshes import Mesh
 
 
-def test_rows_give_the_file_that_save_gives(tmp_path):
+def test_row_writer_gives_the_same_file_as_save(tmp_path):
     rng = np.random.default_rng(0)
     flow, flags = (
         rng.normal(size=(5, 4, 3, 2)).astype(np.float16),
@@ -29,7 +29,7 @@ def test_rows_give_the_file_that_save_gives(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["none.npz", "rows.npz", "whole.npz"]
 
 
-def test_depth_survives_as_half_metres(tmp_path):
+def test_depth_is_stored_as_half_floats_in_metres(tmp_path):
     depth = np.random.default_rng(0).uniform(0.2, 5, (64, 48)).astype(np.float32)
     depth[:5] = 0
     images.write_depth(tmp_path / "a.exr", depth)
@@ -40,12 +40,12 @@ def test_depth_survives_as_half_metres(tmp_path):
     assert first == (tmp_path / "a.exr").read_bytes()
 
 
-def test_depth_that_is_not_a_distance_is_unknown(tmp_path):
+def test_invalid_depth_is_unknown(tmp_path):
     images.write_depth(tmp_path / "a.exr", np.array([[np.nan, np.inf, -1, 2]], np.float32))
     assert images.read_depth(tmp_path / "a.exr").tolist() == [[0, 0, 0, 2]]
 
 
-def test_an_exr_that_asks_for_gigabytes_is_refused_before_decoding(tmp_path):
+def test_huge_exr_is_refused_before_decoding(tmp_path):
     images.write_depth(tmp_path / "a.exr", np.ones((4, 4), np.float32))
     data = bytearray((tmp_path / "a.exr").read_bytes())
     at = data.find(b"dataWindow\0box2i\0") + 21
@@ -55,7 +55,7 @@ def test_an_exr_that_asks_for_gigabytes_is_refused_before_decoding(tmp_path):
         images.read_depth(tmp_path / "a.exr")
 
 
-def test_lossless_pictures_come_back(tmp_path):
+def test_lossless_pictures_round_trip(tmp_path):
     color = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
     images.write_color(tmp_path / "a.png", color)
     assert np.array_equal(images.read_color(tmp_path / "a.png"), color)
@@ -65,7 +65,7 @@ def test_lossless_pictures_come_back(tmp_path):
         images.decode_color(b"not a picture", "somewhere")
 
 
-def test_arrays_come_back_with_equal_bytes_for_equal_data(tmp_path):
+def test_arrays_round_trip_with_deterministic_bytes(tmp_path):
     data = {
         "v002/pose": np.random.default_rng(0).normal(size=(5, 4, 4)),
         "flag": np.array(True),
@@ -79,7 +79,7 @@ def test_arrays_come_back_with_equal_bytes_for_equal_data(tmp_path):
     assert np.array_equal(npz.open_lazily(tmp_path / "a.npz", "v002/pose"), data["v002/pose"])
 
 
-def test_arrays_refuse_pickles_damage_and_missing_names(tmp_path):
+def test_pickles_damage_and_missing_arrays_are_refused(tmp_path):
     np.savez(tmp_path / "pickle.npz", bad=np.array([{}], dtype=object))
     npz.save(tmp_path / "good.npz", a=np.arange(5))
     (tmp_path / "cut.npz").write_bytes((tmp_path / "good.npz").read_bytes()[:40])
@@ -88,7 +88,7 @@ def test_arrays_refuse_pickles_damage_and_missing_names(tmp_path):
             npz.load(tmp_path / path, names)
 
 
-def test_meshes_come_back_and_damage_is_refused(tmp_path):
+def test_meshes_round_trip_and_damage_is_refused(tmp_path):
     rng = np.random.default_rng(0)
     mesh = Mesh(
         rng.normal(size=(10, 3)).astype(np.float32),
@@ -107,13 +107,13 @@ def test_meshes_come_back_and_damage_is_refused(tmp_path):
         ply.read_ply(tmp_path / "a.ply")
 
 
-def test_a_broken_mask_is_refused(tmp_path):
+def test_damaged_mask_is_refused(tmp_path):
     (tmp_path / "a.png").write_bytes(b"not a picture")
     with pytest.raises(InputError, match="CAP-021"):
         images.read_gray(tmp_path / "a.png")
 
 
-def test_srgb_and_linear_are_inverse_and_meet_at_the_knee():
+def test_srgb_and_linear_are_inverse_and_continuous():
     srgb = np.linspace(0, 1, 256)
     linear = images.linear_from_srgb(srgb)
     assert np.allclose(images.srgb_from_linear(linear), srgb, atol=1e-6)

@@ -1,4 +1,4 @@
-"""Animated glTF: what is written is read back by another library, and its skinning equals linear blending."""
+"""Animated glTF, read by another library: content round-trips and skinning equals linear blending."""
 
 import io
 
@@ -15,7 +15,7 @@ BONES = 3
 
 
 def skin_and_action() -> tuple[Mesh, glb.Skin, glb.Action]:
-    """A small cloth of random triangles on three bones that move at random."""
+    """Random triangles on three bones with random motion."""
     vertices = RNG.normal(size=(12, 3)).astype(np.float32)
     faces = RNG.permuted(np.tile(np.arange(12), (8, 1)), axis=1)[:, :3].astype(np.int32)
     mesh = Mesh(vertices, faces, RNG.integers(0, 255, (12, 3), dtype=np.uint8))
@@ -30,7 +30,7 @@ def skin_and_action() -> tuple[Mesh, glb.Skin, glb.Action]:
 
 
 def accessor(file: pygltflib.GLTF2, index: int) -> np.ndarray:
-    """Read an accessor's values."""
+    """Read the values of an accessor."""
     entry = file.accessors[index]
     view = file.bufferViews[entry.bufferView]
     width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}[entry.type]
@@ -40,7 +40,7 @@ def accessor(file: pygltflib.GLTF2, index: int) -> np.ndarray:
     )
 
 
-def test_joints_are_siblings_and_move_as_told() -> None:
+def test_joints_are_siblings_and_follow_the_action() -> None:
     mesh, skin, action = skin_and_action()
     file = pygltflib.GLTF2().load_from_bytes(glb.skinned(mesh, skin, [action]))
     root = file.nodes[file.scenes[0].nodes[0]]
@@ -65,7 +65,7 @@ def test_joints_are_siblings_and_move_as_told() -> None:
         )
 
 
-def test_still_surface_is_read_by_another_library() -> None:
+def test_static_mesh_is_read_by_another_library() -> None:
     mesh, _, _ = skin_and_action()
     scene = trimesh.load(io.BytesIO(glb.static(mesh, "room")), file_type="glb", process=False)
     (found,) = scene.geometry.values()
@@ -73,6 +73,6 @@ def test_still_surface_is_read_by_another_library() -> None:
     np.testing.assert_array_equal(found.faces, mesh.faces)
 
 
-def test_same_content_same_bytes() -> None:
+def test_bytes_are_deterministic() -> None:
     mesh, skin, action = skin_and_action()
     assert glb.skinned(mesh, skin, [action]) == glb.skinned(mesh, skin, [action])

@@ -1,4 +1,4 @@
-"""The plotting kit: what is drawn lies where it should."""
+"""Plotting helpers draw at the right positions."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from pipeline.data import plots
 
 
-def test_a_grid_keeps_every_picture_and_pads_the_smaller_ones():
+def test_grid_keeps_all_pictures_and_pads_smaller_ones():
     images = [
         np.full((4, 6, 3), 10, np.uint8),
         np.full((2, 3, 3), 20, np.uint8),
@@ -18,7 +18,7 @@ def test_a_grid_keeps_every_picture_and_pads_the_smaller_ones():
     assert (sheet[2:4, 6:] == plots.BACKGROUND).all() and (sheet[4:, 6:] == plots.BACKGROUND).all()
 
 
-def test_an_outline_surrounds_its_mask_and_leaves_the_picture_alone():
+def test_outline_surrounds_the_mask_without_modifying_the_picture():
     image, mask = np.zeros((9, 9, 3), np.uint8), np.zeros((9, 9), bool)
     mask[3:6, 3:6] = True
     drawn = plots.outlined(image, mask, (1, 2, 3))
@@ -27,14 +27,14 @@ def test_an_outline_surrounds_its_mask_and_leaves_the_picture_alone():
     assert not image.any()
 
 
-def test_depth_is_yellow_when_near_violet_when_far_and_black_when_unknown():
+def test_depth_colors_of_near_far_and_unknown():
     near, far, unknown = plots.depth_colors(np.array([[0.1, 3.9, 0.0]]))[0].astype(int)
     assert near[0] > 200 and near[2] < 100
     assert far[2] > far[1]
     assert not unknown.any()
 
 
-def test_a_running_mean_keeps_the_level_and_halves_noise():
+def test_running_mean_keeps_the_mean_and_reduces_noise():
     noise = np.random.default_rng(0).normal(5, 1, 1000)
     means = plots.running_mean(noise)
     assert len(means) == 1000 - 20 + 1
@@ -42,7 +42,7 @@ def test_a_running_mean_keeps_the_level_and_halves_noise():
     assert plots.running_mean(noise[:7]).tolist() == noise[:7].tolist()
 
 
-def test_a_floor_plan_puts_solid_columns_where_they_stand():
+def test_floor_plan_draws_solid_columns_at_their_position():
     figure, axes = plots.panels(1, 1, width_in=4, height_in=4)
     solid = np.zeros((10, 20))
     solid[9, 0] = 1  # the largest x, the smallest z
@@ -56,7 +56,7 @@ def test_a_floor_plan_puts_solid_columns_where_they_stand():
     assert column > 0.6 and row < 0.1, "right and up"
 
 
-def test_charts_have_the_size_that_was_asked_for_and_show_their_curves():
+def test_charts_have_the_requested_size_and_curves():
     losses = {
         "goal": {"ours": np.geomspace(1, 0.1, 200), "baseline": np.ones((2, 200))},
         "path": {"ours": np.ones(3)},

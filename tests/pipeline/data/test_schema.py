@@ -1,7 +1,4 @@
-"""Artifact files come back as they were written.
-
-Anything else is a coded error, whatever was done to the bytes.
-"""
+"""Artifact tables round-trip; any damage of their bytes gives an error with a code."""
 
 import contextlib
 import io
@@ -24,7 +21,7 @@ def poses(frames: int) -> np.ndarray:
     return np.repeat(np.eye(4)[None], frames, axis=0)
 
 
-def test_a_table_comes_back_in_the_dtypes_of_its_schema(tmp_path):
+def test_table_round_trips_in_the_dtypes_of_its_schema(tmp_path):
     SCHEMA.save(tmp_path / "table.npz", time_s=np.arange(3), place=np.ones((3, 3)), name=None)
     table = SCHEMA.load(tmp_path / "table.npz")
     assert {key: array.dtype.str for key, array in table.items()} == {"time_s": "<f8", "place": "<f4"}
@@ -43,7 +40,7 @@ def test_a_table_comes_back_in_the_dtypes_of_its_schema(tmp_path):
     ],
     ids=["missing", "lengths", "width", "axes", "kind"],
 )
-def test_another_table_is_refused(tmp_path, arrays):
+def test_table_of_another_schema_is_refused(tmp_path, arrays):
     npz.save(tmp_path / "table.npz", **arrays)
     with pytest.raises(InputError, match="ART-010"):
         SCHEMA.load(tmp_path / "table.npz")
@@ -98,7 +95,7 @@ def _encrypted() -> bytes:
     ],
     ids=["foreign", "56 GiB", "negative", "header", "empty", "encrypted", "lzma", "no archive"],
 )
-def test_a_damaged_archive_is_a_coded_error(tmp_path, data):
+def test_damaged_archive_gives_an_error_code(tmp_path, data):
     (tmp_path / "table.npz").write_bytes(data)
     for read in (
         SCHEMA.load,
@@ -109,7 +106,7 @@ def test_a_damaged_archive_is_a_coded_error(tmp_path, data):
             read(tmp_path / "table.npz")
 
 
-def test_flipped_bytes_give_the_arrays_or_a_coded_error(tmp_path):
+def test_flipped_bytes_give_the_arrays_or_an_error_code(tmp_path):
     path = tmp_path / "table.npz"
     SCHEMA.save(path, time_s=np.arange(50.0), place=np.ones((50, 3)), compress=True)
     whole, rng = path.read_bytes(), np.random.default_rng(0)

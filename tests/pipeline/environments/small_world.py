@@ -1,4 +1,4 @@
-"""An untrained animal in a room of 4 m, for tests of environments; imports no library of theirs."""
+"""An untrained animal in a room of 4 m, for tests of environments; imports no environment library."""
 
 import numpy as np
 
@@ -9,8 +9,7 @@ from pipeline.behavior.scenes import Scenes
 from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.homes import Habitat
 from pipeline.environments.world import AnimalWorld
-from tests.pipeline.behavior.wandering import ARCHITECTURE, room, wandering
-from tests.stages.simulate.test_simulator import scaling
+from tests.pipeline.behavior.wandering import ARCHITECTURE, room, scaling, wandering
 
 QUICK = EnvironmentConfig(goal_steps=2, sequence_steps=2, candidates=1, start_m=(0.8, 1.5))
 

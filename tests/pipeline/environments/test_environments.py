@@ -1,6 +1,4 @@
-"""Environments: the libraries' own checks pass, seeds decide, persons keep out of walls, many live as one
-does.
-"""
+"""Environments: checks of the libraries, seeding, collision of persons with walls, and batching."""
 
 import shutil
 import warnings
@@ -16,10 +14,9 @@ from pipeline.environments.floor import PersonFloor, to_local, to_world
 from pipeline.environments.rewards import REWARDS, StepOutcome
 from pipeline.environments.world import AnimalWorld
 from stages.train_behavior.export import write_contract
-from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, scaling, wandering
 from tests.pipeline.environments.small_world import QUICK, small_world
 from tests.pipeline.environments.test_other_home import write
-from tests.stages.simulate.test_simulator import scaling
 
 gymnasium = pytest.importorskip("gymnasium")
 pytest.importorskip("pettingzoo")
@@ -27,7 +24,7 @@ pytest.importorskip("pettingzoo")
 
 @pytest.fixture(scope="module")
 def build(tmp_path_factory):
-    """A build of an untrained model in a room of 4 m."""
+    """Build with an untrained model in a room of 4 m."""
     from pipeline.data import npz
 
     folder = tmp_path_factory.mktemp("build")
@@ -43,7 +40,7 @@ def build(tmp_path_factory):
 
 
 @pytest.mark.parametrize("embodiment", ["person", "robot"])
-def test_gymnasium_finds_nothing_to_warn_of(build, embodiment):
+def test_gymnasium_checker_passes(build, embodiment):
     from gymnasium.utils.env_checker import check_env
 
     import pipeline.environments.registration  # noqa: F401
@@ -55,7 +52,7 @@ def test_gymnasium_finds_nothing_to_warn_of(build, embodiment):
         check_env(env.unwrapped)
 
 
-def test_pettingzoo_finds_nothing_to_warn_of():
+def test_pettingzoo_checks_pass():
     from pettingzoo.test import parallel_api_test, parallel_seed_test
 
     from pipeline.environments.parallel_env import PersonAnimalEnv
@@ -68,11 +65,11 @@ def test_pettingzoo_finds_nothing_to_warn_of():
 
 
 def small_world_like(world):
-    """Return another world of the same networks."""
+    """Return another world with the same networks."""
     return AnimalWorld(world.animals.sampler, world.habitat, "yaw", world.config)
 
 
-def test_many_at_once_begin_again_and_seeds_decide(build):
+def test_vectorized_episodes_restart_and_are_seeded(build):
     import pipeline.environments.registration  # noqa: F401
 
     lives = []
@@ -90,7 +87,7 @@ def test_many_at_once_begin_again_and_seeds_decide(build):
     np.testing.assert_array_equal(*lives)
 
 
-def test_the_animal_lives_in_another_home(build, tmp_path):
+def test_animal_can_live_in_another_home(build, tmp_path):
     import pipeline.environments.registration  # noqa: F401
 
     own, other = write(tmp_path / "own"), write(tmp_path / "other")
@@ -107,7 +104,7 @@ def test_the_animal_lives_in_another_home(build, tmp_path):
 
 
 @pytest.mark.parametrize("action", [[np.nan, 0.0, 0.0], [0.0, np.inf, 0.0], [0.0, 0.0]])
-def test_a_policy_that_sends_no_numbers_is_refused(action):
+def test_nonfinite_actions_are_refused(action):
     from pipeline.environments.person_env import PersonEnv
 
     env = PersonEnv(small_world())
@@ -116,7 +113,7 @@ def test_a_policy_that_sends_no_numbers_is_refused(action):
         env.step(np.array(action, np.float32))
 
 
-def test_an_animal_is_not_steered_to_nowhere():
+def test_nonfinite_goals_are_refused():
     from pipeline.environments.parallel_env import PersonAnimalEnv
 
     env = PersonAnimalEnv(small_world())
@@ -125,7 +122,7 @@ def test_an_animal_is_not_steered_to_nowhere():
         env.step({"person": np.zeros(3), "animal": np.array([np.nan, 0.0])})
 
 
-def test_plans_are_followed_and_not_drawn_at_every_step():
+def test_plans_are_followed_for_several_steps():
     world = small_world()
     world.begin(3, np.random.default_rng(0))
     for _ in range(40):
@@ -133,7 +130,7 @@ def test_plans_are_followed_and_not_drawn_at_every_step():
     assert world.plans_per_step < 0.1
 
 
-def test_persons_keep_out_of_walls_and_walk_as_told():
+def test_persons_follow_actions_and_stay_out_of_walls():
     world = small_world()
     world.begin(2, np.random.default_rng(0))
     world.persons.position[:], world.persons.heading[:] = 0.0, [0.0, np.pi / 2]
@@ -145,8 +142,8 @@ def test_persons_keep_out_of_walls_and_walk_as_told():
     assert np.abs(world.persons.position).max(1).min() > 1.7
 
 
-def test_what_nobody_saw_is_no_floor_for_persons():
-    """Around the room's thin walls is the rest of the box that holds it."""
+def test_persons_stay_out_of_unobserved_space():
+    """The grid around the thin walls of the room is unobserved."""
     occupancy = np.full((44, 20, 44), 2, np.uint8)
     occupancy[10:34, :, 10:34] = 1
     occupancy[11:33, 2:, 11:33] = 0
@@ -164,14 +161,14 @@ def test_what_nobody_saw_is_no_floor_for_persons():
         assert (np.abs(world.persons.position) < 1.1).all()
 
 
-def test_frames_of_persons():
+def test_local_and_world_frames_are_inverse():
     np.testing.assert_allclose(to_world(np.array([0.0, 1.0]), np.array(np.pi / 2)), [1, 0], atol=1e-9)
     np.testing.assert_allclose(to_world(np.array([1.0, 0.0]), np.array(0.0)), [1, 0], atol=1e-9)
     point = np.array([0.3, -0.7])
     np.testing.assert_allclose(to_local(to_world(point, np.array(0.4)), np.array(0.4)), point)
 
 
-def test_a_commanded_animal_goes_there():
+def test_animal_goes_to_a_commanded_goal():
     world = small_world()
     world.begin(1, np.random.default_rng(0))
     goal = world.animal_position + np.array([[0.5, 0.0, 0.0]])
@@ -181,7 +178,7 @@ def test_a_commanded_animal_goes_there():
     np.testing.assert_allclose(world.animals.goal[0, [0, 2]], goal[0, [0, 2]], atol=1e-5)
 
 
-def test_rewards_name_what_they_reward():
+def test_rewards_have_their_documented_values():
     near = StepOutcome(
         np.array([1.0, 1.0]), np.array([0.6, 0.9]), np.array([0.0, 0.5]), np.array([False, True])
     )
@@ -190,6 +187,6 @@ def test_rewards_name_what_they_reward():
     assert REWARDS["calm"](near).tolist() == [0.0, -0.5]
 
 
-def test_a_folder_without_a_model_is_refused(tmp_path):
+def test_folder_without_model_is_refused(tmp_path):
     with pytest.raises(InputError, match="ART-003"):
         AnimalWorld.load(tmp_path, QUICK)

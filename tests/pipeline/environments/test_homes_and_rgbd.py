@@ -1,4 +1,4 @@
-"""Several homes in one world, and what a person's camera sees of them."""
+"""Several homes in one world, and rendered RGB-D observations of persons."""
 
 import shutil
 import warnings
@@ -19,9 +19,8 @@ from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
 from pipeline.longterm.bodies import SkinnedBody
 from stages.train_behavior.export import write_contract
-from tests.pipeline.behavior.wandering import ARCHITECTURE, BONES, REST, wandering
+from tests.pipeline.behavior.wandering import ARCHITECTURE, BONES, REST, scaling, wandering
 from tests.pipeline.environments.test_other_home import write
-from tests.stages.simulate.test_simulator import scaling
 
 gymnasium = pytest.importorskip("gymnasium")
 
@@ -30,7 +29,7 @@ RED, BLUE = (200, 30, 30), (30, 30, 200)
 
 
 def box(extents, color, place=(0.0, 0.0, 0.0), inward=False):
-    """A box of one colour, centred at a place."""
+    """A box of one colour with a given centre."""
     made = trimesh.creation.box(extents, rigid.make(np.eye(3), np.array(place)))
     faces = np.asarray(made.faces)[:, ::-1] if inward else np.asarray(made.faces)
     vertices = np.asarray(made.vertices, np.float32)
@@ -52,7 +51,7 @@ def write_surfaces(build):
 
 @pytest.fixture(scope="module")
 def builds(tmp_path_factory):
-    """Two homes, of which the first has an untrained model and surfaces, the second surfaces alone."""
+    """Two homes: the first with an untrained model and surfaces, the second with surfaces only."""
     folder = tmp_path_factory.mktemp("builds")
     own, other = write(folder / "own"), write(folder / "other")
     (own / "behavior").mkdir()
@@ -64,7 +63,7 @@ def builds(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_episodes_begin_in_every_home_and_animals_of_all_plan_together(builds):
+def test_episodes_start_in_every_home_and_plan_in_one_batch(builds):
     import pipeline.environments.registration  # noqa: F401
 
     own, other = builds
@@ -91,7 +90,7 @@ def test_episodes_begin_in_every_home_and_animals_of_all_plan_together(builds):
     np.testing.assert_array_equal(*lives)
 
 
-def test_joined_homes_keep_their_own_moments_and_volumes(builds):
+def test_joined_homes_keep_their_start_states_and_volumes(builds):
     own, other = builds
     data = wandering()
     alone = open_homes(own, data, [other])
@@ -109,7 +108,7 @@ def test_joined_homes_keep_their_own_moments_and_volumes(builds):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("observations", [("rgbd",), ("animal", "rgbd")])
-def test_gymnasium_accepts_pictures(builds, observations):
+def test_gymnasium_accepts_image_observations(builds, observations):
     from gymnasium.utils.env_checker import check_env
 
     import pipeline.environments.registration  # noqa: F401
@@ -128,8 +127,8 @@ def test_gymnasium_accepts_pictures(builds, observations):
     assert 0.3 < depth[animal].mean() < 2.5, "metres"
 
 
-def test_depth_is_measured_from_the_eyes():
-    """A wall 1.6 m ahead, and an animal before it that one bone has lowered."""
+def test_rendered_depth_is_relative_to_the_camera():
+    """A wall at 1.6 m, and in front of it an animal that is lowered by a bone."""
     body, wall = box((0.2, 0.2, 0.2), RED), box((20, 20, 1.0), BLUE, (0, 0, 2.1))
     weights = np.zeros((8, BONES))
     weights[:, 1] = 1
@@ -150,10 +149,12 @@ def test_depth_is_measured_from_the_eyes():
         ahead = np.array([ray[0], -ray[1] * np.cos(PITCH_RAD) - np.sin(PITCH_RAD)]) / (
             np.cos(PITCH_RAD) - ray[1] * np.sin(PITCH_RAD)
         )
-        np.testing.assert_allclose(ahead * 0.95, [0, height], atol=0.06)  # metres, at the body's near side
+        np.testing.assert_allclose(
+            ahead * 0.95, [0, height], atol=0.06
+        )  # metres, at the near side of the body
 
 
-def test_a_build_without_surfaces_cannot_be_seen(builds, tmp_path):
+def test_rendering_without_surfaces_is_refused(builds, tmp_path):
     shutil.copytree(builds[0], tmp_path / "blind", ignore=shutil.ignore_patterns("reconstruction"))
     world = AnimalWorld.load(tmp_path / "blind", QUICK)
     assert world.camera is None

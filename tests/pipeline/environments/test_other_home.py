@@ -1,4 +1,4 @@
-"""The animal of one build in another's home: features mean the same, moments fit in, what is strange is told."""
+"""The animal of one build in the home of another: conversion of features, start states, and diagnostics."""
 
 import json
 from dataclasses import replace
@@ -19,7 +19,7 @@ RAW = 40
 
 
 def descriptors(rng, samples=3000):
-    """Descriptors of 12 dimensions among 40, as those of any two homes have most of their dimensions in common."""
+    """Descriptors in a random 12-dimensional subspace of 40 dimensions, mostly shared between homes."""
     mixing = np.random.default_rng(5).standard_normal((12, RAW))
     raw = rng.standard_normal((samples, 12)) * np.linspace(3, 1, 12) @ mixing + 2
     return (raw / np.linalg.norm(raw, axis=1, keepdims=True)).astype(np.float32)
@@ -30,7 +30,7 @@ def basis(seed):
 
 
 def home(volume=None, known=None, origin=(0.0, 0.0, 0.0)):
-    """A room of 4 m with a floor at the height of 0, shifted to ``origin``."""
+    """A room of 4 m with a floor at height 0, shifted to ``origin``."""
     volume = volume or room()
     marks = mark_supported(volume.occupancy == 0, volume.occupancy)
     volume = replace(volume, origin=volume.origin + np.array(origin))
@@ -58,7 +58,7 @@ def write(build, scale="measured", **without):
     return build
 
 
-def test_features_mean_in_the_other_basis_what_they_meant():
+def test_features_are_converted_to_the_other_basis():
     written, read = basis(1), basis(2)
     raw = descriptors(np.random.default_rng(9), 500)
     there, here = written.project(raw), read.project(raw)
@@ -72,7 +72,7 @@ def test_features_mean_in_the_other_basis_what_they_meant():
     assert change_basis(cells, written, FeatureBasis(**vars(written))) is cells
 
 
-def test_moments_stand_on_the_other_floor_in_free_space():
+def test_start_states_are_on_the_other_floor_in_free_space():
     own, other = home(), home(origin=(10.0, 2.0, -7.0))
     data = wandering()
     moved = move_in(own, other, data)
@@ -96,7 +96,7 @@ def test_moments_stand_on_the_other_floor_in_free_space():
     )
 
 
-def test_what_was_never_seen_lowers_the_share_of_known_cells():
+def test_unseen_features_reduce_the_fraction_of_known_cells():
     own = home()
     assert share_known(own, own) == 1.0
     strange = room()
@@ -114,12 +114,12 @@ def test_what_was_never_seen_lowers_the_share_of_known_cells():
     [({"stands_m": None}, "ART-007"), ({"scale": "relative: from pictures"}, "SIM-011"),
      ({"allowed": np.zeros((44, 12, 44), np.uint8)}, "SIM-011")],
 )  # fmt: skip
-def test_homes_that_cannot_be_used_are_named(tmp_path, fault, code):
+def test_unusable_homes_are_refused(tmp_path, fault, code):
     with pytest.raises(InputError, match=code):
         ReconstructedHome.of_build(write(tmp_path / "other", **fault))
 
 
-def test_homes_that_are_not_there_or_of_another_kind_are_named(tmp_path):
+def test_missing_homes_and_other_folders_are_refused(tmp_path):
     with pytest.raises(InputError, match="ART-003"):
         ReconstructedHome.of_build(tmp_path / "nowhere")
     build = write(tmp_path / "other")

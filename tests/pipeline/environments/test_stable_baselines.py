@@ -1,4 +1,4 @@
-"""Stable-Baselines3 accepts the environment; ended episodes begin anew in the same step."""
+"""Stable-Baselines3 accepts the environment; ended episodes are reset within the same step."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from tests.pipeline.environments.small_world import QUICK, small_world
 pytest.importorskip("stable_baselines3")
 
 
-def test_ppo_takes_its_steps():
+def test_ppo_runs():
     from stable_baselines3 import PPO
 
     from pipeline.environments.stable_baselines import PersonStableVecEnv
@@ -22,7 +22,7 @@ def test_ppo_takes_its_steps():
     assert action.shape == (4, 3) and np.isfinite(action).all()
 
 
-def test_episodes_end_with_their_last_observation_and_begin_anew():
+def test_ended_episodes_return_the_terminal_observation_and_reset():
     from pipeline.environments.stable_baselines import PersonStableVecEnv
 
     env = PersonStableVecEnv(small_world(replace(QUICK, episode_s=0.5, reward="calm")), 3)

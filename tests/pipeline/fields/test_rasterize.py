@@ -1,4 +1,4 @@
-"""The tile rasteriser agrees with the dense reference, in values and gradients, and is deterministic."""
+"""The tile rasterizer agrees with the dense reference in values and gradients, and is deterministic."""
 
 import math
 
@@ -23,7 +23,7 @@ def cloud(points: int = 60):
     return [tensor.requires_grad_() for tensor in (means, rotation, log_scale, opacity, values)]
 
 
-def drawn(backend: str):
+def rendered(backend: str):
     parameters = cloud()
     image, coverage = rasterize.draw(*parameters, torch.eye(4), INTRINSICS, HEIGHT, WIDTH, backend)
     generator = torch.Generator().manual_seed(2)
@@ -33,8 +33,8 @@ def drawn(backend: str):
 
 
 def test_tiles_agree_with_the_reference():
-    image, coverage, grads = drawn("tiles")
-    reference_image, reference_coverage, reference_grads = drawn("dense")
+    image, coverage, grads = rendered("tiles")
+    reference_image, reference_coverage, reference_grads = rendered("dense")
     assert 0.3 < reference_coverage.mean() < 0.99, "the scene must neither be empty nor closed"
     torch.testing.assert_close(image, reference_image, rtol=1e-4, atol=2e-4)
     torch.testing.assert_close(coverage, reference_coverage, rtol=1e-4, atol=2e-4)
@@ -45,14 +45,14 @@ def test_tiles_agree_with_the_reference():
         assert error < 1e-4, f"{name}: relative error {error:.1e}"
 
 
-def test_same_bytes_every_time():
-    first, second = drawn("tiles"), drawn("tiles")
+def test_rendering_is_deterministic():
+    first, second = rendered("tiles"), rendered("tiles")
     assert torch.equal(first[0], second[0]) and all(
         torch.equal(a, b) for a, b in zip(first[2], second[2], strict=True)
     )
 
 
-def test_a_gaussian_behind_the_camera_or_hidden_by_others_is_not_seen():
+def test_occluded_gaussians_and_those_behind_the_camera_are_invisible():
     means = torch.tensor([[0.0, 0, -1], [0, 0, 1], [0, 0, 2]])
     rotation, log_scale = torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1), torch.full((3, 3), math.log(0.3))
     values = torch.eye(3)

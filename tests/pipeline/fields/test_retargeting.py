@@ -1,4 +1,4 @@
-"""Motion keeps its meaning on another body: itself, a bigger one, one with other bones."""
+"""Retargeting of motion to the same body, to a larger one, and to one with other bones."""
 
 import numpy as np
 
@@ -17,12 +17,12 @@ def body() -> SkinnedShape:
 
 
 def posed(shape: SkinnedShape, bones: np.ndarray) -> np.ndarray:
-    """Where the vertices are, [frame vertex 3]."""
+    """Return vertex positions, [frame vertex 3]."""
     motion = bones @ rigid.inverse(shape.agent_from_bone_rest)
     return retargeting.transfer(motion, shape.weights, shape.vertices)[0]
 
 
-def test_a_motion_on_its_own_body_stays() -> None:
+def test_retargeting_to_the_same_body_is_the_identity() -> None:
     same = retargeting.retarget(body(), body(), TRACK.world_from_agent, MOTION)
     away = np.linalg.norm(posed(body(), same.agent_from_bone) - posed(body(), MOTION), axis=-1)
     assert away.max() < 1e-3 and same.residual_m.max() < 1e-3, "metres"
@@ -30,7 +30,7 @@ def test_a_motion_on_its_own_body_stays() -> None:
     assert retargeting.shape_distance_m(body(), body()) < 1e-6
 
 
-def test_a_bigger_body_moves_as_much_more_and_stands_higher() -> None:
+def test_motion_scales_with_the_body() -> None:
     small = body()
     rest = small.agent_from_bone_rest.copy()
     rest[:, :3, 3] *= 2
@@ -51,7 +51,7 @@ def test_a_bigger_body_moves_as_much_more_and_stands_higher() -> None:
 
 
 def test_other_bones_follow_the_same_surface() -> None:
-    """Eight bones elsewhere along the same body bend it nearly as its own five do."""
+    """Eight bones at other places along the same body deform it nearly like its own five."""
     own = body()
     place = np.linspace(-0.22, 0.22, 8)
     weights = np.exp(-((own.vertices[:, 2:] - place) ** 2) / (2 * 0.04**2))

@@ -1,4 +1,4 @@
-"""Skinning: weights are probabilities, blended motions are rigid, and backward undoes forward."""
+"""Skinning weights are convex, blended motions are rigid, and backward skinning inverts forward skinning."""
 
 import torch
 
@@ -21,7 +21,7 @@ def test_weights_are_softmax_of_scaled_distances():
     torch.testing.assert_close(skinning.skinning_weights(cloud, rest, scale), expected)
 
 
-def test_rest_pose_moves_nothing_and_a_shared_motion_moves_everything_rigidly():
+def test_rest_pose_is_the_identity_and_a_shared_motion_is_rigid():
     generator, rest, scale, cloud = body()
     weights = skinning.skinning_weights(cloud, rest, scale)
     torch.testing.assert_close(skinning.move(skinning.blend(weights, rest, rest), cloud), cloud)
@@ -31,7 +31,7 @@ def test_rest_pose_moves_nothing_and_a_shared_motion_moves_everything_rigidly():
 
 
 def test_antipodal_quaternions_do_not_cancel():
-    """Two bones that both turn by nearly half a turn, on either side of it, must blend to half a turn."""
+    """Two bones with rotations of nearly 180 degrees of opposite sign blend to 180 degrees."""
     rest = torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
     angle = torch.tensor([torch.pi - 0.01, torch.pi + 0.01], dtype=torch.float64)
     twist = torch.zeros(2, 6, dtype=torch.float64)
@@ -41,7 +41,7 @@ def test_antipodal_quaternions_do_not_cancel():
     torch.testing.assert_close(blended[:4, 0] * blended[2, 0].sign(), half_turn)
 
 
-def test_backward_undoes_forward_where_bones_agree():
+def test_backward_inverts_forward_where_bones_agree():
     generator, rest, scale, cloud = body()
     posed = rest @ rigid_torch.se3_exp(torch.randn(6, 6, generator=generator, dtype=torch.float64) * 0.02)
     forward = skinning.move(skinning.blend(skinning.skinning_weights(cloud, rest, scale), posed, rest), cloud)

@@ -1,4 +1,4 @@
-"""Four fitted weights: exact where four bones are enough, never worse than the four heaviest."""
+"""Refit of skinning weights to four bones: exact if four bones suffice, never worse than the four largest."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ RNG = np.random.default_rng(0)
 
 
 def world(bones: int, bend_rad: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Random bones, points near them with soft weights, and poses in which every bone bends at random."""
+    """Random bones, nearby points with soft weights, and random poses."""
     centers = RNG.normal(0, 0.15, (bones, 3))
     points = centers[RNG.integers(0, bones, 200)] + RNG.normal(0, 0.04, (200, 3))
     weights = np.exp(-((points[:, None] - centers) ** 2).sum(-1) / (2 * 0.08**2))
@@ -23,7 +23,7 @@ def world(bones: int, bend_rad: float) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 @pytest.mark.parametrize("bones", [2, 4, 12])
-def test_weights_are_convex_and_beat_the_four_heaviest(bones: int) -> None:
+def test_weights_are_convex_and_better_than_the_four_largest(bones: int) -> None:
     points, weights, rest, posed_bones = world(bones, 0.3)
     body = SkinnedShape(points, weights, rest)
     poses = weight_refit.Poses.of(body, posed_bones)
@@ -39,7 +39,7 @@ def test_weights_are_convex_and_beat_the_four_heaviest(bones: int) -> None:
     assert after <= before * (1 + 1e-6)
 
 
-def test_one_bone_a_point_is_exact() -> None:
+def test_rigid_points_are_exact() -> None:
     points, weights, rest, posed_bones = world(6, 0.5)
     alone = np.eye(6)[weights.argmax(1)]
     body = SkinnedShape(points, alone, rest)
@@ -48,7 +48,7 @@ def test_one_bone_a_point_is_exact() -> None:
     assert weight_refit.residual_m(points, fitted, poses).max() < 1e-4, "metres: float32 blending"
 
 
-def test_different_poses_hold_the_extremes() -> None:
+def test_selected_poses_contain_the_extremes() -> None:
     turn = np.zeros((50, 1, 6))
     turn[:, 0, 0] = np.sort(RNG.uniform(-1, 1, 50))
     chosen = weight_refit.farthest_poses(rigid.exp(turn), 5)

@@ -1,4 +1,4 @@
-"""Alignment: exact on clean correspondences, right with two thirds of them wrong."""
+"""Rigid alignment is exact on clean correspondences and robust to two thirds of outliers."""
 
 import numpy as np
 
@@ -12,13 +12,13 @@ def test_kabsch_recovers_motions_in_a_batch():
     assert np.allclose(align.kabsch(source, rigid.apply(target_from_source, source)), target_from_source)
 
 
-def test_kabsch_never_mirrors():
+def test_kabsch_gives_proper_rotations():
     rng = np.random.default_rng(0)
     flat = rng.normal(size=(20, 3)) * [1, 1, 0]
     assert np.linalg.det(align.kabsch(flat, flat * [-1, 1, 1])[:3, :3]) > 0.99
 
 
-def test_ransac_survives_two_thirds_of_outliers():
+def test_ransac_is_robust_to_two_thirds_of_outliers():
     rng = np.random.default_rng(1)
     target_from_source = rigid.exp(rng.normal(size=6))
     source = rng.uniform(-2, 2, (300, 3))
@@ -29,7 +29,7 @@ def test_ransac_survives_two_thirds_of_outliers():
     assert inlier[200:].mean() > 0.95 and inlier[:200].mean() < 0.05
 
 
-def test_ransac_without_points_claims_nothing():
+def test_ransac_without_points_fails():
     transform, inlier = align.ransac_rigid(
         np.zeros((2, 3)), np.zeros((2, 3)), threshold_m=0.1, iterations=10, rng=np.random.default_rng(0)
     )

@@ -1,4 +1,4 @@
-"""Cameras: projection undoes lifting, turning a picture turns everything together."""
+"""Projection inverts back-projection; resizing and rotating pictures transform intrinsics consistently."""
 
 import numpy as np
 import torch
@@ -8,7 +8,7 @@ from pipeline.geometry import cameras, rigid
 INTRINSICS = np.array([[230.0, 0, 121.3], [0, 228.0, 158.2], [0, 0, 1]])
 
 
-def test_projection_undoes_back_projection():
+def test_projection_inverts_back_projection():
     depth = np.random.default_rng(0).uniform(0.3, 5, (32, 24))
     pixel, z = cameras.project(cameras.back_project(depth, INTRINSICS), INTRINSICS)
     assert np.allclose(pixel, cameras.pixel_grid(32, 24)) and np.allclose(z, depth)
@@ -37,14 +37,14 @@ def test_lookups_return_what_was_back_projected_and_nothing_out_of_view():
     assert np.array_equal(own[..., 2], depth.repeat(2, 0).repeat(2, 1))
 
 
-def test_resizing_moves_pixels_in_proportion():
+def test_resizing_scales_pixel_coordinates():
     point = np.array([[0.2, -0.1, 1.5]])
     pixel, _ = cameras.project(point, INTRINSICS)
     small, _ = cameras.project(point, cameras.scale_intrinsics(INTRINSICS, (320, 240), (160, 60)))
     assert np.allclose(small, pixel * [60 / 240, 160 / 320])
 
 
-def test_a_turned_picture_shows_the_same_world():
+def test_rotated_picture_has_consistent_intrinsics_and_pose():
     rng = np.random.default_rng(1)
     world_from_camera = rigid.exp(rng.normal(size=6))
     points_camera = np.stack(

@@ -23,7 +23,7 @@ def render(scene: RayCaster) -> np.ndarray:
     return render_view(scene, CAMERA, INTRINSICS, *SIZE)[0]
 
 
-def test_a_box_on_the_floor_has_the_depth_of_a_box_on_the_floor():
+def test_depth_of_a_box_on_the_floor():
     true, floor = render(caster(BOX)), render(caster())
     mask = true < floor - 1e-3
     touched = contact.find(mask, INTRINSICS, CAMERA, caster())
@@ -35,7 +35,7 @@ def test_a_box_on_the_floor_has_the_depth_of_a_box_on_the_floor():
     assert np.median(np.abs(depth - true)[mask]) < 0.03
 
 
-def test_a_part_that_goes_on_beyond_the_picture_or_stands_before_a_wall_touches_nothing():
+def test_no_contact_at_picture_borders_or_in_front_of_walls():
     cut = np.zeros(SIZE, bool)
     cut[80:, 70:90] = True
     assert not contact.find(cut, INTRINSICS, CAMERA, caster()).certain
@@ -45,7 +45,7 @@ def test_a_part_that_goes_on_beyond_the_picture_or_stands_before_a_wall_touches_
     assert not contact.find(high, INTRINSICS, CAMERA, caster(wall)).certain
 
 
-def test_contacts_are_carried_on_for_a_while_only():
+def test_contacts_are_extrapolated_for_a_limited_time():
     seen = contact.Contact(np.array([1.0, 0, 0]), True)
     later = contact.Contact(np.array([2.0, 0, 0]), True)
     hidden = contact.Contact(np.array([9.0, 0, 0]), False)

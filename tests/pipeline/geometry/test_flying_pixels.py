@@ -1,11 +1,11 @@
-"""Depth of thin things is kept, what flies beside them is not."""
+"""Flying pixels are removed, thin structures are kept."""
 
 import numpy as np
 
 from pipeline.geometry.flying_pixels import supported
 
 
-def test_a_limb_two_pixels_wide_is_kept_and_the_pixels_flying_beside_it_are_not():
+def test_two_pixel_limb_is_kept_and_flying_pixels_are_removed():
     depth = np.full((20, 24), 3.0)
     depth[:, 10:12] = 2.0
     depth[:, 9], depth[:, 12] = 2.4, 2.7

@@ -1,4 +1,4 @@
-"""Meshes and rays: depth is z, hits interpolate attributes, normals point outwards."""
+"""Ray casting: depth is z, attributes are interpolated, normals point outwards."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ WALL = Mesh(
 )
 
 
-def test_a_wall_across_the_view_has_one_depth():
+def test_frontal_wall_has_constant_depth():
     intrinsics = np.array([[30.0, 0, 20], [0, 30, 15], [0, 0, 1]])
     depth, hits = render_view(RayCaster(WALL), np.eye(4), intrinsics, 30, 40)
     assert np.allclose(depth, 2.0, atol=1e-5)
@@ -19,12 +19,12 @@ def test_a_wall_across_the_view_has_one_depth():
     assert np.allclose(points, cameras.back_project(depth, intrinsics), atol=1e-4)
 
 
-def test_rays_that_miss_say_so():
+def test_missing_rays_are_marked():
     hits = RayCaster(WALL).cast(np.zeros((1, 3)), np.array([[0.0, 0, -1]]))
     assert hits.face[0] == -1 and np.isinf(hits.distance[0])
 
 
-def test_normals_of_a_turned_wall_turn_with_it():
+def test_normals_rotate_with_the_wall():
     turn = rigid.exp(np.array([0.4, 0.2, -0.9, 0, 0, 0]))
     turned = Mesh(rigid.apply(turn, WALL.vertices), WALL.faces)
     assert np.allclose(turned.vertex_normals(), WALL.vertex_normals() @ turn[:3, :3].T, atol=1e-6)

@@ -8,7 +8,7 @@ REST = slice(200, FRAMES)
 
 
 def gait_and_rest() -> tuple[np.ndarray, np.ndarray]:
-    """Return true and noisy poses of two bones: they swing at 2 Hz of 10 Hz, then rest."""
+    """Return true and noisy poses of two bones that swing at 2 Hz (sampled at 10 Hz), then rest."""
     when, rng = np.arange(FRAMES) / 10, np.random.default_rng(0)
     twist = np.zeros((FRAMES, 2, 6))
     twist[:200, :, 0] = 0.4 * np.sin(4 * np.pi * when[:200, None] + np.array([0.0, np.pi]))
@@ -23,7 +23,7 @@ def error(poses: np.ndarray, truth: np.ndarray, frames: slice) -> tuple[float, f
     return float(angle.mean()), float(shift.mean())
 
 
-def test_rest_is_calmed_and_a_gait_is_kept():
+def test_noise_is_reduced_at_rest_and_gait_is_preserved():
     truth, noisy = gait_and_rest()
     filtered = wiener_filter(noisy, np.ones(FRAMES, bool), WINDOW)
     before, after = error(noisy, truth, REST), error(filtered, truth, REST)
@@ -34,7 +34,7 @@ def test_rest_is_calmed_and_a_gait_is_kept():
     np.testing.assert_allclose(np.linalg.det(filtered[..., :3, :3]), 1, atol=1e-9)
 
 
-def test_still_poses_and_short_sequences_stay_as_they_are():
+def test_constant_poses_and_short_sequences_are_unchanged():
     still = np.repeat(rigid.exp(np.array([[0.1, 0.2, 0.3, 1.0, 2.0, 3.0]])), 20, axis=0)
     np.testing.assert_allclose(wiener_filter(still, np.ones(20, bool), WINDOW), still, atol=1e-9)
     noisy = gait_and_rest()[1][:5]

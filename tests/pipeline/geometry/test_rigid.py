@@ -1,4 +1,4 @@
-"""Rigid motions: group laws, agreement of the NumPy and torch sides, safe gradients."""
+"""Rigid transforms: group laws, agreement of NumPy and torch, finite gradients."""
 
 import numpy as np
 import torch
@@ -32,7 +32,7 @@ def test_torch_agrees_with_numpy(twist):
     assert np.allclose(rigid_torch.rotation_from_6d(columns).numpy(), a_from_b[:, :3, :3].numpy(), atol=1e-9)
 
 
-def test_gradients_are_right_at_and_near_the_identity():
+def test_gradients_are_correct_at_and_near_the_identity():
     vector = torch.tensor(
         [[0.0, 0, 0], [1e-5, 0, 0], [0.3, -1.0, 2.0]], dtype=torch.double, requires_grad=True
     )
@@ -45,7 +45,7 @@ def test_rotation_angle_is_exact_for_tiny_and_half_turns():
         assert abs(rigid.rotation_angle(np.eye(3), rotation) - angle) < 1e-9
 
 
-def test_interpolation_hits_its_knots_and_holds_beyond_them():
+def test_interpolation_passes_through_knots_and_is_constant_outside():
     rng = np.random.default_rng(0)
     knots = rigid.exp(rng.normal(size=(4, 6)))
     times = np.array([0.0, 1.0, 2.5, 3.0])

@@ -15,8 +15,8 @@ def scene():
 
 
 def true_distance(points):
-    """Distance to a room's inside faces and to the block within, which is 0.1 m deep in the floor: there the
-    floor does not count.
+    """Distance to the inner faces of a room and to a block that is sunk 0.1 m into the floor, without the
+    covered floor.
     """
     walls = np.min([2 - np.abs(points[:, 0]), points[:, 1], 2 - np.abs(points[:, 2])], axis=0)
     away = np.abs(points - [0, 0.2, 0]) - [0.4, 0.3, 0.4]
@@ -24,7 +24,7 @@ def true_distance(points):
     return np.where((away < 0).all(1), block, np.minimum(walls, block))
 
 
-def test_distance_is_true_in_free_space_and_in_the_block(scene):
+def test_distance_is_correct_in_free_space_and_in_the_block(scene):
     rng = np.random.default_rng(0)
     points = rng.uniform([-1.9, 0.05, -1.9], [1.9, 0.6, 1.9], (4000, 3))
     off = scene.at(torch.from_numpy(points)).numpy() - true_distance(points)
@@ -32,7 +32,7 @@ def test_distance_is_true_in_free_space_and_in_the_block(scene):
     assert np.median(np.abs(off)) < 0.004
 
 
-def test_beneath_the_floor_is_inside_and_the_border_holds_beyond(scene):
+def test_distance_is_negative_below_the_floor_and_clamped_outside_the_grid(scene):
     points = torch.tensor([[1.0, -0.1, 1.0], [1.0, -5.0, 1.0], [1.0, 0.1, 1.0]])
     below, far, above = scene.at(points).tolist()
     assert below == pytest.approx(-0.1, abs=0.01)
@@ -49,7 +49,7 @@ def test_gradient_points_away_from_the_surface(scene):
 
 
 def test_axes_are_not_swapped():
-    """Traps of the paper's code: the order of axes, and points beside the grid."""
+    """Checks the order of axes and points outside the grid."""
     thin = signed_distance.from_mesh(
         box([0, 0, 0], [1.0, 0.4, 0.2]), np.array([-0.2] * 3), np.array([1.2, 0.6, 0.4]), voxel_m=0.02
     )
@@ -59,8 +59,8 @@ def test_axes_are_not_swapped():
     torch.testing.assert_close(thin.at(outside), torch.full((3,), 0.1), atol=0.01, rtol=0)
 
 
-def test_open_meshes_bear_a_sign():
-    """A block without bottom on a floor, and a single leaf in the air behind which nothing is solid."""
+def test_sign_of_open_meshes():
+    """A block without a bottom on a floor, and a single sheet in the air with free space behind it."""
     block = box([-0.3, 0, -0.3], [0.3, 0.4, 0.3])
     lidless = Mesh(block.vertices, block.faces[np.abs(block.face_normals()[:, 1] + 1) > 1e-3])
     floor = Mesh(
@@ -75,10 +75,8 @@ def test_open_meshes_bear_a_sign():
     assert scene.at(torch.tensor([[1.05, 0.4, 1.05]])) > 0.05
 
 
-def test_crumbs_of_surface_inside_of_a_block_leave_it_solid_to_its_middle():
-    """Fusion leaves such in walls: distances to them would lead deeper, and their backs and fronts mislead
-    the vote.
-    """
+def test_fragments_inside_a_block_are_ignored():
+    """Fusion leaves spurious fragments in walls; distances and signs must not depend on them."""
     rng = np.random.default_rng(0)
     corners = rng.uniform([-0.3, 0.05, -0.3], [0.3, 0.65, 0.3], (60, 1, 3)) + rng.uniform(
         -0.03, 0.03, (60, 3, 3)
@@ -94,7 +92,7 @@ def test_crumbs_of_surface_inside_of_a_block_leave_it_solid_to_its_middle():
     assert np.quantile(np.abs(off), 0.98) < 0.04, "a voxel"
 
 
-def test_points_lie_evenly_on_the_surface():
+def test_surface_samples_are_uniform():
     spread = signed_distance.surface_points(room(), 0.1)
     assert len(spread.points) == pytest.approx(
         (4 * 4 * 2 + 4 * 4 * 2 + 2 * 0.64 + 4 * 0.8 * 0.6) / 0.01, rel=0.01

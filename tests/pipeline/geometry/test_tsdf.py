@@ -1,5 +1,5 @@
-"""Fusing depth: the surface of a rendered box comes back within a fraction of a voxel, and unseen walls stay
-open.
+"""TSDF fusion reconstructs a rendered box within a fraction of a voxel, with holes where nothing was
+observed.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 K = np.array([[80.0, 0, 48], [0, 80, 64], [0, 0, 1]])
 
 
-def test_room_is_fused_where_it_was_seen():
+def test_room_is_fused_where_it_was_observed():
     room = trimesh.creation.box((3.0, 2.0, 3.0))
     room.invert()
     caster = RayCaster(Mesh(np.asarray(room.vertices, np.float32), np.asarray(room.faces, np.int32)))

@@ -1,4 +1,4 @@
-"""The localizer: calibration is a probability, a bank answers for views it does not hold, files keep it."""
+"""Localizers: calibrated confidence, answers for unseen views, and saving."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def scene():
 
 
 @pytest.mark.slow
-def test_bank_answers_for_new_views(scene):
+def test_bank_localizes_unseen_views(scene):
     clip, localizer, held = scene
     fresh = MemoryClip(clip.caster, walk(12, seed=5), None)
     answers = [localizer.localize(fresh.color(i), fresh.depth(i), INTRINSICS, INTRINSICS) for i in range(12)]
@@ -42,7 +42,7 @@ def test_masked_pictures_give_no_answer(scene):
     )
 
 
-def test_files_keep_the_localizer(scene, tmp_path):
+def test_localizer_survives_saving(scene, tmp_path):
     clip, localizer, _ = scene
     model.save(tmp_path, localizer, {"views": 1})
     again = model.load(tmp_path)
@@ -52,7 +52,7 @@ def test_files_keep_the_localizer(scene, tmp_path):
     assert first.probability == second.probability
 
 
-def test_calibration_is_a_rising_probability():
+def test_calibration_is_a_monotonic_probability():
     rng = np.random.default_rng(0)
     score = rng.uniform(0, 1, 400)
     truth = 1 / (1 + np.exp(-(12 * score - 5)))

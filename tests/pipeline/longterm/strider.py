@@ -1,5 +1,5 @@
-"""A room with a block in it, and a body on four feet that strides through it without sliding: truth for
-long-term motion.
+"""Synthetic data for long-term motion: a room with a block, and a four-legged body that walks without foot
+skate.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ STRIDE_S = 0.6
 
 
 def box(low, high, outward=True) -> Mesh:
-    """Return a closed box; inward for a room."""
+    """Return a closed box; inward-facing for a room."""
     low, high = np.asarray(low, float), np.asarray(high, float)
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     faces = np.array(
@@ -40,7 +40,7 @@ def box(low, high, outward=True) -> Mesh:
 
 
 def merged(*parts: Mesh) -> Mesh:
-    """Return several meshes as one."""
+    """Merge meshes."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
     return Mesh(np.concatenate([part.vertices for part in parts]), np.ascontiguousarray(faces, np.int32))
@@ -52,7 +52,7 @@ def room() -> Mesh:
 
 
 def body() -> SkinnedBody:
-    """Return a trunk and four legs of one bone each; soles 0.2 m under the root."""
+    """Return a trunk and four legs of one bone each; soles are 0.2 m below the root."""
     parts = [box([-0.07, -0.05, -0.16], [0.07, 0.05, 0.16])]
     parts += [box(foot - [0.012, 0, 0.012], foot + np.array([0.012, HIP_M - 0.05, 0.012])) for foot in FEET]
     mesh = merged(*parts)
@@ -62,7 +62,7 @@ def body() -> SkinnedBody:
 
 
 def striding(way_world: np.ndarray, seconds: float) -> BodyMotion:
-    """Walk along a polyline at an even pace; each foot stands for two thirds of every stride."""
+    """Walk along a polyline at constant speed; each foot is in stance for two thirds of every stride."""
     time_s = np.arange(round(seconds * RATE_HZ) + 1) / RATE_HZ
     root = _along(way_world, time_s, seconds)
     feet = np.stack(

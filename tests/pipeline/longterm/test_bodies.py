@@ -8,7 +8,7 @@ from pipeline.longterm.contacts import motion_tensors
 from tests.pipeline.longterm import strider
 
 
-def test_surface_is_the_blend_of_its_bones():
+def test_surface_is_linear_blend_skinning():
     body, moving = strider.body(), strider.striding(np.array([[0.8, 0, -1.0], [0.8, 0, 1.0]]), 2.0)
     weights = np.random.default_rng(0).dirichlet(np.ones(5), len(body.mesh.vertices))
     body = type(body)(body.mesh, weights, body.agent_from_bone_rest, body.shape)
@@ -22,7 +22,7 @@ def test_surface_is_the_blend_of_its_bones():
         )
 
 
-def test_pose_space_gives_back_what_it_has_seen():
+def test_pose_space_reconstructs_training_poses():
     moving = strider.striding(np.array([[0.8, 0, -1.0], [0.8, 0, 1.0]]), 3.0)
     rest = strider.body().agent_from_bone_rest
     poses = PoseSpace(rest, 12).fit(moving.agent_from_bone)
@@ -33,12 +33,12 @@ def test_pose_space_gives_back_what_it_has_seen():
     torch.testing.assert_close(
         poses.bones(channels), torch.from_numpy(moving.agent_from_bone).float(), atol=1e-5, rtol=0
     )
-    used = p.std(0) > 0.5  # components without any spread stay silent
+    used = p.std(0) > 0.5  # components without variance are zero
     assert used.sum() >= 3
     torch.testing.assert_close(p[:, used].std(0), torch.ones(int(used.sum())), atol=0.02, rtol=0)
 
 
-def test_spread_vertices_cover_the_body():
+def test_sampled_vertices_cover_the_body():
     body = strider.body()
     chosen = body.sample_vertices(12)
     assert len(set(chosen.tolist())) == 12

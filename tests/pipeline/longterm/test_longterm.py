@@ -50,7 +50,7 @@ def clips(dataset, model):
     return encode_selection(dataset, select_clips(dataset, rng, stride=40), model.poses, SIZES.points, rng)
 
 
-def test_channels_and_motion_are_each_others_inverse(dataset, model):
+def test_channel_encoding_is_inverted(dataset, model):
     part = dataset.stretches[0][: STEPS + 1]
     p = pose_channels(part.agent_from_bone, model.poses)[None]
     coded = encode_clips(
@@ -63,19 +63,19 @@ def test_channels_and_motion_are_each_others_inverse(dataset, model):
     assert float(ahead[2]) > 0.3 and abs(float(ahead[0])) < 1e-5
 
 
-def test_scene_points_lie_on_the_scene_near_the_clip(dataset, clips):
+def test_scene_points_are_on_the_surface_near_the_clip(dataset, clips):
     world = torch.einsum(
         "cij,cpj->cpi", torch.from_numpy(clips.world_from_clip[:, :3, :3]).float(), clips.seen.points
     )
     world = world + torch.from_numpy(clips.world_from_clip[:, None, :3, 3]).float()
     open_to_a_body = (world[..., 1] > 0.01) | (
         world[..., [0, 2]].abs().amax(-1) > 0.41
-    )  # the block is let into the floor
+    )  # the block is sunk into the floor
     assert dataset.scenes[0].distance.at(world)[open_to_a_body].abs().max() < 0.06
     assert clips.seen.points.norm(dim=-1).max() < 1.51
 
 
-def test_distances_beside_a_route_are_those_of_the_scene(dataset, clips):
+def test_distances_along_a_route_are_those_of_the_scene(dataset, clips):
     read = read_distances(clips.seen.field, clips.channels[..., :3])
     assert read.shape == (*clips.channels.shape[:2], READ_CHANNELS)
     frames = torch.from_numpy(clips.world_from_clip).float()
@@ -88,7 +88,7 @@ def test_distances_beside_a_route_are_those_of_the_scene(dataset, clips):
 
 
 @pytest.mark.parametrize("name", ["ours", *longterm_networks.ABLATIONS])
-def test_short_motions_begin_and_end_as_given(model, clips, name):
+def test_short_motions_have_the_given_end_points(model, clips, name):
     torch.manual_seed(1)
     made = model if name == "ours" else longterm_networks.build(longterm_networks.ABLATIONS[name], SIZES)
     frames = made.between(clips.channels[:, 0], clips.channels[:, -1], clips.seen)
@@ -97,7 +97,7 @@ def test_short_motions_begin_and_end_as_given(model, clips, name):
     assert (frames[:, 30] - clips.channels[:, 30]).abs().max() > 1e-3
 
 
-def test_strides_carry_a_pose_around_with_the_way_and_back_again(clips):
+def test_stride_encoding_rotates_with_the_path_and_is_inverted(clips):
     torch.manual_seed(3)
     strides, route, p = GaitPhase(SIZES.pose), clips.channels[..., :9], clips.channels[:, 0, 9:]
     carried = strides(p, p, route)
@@ -112,7 +112,7 @@ def test_strides_carry_a_pose_around_with_the_way_and_back_again(clips):
     torch.testing.assert_close(gait_progress(route)[:, -1, 0], gone)
 
 
-def test_blind_networks_do_not_see_and_seeing_ones_do(clips):
+def test_scene_changes_only_networks_with_scene_input(clips):
     torch.manual_seed(2)
     moved = LocalScene(clips.seen.points + 0.5, clips.seen.field - 0.3)
     for name, differs in (
@@ -129,7 +129,7 @@ def test_blind_networks_do_not_see_and_seeing_ones_do(clips):
     assert not any(isinstance(p, torch.nn.Parameter) for p in PointNet(4, with_scene=False).parameters())
 
 
-def test_a_saved_model_is_the_same_model(model, clips, tmp_path):
+def test_model_survives_saving(model, clips, tmp_path):
     model.save(tmp_path)
     again = LongTerm.load(tmp_path)
     args = (clips.channels[:, 0], clips.channels[:, -1], clips.seen)
@@ -139,7 +139,7 @@ def test_a_saved_model_is_the_same_model(model, clips, tmp_path):
     np.testing.assert_array_equal(again.contacts.foot, model.contacts.foot)
 
 
-def test_habits_are_those_of_the_strider(dataset, model):
+def test_motion_prior_is_that_of_the_data(dataset, model):
     assert model.motion_prior.clearance_m == pytest.approx(strider.HIP_M, abs=0.01)
     ends = [
         np.linalg.norm(s.world_from_agent[60, :3, 3] - s.world_from_agent[0, :3, 3])
@@ -148,7 +148,7 @@ def test_habits_are_those_of_the_strider(dataset, model):
     assert min(ends) - 0.05 < model.motion_prior.pace_m < max(ends) + 0.05
 
 
-def test_clips_that_travel_are_kept_and_loose_places_are_level(dataset, model):
+def test_moving_clips_are_kept_and_waypoints_are_level(dataset, model):
     rng = np.random.default_rng(0)
     cuts = select_clips(dataset, rng, stride=10, resting=0.0)
     ways = [
@@ -166,14 +166,14 @@ def test_clips_that_travel_are_kept_and_loose_places_are_level(dataset, model):
     assert float(stills.truth[:, 1].std()) == pytest.approx(0.03, rel=0.4)
 
 
-def test_places_tell_the_clearance(dataset):
+def test_waypoints_have_clearance(dataset):
     root = np.tile(np.eye(4), (2, 1, 1))
     root[:, :3, 3] = [[1.2, 0.3, 1.2], [0.0, 0.7, 0.0]]  # over the floor, over the block
-    told = encode_places(root, np.array([0, 0]), dataset.scenes, 16, np.random.default_rng(0))
-    torch.testing.assert_close(told.place[:, 0], torch.tensor([0.3, 0.2]), atol=0.03, rtol=0)
+    encoded = encode_places(root, np.array([0, 0]), dataset.scenes, 16, np.random.default_rng(0))
+    torch.testing.assert_close(encoded.place[:, 0], torch.tensor([0.3, 0.2]), atol=0.03, rtol=0)
 
 
-def test_legs_lead_around_the_block_and_are_on_time(dataset, model):
+def test_planned_legs_avoid_the_block_and_keep_the_duration(dataset, model):
     ends = [
         Subgoal(np.array([-1.2, np.nan, 0.0]), 0.0),
         Subgoal(np.array([1.2, np.nan, 0.0]), np.pi, 20.0),
@@ -184,7 +184,7 @@ def test_legs_lead_around_the_block_and_are_on_time(dataset, model):
     np.testing.assert_allclose(
         where[places.subgoal], [[-1.2, strider.HIP_M, 0], [1.2, strider.HIP_M, 0], [0, 0.7, 0]], atol=0.01
     )
-    assert places.subgoal[1] == 10  # 20 s are ten legs; what it does not need it rests
+    assert places.subgoal[1] == 10  # 20 s are ten legs; the remaining time is rest
     on_floor = np.abs(where[:, 1] - strider.HIP_M) < 0.05
     assert (np.abs(where[on_floor][:, [0, 2]]).max(1) > 0.4).all()
     np.testing.assert_allclose(places.world_from_agent[places.subgoal[1], :3, 2], [0, 0, -1], atol=1e-9)
@@ -193,7 +193,7 @@ def test_legs_lead_around_the_block_and_are_on_time(dataset, model):
     assert not floor.free[tuple(np.round((np.array([0.0, 0.0]) - floor.corner) / 0.08).astype(int))]
 
 
-def test_sub_goals_by_the_block_are_moved_to_where_a_body_can_turn_and_legs_lead_past_it(dataset, model):
+def test_sub_goals_near_the_block_are_moved_to_free_space_and_legs_pass_it(dataset, model):
     floor = WalkableFloor.of(dataset.scenes[0], model.motion_prior)
     read_distances, inside, far = (np.array([x, strider.HIP_M, 0.1]) for x in (0.5, 0.0, 1.2))
     for position in (read_distances, inside):
@@ -216,7 +216,7 @@ def test_sub_goals_by_the_block_are_moved_to_where_a_body_can_turn_and_legs_lead
     assert floor.blocked_m(places.world_from_agent[:, :3, 3]) < 0.1
 
 
-def test_a_place_within_a_pen_is_moved_out_of_it(dataset, model):
+def test_waypoint_in_an_enclosure_is_moved_out(dataset, model):
     fence = [
         strider.box(*sides)
         for sides in (([-2, -0.1, 0.7], [-0.6, 0.5, 0.8]), ([-0.7, -0.1, 0.7], [-0.6, 0.5, 2]))
@@ -228,13 +228,13 @@ def test_a_place_within_a_pen_is_moved_out_of_it(dataset, model):
     assert moved[0] > -0.6 or moved[2] < 0.7
 
 
-def test_a_scene_without_free_floor_is_refused_for_leaps_too():
+def test_scene_without_free_floor_is_refused():
     nowhere = WalkableFloor(np.zeros((3, 3), bool), np.zeros((3, 3)), np.zeros(2), 0.0, 0.0, 1.0)
     with pytest.raises(InputError, match="SIM-003"):
         nowhere.landing(np.zeros(3), 0.2)
 
 
-def test_a_body_at_rest_turns_about_in_two_legs(dataset, model):
+def test_resting_body_turns_around_in_two_legs(dataset, model):
     goals = [
         Subgoal(np.array([x, np.nan, 1.2]), time_s=t) for x, t in ((-1.0, None), (1.0, 20.0), (-1.0, None))
     ]
@@ -242,17 +242,17 @@ def test_a_body_at_rest_turns_about_in_two_legs(dataset, model):
     assert np.degrees(np.arccos(np.clip((ahead[1:] * ahead[:-1]).sum(1), -1, 1))).max() < 100
 
 
-def test_preferred_places_are_where_the_animal_was():
+def test_preferred_places_are_recorded_places():
     been = np.concatenate([np.tile([1.0, 0.2, 1.0], (300, 1)), np.tile([-1.0, 0.4, 0.5], (100, 1))])
     drawn = np.array(
         [goal.position_world for goal in sample_visited_subgoals(been, 200, np.random.default_rng(0))]
     )
     assert set(map(tuple, np.round(drawn, 6))) == {(1.0, 0.2, 1.0), (-1.0, 0.4, 0.5)}
-    assert (np.abs(np.diff(drawn[:, 0])) > 1).all()  # neighbours are apart
+    assert (np.abs(np.diff(drawn[:, 0])) > 1).all()  # adjacent ones are separated
 
 
-def test_a_sub_goal_inside_of_furniture_is_put_on_top_of_it_and_one_in_the_air_on_the_floor(dataset, model):
-    """The block of the strider's room reaches up to 0.5 m."""
+def test_sub_goals_are_placed_on_furniture_and_floor(dataset, model):
+    """The block of the room is 0.5 m high."""
     goals = [Subgoal(np.array(place)) for place in ([-1.2, np.nan, 0.0], [0.0, 0.45, 0.0], [1.2, 0.9, 0.0])]
     where = plan_waypoints(None, goals, dataset.scenes[0], model.motion_prior)
     top, floor = where.world_from_agent[where.subgoal[1:], :3, 3]
@@ -260,7 +260,7 @@ def test_a_sub_goal_inside_of_furniture_is_put_on_top_of_it_and_one_in_the_air_o
     np.testing.assert_allclose(floor, [1.2, strider.HIP_M, 0.0], atol=0.01)
 
 
-def test_a_long_motion_goes_through_its_places(dataset, model):
+def test_long_motion_passes_its_waypoints(dataset, model):
     places = plan_waypoints(
         None,
         [Subgoal(np.array([-1.2, np.nan, -1.0])), Subgoal(np.array([1.2, np.nan, 1.0]))],
@@ -275,7 +275,7 @@ def test_a_long_motion_goes_through_its_places(dataset, model):
     np.testing.assert_allclose(np.linalg.det(moving.world_from_agent[:, :3, :3]), 1, atol=1e-4)
 
 
-def test_bodies_in_passing_are_made_by_the_motion_and_those_that_stay_stay(dataset, model):
+def test_bodies_of_passed_waypoints_are_generated_and_others_kept(dataset, model):
     ends = [
         Subgoal(np.array([-1.2, np.nan, -1.0])),
         Subgoal(np.array([1.2, np.nan, -1.0]), time_s=30.0),
@@ -290,12 +290,12 @@ def test_bodies_in_passing_are_made_by_the_motion_and_those_that_stay_stay(datas
     )
     changed = (given[1].agent_from_bone != drawn[1].agent_from_bone).any((1, 2, 3))
     assert not changed[places.subgoal].any() and changed.any()
-    rest = given[1].agent_from_bone[2 : places.subgoal[1]]  # on the last of these places it turns to leave
+    rest = given[1].agent_from_bone[2 : places.subgoal[1]]  # at the last of these it turns to leave
     np.testing.assert_array_equal(rest, np.broadcast_to(rest[:1], rest.shape))
     assert len(given[0]) == len(drawn[0])
 
 
-def test_simulated_lives_come_back(dataset, tmp_path):
+def test_simulated_clips_survive_saving(dataset, tmp_path):
     simulated_lives.save(
         tmp_path,
         dataset.body,

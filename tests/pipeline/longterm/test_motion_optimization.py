@@ -54,7 +54,7 @@ def test_soles_are_found_and_form_four_feet(dataset, contact_body):
     assert all(len(set(bone[contact_body.contacts.foot == foot])) == 1 for foot in range(4))
 
 
-def test_feet_stand_two_thirds_of_the_time_and_true_motion_is_physical(dataset, contact_body):
+def test_stance_ratio_and_residuals_of_the_true_motion(dataset, contact_body):
     judge, moving = (
         PlausibilityMeter(dataset.body, contact_body.contacts, dataset.scenes[0].distance),
         dataset.stretches[0],
@@ -67,8 +67,8 @@ def test_feet_stand_two_thirds_of_the_time_and_true_motion_is_physical(dataset, 
     assert worth.non_collision > 0.999
 
 
-def test_feet_that_should_stand_have_time_to_swing():
-    """One foot glides at the body's pace, one rests, one leaps 10 cm aside between two rests."""
+def test_stances_leave_time_for_swings():
+    """One foot glides at the speed of the body, one rests, one jumps 10 cm sideways between two rests."""
     feet = np.zeros((120, 3, 3))
     feet[:, 0, 2] = np.arange(120) / 30
     feet[60:, 2, 0] = 0.1
@@ -88,7 +88,7 @@ def test_feet_that_should_stand_have_time_to_swing():
     assert (gaps[0] + 2 >= np.sqrt(6 * away / SWING_M_S2) * 30).all()
 
 
-def test_a_shaken_motion_becomes_physical_and_stays_near(dataset, contact_body):
+def test_noisy_motion_becomes_physical_and_stays_close(dataset, contact_body):
     truth = dataset.stretches[0][:120]
     shake = gaussian_filter1d(np.random.default_rng(1).normal(size=(120, 3)), 4, axis=0) * [0.05, 0.05, 0.05]
     root = truth.world_from_agent.copy()
@@ -109,7 +109,7 @@ def test_a_shaken_motion_becomes_physical_and_stays_near(dataset, contact_body):
     assert error[1] < 1.1 * error[0]
 
 
-def test_a_gliding_motion_gets_feet_that_stand(dataset, contact_body):
+def test_gliding_motion_gets_stances(dataset, contact_body):
     walk = dataset.stretches[0][:90]
     mean = np.repeat(walk.agent_from_bone.mean(0, keepdims=True), len(walk), axis=0)
     mean[..., :3, :3] = walk.agent_from_bone[0, :, :3, :3]
@@ -122,7 +122,7 @@ def test_a_gliding_motion_gets_feet_that_stand(dataset, contact_body):
     assert not judge.stance(gliding).any() and judge.stance(done).any(axis=1).mean() > 0.5
 
 
-def test_held_frames_stay(dataset, contact_body):
+def test_fixed_frames_are_unchanged(dataset, contact_body):
     moving, held = dataset.stretches[1][:30], np.arange(30) % 29 == 0
     lifted = BodyMotion(moving.world_from_agent + np.eye(4)[:, 3] * 0 + _lift(0.03), moving.agent_from_bone)
     done = optimize_motion(
@@ -132,7 +132,7 @@ def test_held_frames_stay(dataset, contact_body):
     assert np.abs(done.world_from_agent[~held] - lifted.world_from_agent[~held]).max() > 1e-3
 
 
-def test_a_motion_pushed_into_the_block_comes_out(dataset, contact_body):
+def test_penetrating_motion_is_moved_out_of_the_block(dataset, contact_body):
     walk = strider.striding(np.array([[0.36, 0, -0.2], [0.36, 0, 0.2]]), 1.0)
     scene = dataset.scenes[0].distance
     judge = PlausibilityMeter(dataset.body, contact_body.contacts, scene)
@@ -142,8 +142,8 @@ def test_a_motion_pushed_into_the_block_comes_out(dataset, contact_body):
     assert judge.plausibility(done, stance).deepest_m < 0.02
 
 
-def test_what_nobody_looks_at_comes_out_of_a_board_too(dataset, contact_body):
-    """Of the trunk one vertex is looked at, on the far side."""
+def test_unsampled_vertices_are_moved_out_of_a_board(dataset, contact_body):
+    """Only one vertex of the trunk, on the far side, is sampled for collisions."""
     board = strider.merged(strider.room(), strider.box([0.85, 0.17, -1], [1.3, 0.6, 1]))
     scene = replace(dataset.scenes[0], mesh=board).distance
     walk = strider.striding(np.array([[0.82, 0, -0.3], [0.82, 0, 0.3]]), 1.0)
@@ -157,7 +157,7 @@ def test_what_nobody_looks_at_comes_out_of_a_board_too(dataset, contact_body):
     assert deepest[0] > 0.03 and deepest[1] < 0.005
 
 
-def test_terms_are_what_they_say():
+def test_terms_have_known_values():
     stance = np.array([[1, 0], [1, 1], [0, 1], [1, 1]], bool)
     flat, phase = phase_means(stance)
     assert flat.tolist() == [0, 2, 3, 5, 6, 7]
@@ -174,7 +174,7 @@ def test_terms_are_what_they_say():
     assert smooth_error(even**2).sum() == 3 * 3 * 2**2
 
 
-def test_a_jump_at_a_seam_is_measured(dataset):
+def test_discontinuity_at_a_seam_is_measured(dataset):
     moving = dataset.stretches[0]
     assert seams(dataset.body, moving, 60).max() < 0.02
     root = moving.world_from_agent.copy()
@@ -197,7 +197,7 @@ def _lift(height_m):
     )
 
 
-def test_feet_in_a_board_are_lifted_out_of_it_and_those_in_a_wall_are_not(dataset):
+def test_feet_are_lifted_out_of_boards_but_not_out_of_walls(dataset):
     scene = dataset.scenes[0].distance  # a floor at 0, a block up to 0.5, walls at 2
     depth = np.repeat([0.0, 0.06], 40)
     floor = torch.tensor(
@@ -214,7 +214,7 @@ def test_feet_in_a_board_are_lifted_out_of_it_and_those_in_a_wall_are_not(datase
     )
 
 
-def test_single_bodies_come_out_of_the_floor_and_down_from_the_air(dataset, contact_body):
+def test_single_bodies_are_moved_onto_the_floor(dataset, contact_body):
     still = dataset.stretches[0][np.array([0, 40, 80])]
     judge = PlausibilityMeter(dataset.body, contact_body.contacts, dataset.scenes[0].distance)
     root = still.world_from_agent.copy()

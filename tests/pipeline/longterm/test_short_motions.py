@@ -14,7 +14,7 @@ from pipeline.longterm.short_motions import (
 
 
 def turning(time_s):
-    """A smooth path that turns at an even rate."""
+    """A smooth path with a constant turn rate."""
     vector = np.zeros((len(time_s), 3))
     vector[:, 1] = 0.8 * time_s
     return rigid.make(
@@ -23,7 +23,7 @@ def turning(time_s):
     )
 
 
-def test_thirty_frames_a_second_follow_the_curve():
+def test_upsampled_motion_follows_the_curve():
     coarse, fine = np.arange(41) / 10, np.arange(121) / 30
     moving = resample_motion(coarse, BodyMotion(turning(coarse), turning(coarse)[:, None]))
     assert len(moving) == 121
@@ -33,7 +33,7 @@ def test_thirty_frames_a_second_follow_the_curve():
     np.testing.assert_allclose(moving.agent_from_bone[:, 0], turning(fine), atol=2e-3)
 
 
-def test_stretches_end_where_frames_are_missing():
+def test_segments_end_at_missing_frames():
     time_s = np.arange(100) / 10
     valid = np.ones(100, bool)
     valid[[30, 45]] = False
@@ -43,14 +43,14 @@ def test_stretches_end_where_frames_are_missing():
     np.testing.assert_allclose(found[1].world_from_agent[0], root[46], atol=1e-9)
 
 
-def test_joints_count_once():
+def test_shared_frames_occur_once():
     moving = BodyMotion(turning(np.arange(10) / 30), turning(np.arange(10) / 30)[:, None])
     whole = concatenate_motions([moving[:4], moving[3:7], moving[6:]])
     np.testing.assert_array_equal(whole.world_from_agent, moving.world_from_agent)
     assert len(concatenate_motions([moving])) == pytest.approx(10)
 
 
-def test_a_leap_goes_up_before_across_and_down_after():
+def test_leap_rises_before_and_descends_after_crossing():
     roots = np.tile(np.eye(4), (61, 1, 1))
     roots[:, :3, 3] = np.linspace(0, 1, 61)[:, None] * [1.0, 0.5, 0.0]
     up = jump_between_levels(BodyMotion(roots, np.tile(np.eye(4), (61, 2, 1, 1))))
@@ -62,7 +62,7 @@ def test_a_leap_goes_up_before_across_and_down_after():
         assert np.linalg.norm(np.diff(place, 2, axis=0), axis=1).max() < 0.02
 
 
-def test_a_flip_becomes_a_turn_that_takes_its_time():
+def test_heading_flip_becomes_a_rate_limited_turn():
     yaw = np.where(np.arange(61) < 30, 0.0, 3.0) + np.linspace(0, 0.1, 61)
     roots = rigid.make(rigid.rotation_from_vector(yaw[:, None] * [0.0, 1.0, 0.0]), np.zeros((61, 3)))
     made = limit_turn_rate(BodyMotion(roots, roots[:, None]), 0.2).world_from_agent[:, :3, :3]

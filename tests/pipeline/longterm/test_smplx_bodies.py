@@ -14,8 +14,8 @@ VERTICES, JOINTS = 120, 55
 
 
 def write_model(path, *, standing=False):
-    """Write a model file in the true format: a random surface on the tree of 55 joints; the neck is above the
-    pelvis where it is ``standing``.
+    """Write a model file in the official format with a random surface on the tree of 55 joints; the neck is
+    above the pelvis if ``standing``.
     """
     rng = np.random.default_rng(0)
     parents = np.concatenate([[2**32 - 1], [int(rng.integers(0, joint)) for joint in range(1, JOINTS)]])
@@ -43,13 +43,13 @@ def write_model(path, *, standing=False):
     return path
 
 
-def test_a_missing_package_and_a_wrong_file_are_told(tmp_path, monkeypatch):
+def test_missing_package_and_file_are_refused(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "smplx", None)
     with pytest.raises(InputError, match="LTM-003"):
         smplx_body(tmp_path / "none.npz")
 
 
-def test_wrong_files_are_told(tmp_path):
+def test_wrong_files_are_refused(tmp_path):
     pytest.importorskip("smplx")
     with pytest.raises(InputError, match="LTM-004"):
         smplx_body(tmp_path / "none.npz")
@@ -58,7 +58,7 @@ def test_wrong_files_are_told(tmp_path):
         smplx_body(tmp_path / "other.npz")
 
 
-def test_our_skinning_is_that_of_the_package(tmp_path):
+def test_skinning_equals_that_of_smplx(tmp_path):
     smplx = pytest.importorskip("smplx")
     path = write_model(tmp_path / "SMPLX_NEUTRAL.npz")
     rng = np.random.default_rng(1)
@@ -72,7 +72,7 @@ def test_our_skinning_is_that_of_the_package(tmp_path):
     layer = smplx.SMPLXLayer(str(path), ext="npz", num_betas=10, use_pca=False)
     layer.vertex_joint_selector.extra_joints_idxs = torch.zeros(
         0, dtype=torch.long
-    )  # they name vertices that only the real model has
+    )  # they index vertices that only the real model has
     rotation = torch.from_numpy(
         rigid.rotation_from_vector(np.concatenate([turn, pose], axis=1).reshape(4, 22, 3))
     ).float()

@@ -1,4 +1,4 @@
-"""Cameras are recovered from points that several of them show, and deviations are measured, not assumed."""
+"""Bundle adjustment recovers cameras and scale, and estimates standard deviations from residuals."""
 
 import numpy as np
 import pytest
@@ -13,8 +13,8 @@ NO_INDEX, NO_POINT = np.zeros(0, int), np.zeros((0, 3))
 NOTHING = pose_optimization.Correspondences(NO_INDEX, NO_INDEX, NO_POINT, NO_POINT, NO_POINT, np.zeros(0))
 
 
-def seen(rng, noise_px=0.0, depth_scale=1.0, noise_m=0.0):
-    """Return cameras along a curve and what they show of a cloud of points, some without depth."""
+def observed(rng, noise_px=0.0, depth_scale=1.0, noise_m=0.0):
+    """Return cameras along a curve and their observations of a point cloud, some without depth."""
     twist = np.linspace(0, 1, CAMERAS)[:, None] * np.array([0.1, -0.3, 0.1, 1.2, 0.2, 0.3])
     truth, cloud = rigid.exp(twist), rng.uniform((-0.6, -1, 2.5), (1.4, 1, 4.5), (POINTS, 3))
     camera, point = (each.ravel() for each in np.meshgrid(np.arange(CAMERAS), np.arange(POINTS)))
@@ -55,15 +55,15 @@ def displaced(truth, rng):
     return truth @ rigid.exp(error)
 
 
-def test_cameras_and_metres_are_recovered():
+def test_cameras_and_scale_are_recovered():
     rng = np.random.default_rng(0)
-    truth, tracked = seen(rng)
+    truth, tracked = observed(rng)
     assert np.abs(optimized(displaced(truth, rng), tracked) - truth).max() < 1e-4
 
 
-def test_false_matches_and_false_depth_do_not_count():
+def test_outliers_of_matches_and_depth_are_rejected():
     rng = np.random.default_rng(1)
-    truth, tracked = seen(rng, noise_px=0.3, noise_m=0.02)
+    truth, tracked = observed(rng, noise_px=0.3, noise_m=0.02)
     wrong = rng.random(len(tracked.camera)) < 0.05
     tracked.pixel[wrong] += rng.uniform(20, 40, (int(wrong.sum()), 2))
     tracked.depth_m[rng.random(len(wrong)) < 0.1] += 0.8
@@ -71,18 +71,18 @@ def test_false_matches_and_false_depth_do_not_count():
     assert np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.01, "metres"
 
 
-def test_depth_decides_on_metres_alone():
+def test_depth_determines_only_the_scale():
     rng = np.random.default_rng(2)
-    truth, tracked = seen(rng, noise_px=0.2, depth_scale=1.05)
+    truth, tracked = observed(rng, noise_px=0.2, depth_scale=1.05)
     found = optimized(truth, tracked)
     length = np.linalg.norm(found[-1, :3, 3]) / np.linalg.norm(truth[-1, :3, 3])
     assert length == pytest.approx(1.05, abs=0.005)
     assert np.rad2deg(rigid.rotation_angle(found[:, :3, :3], truth[:, :3, :3])).max() < 0.2, "degrees"
 
 
-def test_deviations_are_measured():
+def test_standard_deviations_are_estimated():
     rng = np.random.default_rng(3)
-    truth, tracked = seen(rng, noise_px=0.8, noise_m=0.06)
+    truth, tracked = observed(rng, noise_px=0.8, noise_m=0.06)
     term = PointTerm(tracked, truth)
     normal, gradient = term.normal_equations(truth)
     assert term.sigma_px == pytest.approx(0.8, rel=0.2)
@@ -91,10 +91,10 @@ def test_deviations_are_measured():
     assert gradient.shape == (6 * CAMERAS,)
 
 
-def test_the_lens_is_recovered():
-    """Pixels are nearer to the centre than a pinhole would show them."""
+def test_lens_distortion_is_recovered():
+    """Pixels are closer to the centre than with a pinhole."""
     rng, radial = np.random.default_rng(5), 0.05
-    truth, tracked = seen(rng)
+    truth, tracked = observed(rng)
     straight = (tracked.pixel - tracked.center_px) / FOCAL_PX
     shown = straight
     for _ in range(20):
@@ -106,7 +106,7 @@ def test_the_lens_is_recovered():
     assert np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.005, "metres"
 
 
-def test_points_that_show_twice_in_a_picture_are_none():
+def test_points_with_two_observations_in_a_picture_are_dropped():
     pixels = [np.array([[1.0, 2], [3, 4], [5, 6]]), np.array([[7.0, 8], [9, 10]])]
     depths, pinhole = [np.array([1.0, np.nan, 2]), np.array([3.0, 4])], np.repeat(np.eye(3)[None], 2, axis=0)
     links = [(0, 1, np.array([[0, 0], [1, 1], [2, 1]]))]
@@ -115,6 +115,6 @@ def test_points_that_show_twice_in_a_picture_are_none():
     assert found.camera.tolist() == found.lens.tolist() == [0, 1] and found.points == 1
 
 
-def test_points_that_pairs_of_cameras_share_are_counted():
-    _, tracked = seen(np.random.default_rng(4))
+def test_covisibility_counts_shared_points():
+    _, tracked = observed(np.random.default_rng(4))
     assert (tracked.covisibility(CAMERAS) == POINTS).all()

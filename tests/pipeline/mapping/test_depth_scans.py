@@ -1,6 +1,4 @@
-"""Depth against a surface: scans keep what can be trusted, contacts lie on the facing side, distances are
-signed.
-"""
+"""Registration of depth to a surface: filtering of scans, facing correspondences, signed distances."""
 
 import numpy as np
 import trimesh
@@ -13,14 +11,14 @@ K = np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]])
 
 
 def wall(z_m: float) -> Mesh:
-    """A wall facing -z, 4 m wide."""
+    """A wall that faces -z, 4 m wide."""
     grid = trimesh.creation.box((4.0, 4.0, 0.02)).subdivide_to_size(0.08)
     front = grid.triangles_center[:, 2] < -0.009
     vertices = grid.vertices + np.array([0, 0, z_m + 0.01])
     return Mesh(vertices.astype(np.float32), grid.faces[front].astype(np.int32))
 
 
-def test_scan_leaves_out_jumps_far_and_doubtful_depth():
+def test_scan_drops_discontinuities_and_distant_or_uncertain_depth():
     depth = np.full((48, 64), 2.0)
     depth[:, 40:] = 3.0
     depth[:8] = 0.0
@@ -37,7 +35,7 @@ def test_scan_leaves_out_jumps_far_and_doubtful_depth():
     assert np.allclose(found.points_camera[:, 2], 2.0)
 
 
-def test_a_scan_is_subsampled_evenly():
+def test_scan_is_subsampled_evenly():
     scan = depth_scans.scan(np.full((48, 64), 2.0), K, stride=2)
     few = scan.subsampled(100)
     assert len(few.points_camera) == len(few.sigma_m) == 100
@@ -50,7 +48,7 @@ def test_a_scan_is_subsampled_evenly():
     )
 
 
-def test_contacts_pull_a_camera_onto_the_wall():
+def test_correspondences_align_a_camera_to_the_wall():
     place = depth_scans.SurfaceMap(wall(2.0))
     scan = depth_scans.scan(np.full((48, 64), 2.0), K, stride=4)
     off = rigid.exp(np.array([[0.02, -0.015, 0, 0, 0, 0.06]]))
@@ -64,7 +62,7 @@ def test_contacts_pull_a_camera_onto_the_wall():
     assert np.abs(seen[:, 2] - 2.0).max() < 1e-3, "metres"
 
 
-def test_distance_is_signed_and_backs_are_no_contacts():
+def test_distance_is_signed_and_back_faces_are_no_correspondences():
     place = depth_scans.SurfaceMap(wall(2.0))
     assert np.allclose(place.distance(np.array([[0.0, 0, 1.9], [0.0, 0, 2.1]])), [0.1, -0.1], atol=1e-3)
     behind = rigid.exp(np.array([[0.0, np.pi, 0, 0, 0, 4.0]]))

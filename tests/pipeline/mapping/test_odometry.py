@@ -1,4 +1,4 @@
-"""Depth pictures align to one another, and a walk around a room closes its loop."""
+"""RGB-D odometry: pairwise alignment, loop closure and gravity."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def room() -> RayCaster:
 
 @pytest.fixture(scope="module")
 def circle(room):
-    """True poses of a circle around the middle, and noisy depth views from them."""
+    """True poses on a circle around the centre, and noisy depth views."""
     rng = np.random.default_rng(0)
     angles = np.linspace(0, 2 * np.pi * 1.05, 60)
     eyes = np.stack([1.1 * np.cos(angles), 1.0 + 0.1 * np.sin(3 * angles), 1.0 * np.sin(angles)], axis=1)
@@ -55,7 +55,7 @@ def circle(room):
 
 
 def drifted(poses, rng, radians=0.002, metres=0.004):
-    """Accumulate small random errors as odometry does."""
+    """Accumulate small random errors like odometry."""
     relative = rigid.inverse(poses[:-1]) @ poses[1:]
     steps = relative @ rigid.exp(
         np.c_[rng.normal(0, radians, (len(relative), 3)), rng.normal(0, metres, (len(relative), 3))]
@@ -74,7 +74,7 @@ def test_alignment_recovers_a_small_motion(circle):
     assert found.overlap > 0.5
 
 
-def test_pose_graph_spreads_a_closed_loop():
+def test_pose_graph_distributes_the_loop_closure_error():
     rng = np.random.default_rng(1)
     poses = np.stack(
         [rigid.exp(np.array([0, 2 * np.pi * i / 20, 0, np.sin(i / 3), 0, np.cos(i / 3)])) for i in range(20)]
@@ -90,7 +90,7 @@ def test_pose_graph_spreads_a_closed_loop():
     assert np.median(after) < 0.6 * np.median(before)
 
 
-def test_one_false_edge_does_little_harm():
+def test_pose_graph_is_robust_to_a_false_edge():
     poses = np.stack([rigid.exp(np.array([0, 0.1 * i, 0, 0.1 * i, 0, 0])) for i in range(15)])
     relative = rigid.inverse(poses[:-1]) @ poses[1:]
     edges = [RelativePose(i, i + 1, relative[i], np.diag([1e5] * 6), robust=False) for i in range(14)]
@@ -110,7 +110,7 @@ def test_drift_is_corrected(circle):
     assert found.edges >= 12
 
 
-def test_a_tracking_jump_is_closed(circle):
+def test_tracking_jump_is_repaired(circle):
     poses, views = circle
     odometry = drifted(poses, np.random.default_rng(2))
     odometry[35:] = rigid.exp(np.array([0, 0.1, 0, 0.5, 0, 0.3])) @ odometry[35:]
@@ -120,7 +120,7 @@ def test_a_tracking_jump_is_closed(circle):
     )
 
 
-def test_chain_needs_no_odometry(circle):
+def test_chained_alignment_needs_no_odometry(circle):
     poses, views = circle
     rng, relative = np.random.default_rng(4), rigid.inverse(poses[:-1]) @ poses[1:]
     guesses = relative @ rigid.exp(rng.normal(0, [0.02] * 3 + [0.03] * 3, (len(relative), 6)))
@@ -132,7 +132,7 @@ def test_chain_needs_no_odometry(circle):
     assert error < 0.12, "metres over a walk of 1.2 m along plain walls"
 
 
-def test_level_finds_up(circle):
+def test_gravity_is_estimated(circle):
     poses, views = circle
     tilted = rigid.exp(np.array([0.25, 0.1, -0.2, 0, 0, 0])) @ poses
     up = (
@@ -143,7 +143,7 @@ def test_level_finds_up(circle):
     assert np.degrees(np.arccos(np.clip(up[:, 1], -1, 1))).max() < 1.0
 
 
-def test_ground_is_the_level_below_the_focus():
+def test_floor_is_the_plane_below_the_focus():
     rng = np.random.default_rng(3)
     floor = np.c_[rng.uniform(-1, 1, 4000), rng.normal(0, 0.004, 4000), rng.uniform(-1, 1, 4000)]
     seat = np.c_[rng.uniform(-0.3, 0.3, 2500), rng.normal(0.45, 0.004, 2500), rng.uniform(-0.3, 0.3, 2500)]

@@ -1,4 +1,4 @@
-"""Pictures tell whether depth, intrinsics and poses are right, and which other reading of them is."""
+"""Photometric checks of depth, intrinsics and poses, and detection of the correct interpretation."""
 
 from dataclasses import replace
 from functools import cache
@@ -12,12 +12,12 @@ from pipeline.mapping.picture_agreement import PosedPicture
 from tests.stages import textured_room
 
 APART, CLOCK = 4, 2
-"""frames between the pictures of a pair, and between a picture and those earlier and later"""
+"""frames between the pictures of a pair, and offset of delayed pictures"""
 
 
 @cache
 def _recording(seed: int = 0, frames: int = 40) -> list[PosedPicture]:
-    """A walk through a textured room with LiDAR's noise; light changes from frame to frame."""
+    """A walk through a textured room with LiDAR noise and changing light."""
     mesh = textured_room.textured_room(seed, edge_m=0.06)
     caster, size, rng = RayCaster(mesh), textured_room.SIZE, np.random.default_rng(seed)
     walked = textured_room.walk(frames + 2 * CLOCK, seed=7)
@@ -100,7 +100,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("right", FAULTS)
-def test_a_fault_is_named_by_what_would_be_right(right):
+def test_fault_is_identified(right):
     found = _check([FAULTS[right](each) for each in _recording()])
     assert (found.verdict, found.better) == ("contradict", right), found
     assert right in found.reason
@@ -108,13 +108,13 @@ def test_a_fault_is_named_by_what_would_be_right(right):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_right_recording_agrees(seed):
+def test_correct_recording_agrees(seed):
     found = _check(_recording(seed))
     assert found.verdict == "agree", found
     assert found.correlation > 0.5
 
 
-def test_poses_from_elsewhere_are_not_confirmed():
+def test_unrelated_poses_are_not_confirmed():
     pictures, others = _recording(), textured_room.walk(40, seed=2)
     elsewhere = [
         replace(each, world_from_camera=dict.fromkeys(("", "earlier", "later"), pose))
@@ -123,13 +123,13 @@ def test_poses_from_elsewhere_are_not_confirmed():
     assert _check(elsewhere).verdict == "unconfirmed"
 
 
-def test_small_errors_are_no_contradiction():
-    """Readings are 10 % apart, so errors of a good phone's calibration, 1 %, stay nearest to none."""
+def test_small_errors_are_tolerated():
+    """Hypotheses differ by 10 %, so the 1 % calibration error of a good phone stays closest to no fault."""
     for fault in (_depth(1.01), _focal(0.99)):
         assert _check([fault(each) for each in _recording()]).verdict == "agree"
 
 
-def test_too_little_is_untested():
+def test_too_few_pictures_are_untested():
     assert _check(_recording()[:10]).verdict == "untested"
     still = [
         replace(each, depth={clock: 0 * depth for clock, depth in each.depth.items()})

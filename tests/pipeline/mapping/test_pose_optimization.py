@@ -1,4 +1,4 @@
-"""Relaxing poses: contacts pull displaced cameras back, odometry bridges what contacts leave open."""
+"""Pose optimization: correspondences recover displaced cameras, odometry constrains the others."""
 
 import dataclasses
 
@@ -12,7 +12,9 @@ FRAMES = 12
 
 
 def corridor(rng):
-    """Return true poses along a curve and points on three walls, so that planes fix all six directions."""
+    """Return true poses along a curve and points on three walls, whose planes constrain all six degrees of
+    freedom.
+    """
     time = np.linspace(0, 1, FRAMES)
     twist = np.stack(
         [
@@ -32,7 +34,7 @@ def corridor(rng):
 
 
 def plane_correspondences(truth, points, normals, frames):
-    """Return contacts of every point of the walls with the map, as the given frames saw them."""
+    """Return correspondences of all wall points with the map, as observed by the given frames."""
     first = np.repeat(frames, len(points))
     seen = np.concatenate([rigid.apply(rigid.inverse(truth[frame]), points) for frame in frames])
     tiled = np.tile(points, (len(frames), 1))
@@ -47,7 +49,7 @@ def plane_correspondences(truth, points, normals, frames):
     )
 
 
-def test_contacts_recover_displaced_cameras():
+def test_correspondences_recover_displaced_cameras():
     rng = np.random.default_rng(0)
     _, truth, points, normals = corridor(rng)
     start = truth @ rigid.exp(rng.normal(0, 0.05, (FRAMES, 6)))
@@ -57,7 +59,7 @@ def test_contacts_recover_displaced_cameras():
     assert np.abs(found.residual_m).max() < 1e-5
 
 
-def test_odometry_carries_frames_without_contacts():
+def test_odometry_constrains_frames_without_correspondences():
     rng = np.random.default_rng(1)
     time, truth, points, normals = corridor(rng)
     moved = rigid.exp(np.array([0.1, -0.4, 0.2, 1.0, 2.0, 3.0])) @ truth
@@ -68,7 +70,7 @@ def test_odometry_carries_frames_without_contacts():
     assert np.abs(found.world_from_camera - truth).max() < 1e-4
 
 
-def test_pairs_of_cameras_share_points_and_held_frames_stay():
+def test_covisible_pairs_are_aligned_and_fixed_frames_stay():
     rng = np.random.default_rng(2)
     _, truth, _, _ = corridor(rng)
     first, second = np.repeat(np.arange(FRAMES - 1), 60), np.repeat(np.arange(1, FRAMES), 60)
@@ -90,7 +92,7 @@ def test_pairs_of_cameras_share_points_and_held_frames_stay():
     assert (found.world_from_camera[0] == truth[0]).all()
 
 
-def test_gross_outliers_do_not_move_the_answer():
+def test_gross_outliers_are_rejected():
     rng = np.random.default_rng(3)
     _, truth, points, normals = corridor(rng)
     correspondences = plane_correspondences(truth, points, normals, np.arange(FRAMES))
@@ -103,7 +105,7 @@ def test_gross_outliers_do_not_move_the_answer():
     assert rigid.rotation_angle(found.world_from_camera[:, :3, :3], truth[:, :3, :3]).max() < np.deg2rad(0.3)
 
 
-def test_spread_is_the_diagonal_of_the_inverse_and_grows_away_from_contacts():
+def test_marginal_covariance_is_correct_and_grows_away_from_correspondences():
     rng = np.random.default_rng(3)
     time, truth, points, normals = corridor(rng)
     correspondences = plane_correspondences(truth, points[:40], normals[:40], np.array([0, 1, 2]))
@@ -117,7 +119,7 @@ def test_spread_is_the_diagonal_of_the_inverse_and_grows_away_from_contacts():
     assert (np.diff(size[2:]) > 0).all(), "metres: what odometry alone carries drifts"
 
 
-def test_contradictions_are_measured_in_deviations():
+def test_inconsistencies_are_in_standard_deviations():
     rng = np.random.default_rng(6)
     _, truth, points, normals = corridor(rng)
     exact = plane_correspondences(truth, points, normals, np.arange(FRAMES))

@@ -1,4 +1,4 @@
-"""Odometry that jumps: the jump is told from fast walking, missing frames and tipping, and taken out."""
+"""Detection and repair of tracking jumps, without false alarms for fast motion, gaps and tilting."""
 
 import numpy as np
 
@@ -12,13 +12,13 @@ TIME_S = 0.1 * np.arange(60)
 
 
 def jumping(odometry, frame, metres=0.6):
-    """Let tracking jump before a frame: all that follows is displaced and turned."""
+    """Insert a tracking jump before a frame: all later poses are displaced and rotated."""
     displaced = odometry.copy()
     displaced[frame:] = rigid.exp(np.array([0, 0.2, 0, metres, 0, 0])) @ odometry[frame:]
     return displaced
 
 
-def test_a_jump_is_found_and_repaired():
+def test_jump_is_detected_and_repaired():
     truth = walk(60)
     odometry = jumping(jumping(drifting(truth, 4, deg=0.03, m=0.001), 20), 41, 0.9)
     jumps = find_jumps(TIME_S, odometry)
@@ -27,13 +27,13 @@ def test_a_jump_is_found_and_repaired():
     assert aligned_errors(repair(TIME_S, odometry, jumps), truth)[1].max() < 0.03, "metres, drift included"
 
 
-def test_one_frame_elsewhere_tears_twice():
+def test_single_displaced_frame_gives_two_jumps():
     odometry = walk(60)
     odometry[30, :3, 3] += 1.0
     assert np.flatnonzero(find_jumps(TIME_S, odometry)).tolist() == [30, 31]
 
 
-def test_what_hands_do_is_no_tear():
+def test_hand_motion_is_no_jump():
     ends = np.array([0.0, 2.0, 2.5, 6.0])
     lunge = rigid.make(
         np.eye(3), np.interp(TIME_S, ends, [0.0, 1.0, 3.5, 5.0])[:, None] * np.array([1.0, 0, 0])
@@ -54,7 +54,7 @@ def test_what_hands_do_is_no_tear():
         assert repair(time_s, odometry, jumps) is odometry
 
 
-def test_depth_decides_on_what_a_hand_could_do():
+def test_depth_decides_ambiguous_motion():
     truth, caster = walk(60), RayCaster(textured_room(edge_m=0.5))
 
     def view(frame):

@@ -1,4 +1,4 @@
-"""Motion from pictures with depth: right where there is texture, a jump where there is none."""
+"""Visual odometry with depth: correct with texture, a jump without."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from pipeline.metrics.pose_errors import pose_errors
 from tests.stages.textured_room import INTRINSICS, MemoryClip, textured_room, walk
 
 
-def test_motion_is_chained_and_a_blind_frame_is_a_jump():
+def test_motion_is_chained_and_a_textureless_frame_is_a_jump():
     truth = walk(60)[20:28]
     clip = MemoryClip(RayCaster(textured_room()), truth, None)
 
@@ -25,7 +25,7 @@ def test_motion_is_chained_and_a_blind_frame_is_a_jump():
     assert found.relative_poses.sigma_m[3] > 10 * found.relative_poses.sigma_m[0]
 
 
-def test_a_phone_that_is_swung_about_is_followed():
+def test_fast_rotation_is_tracked():
     truth = walk(60)[20:25].copy()
     truth[2:] = truth[2:] @ rigid.exp(np.array([0, 0, np.deg2rad(120.0), 0, 0, 0]))
     clip = MemoryClip(RayCaster(textured_room()), truth, None)

@@ -1,4 +1,4 @@
-"""LPIPS: the published network, checked with small random weights that the test writes."""
+"""LPIPS with small random weights in the published format."""
 
 from pathlib import Path
 
@@ -14,21 +14,21 @@ RNG = np.random.default_rng(0)
 
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
-    """Write random weights in the form in which both files are published."""
+    """Write random weights in the published format of both files."""
     generator, inner, features = torch.Generator().manual_seed(0), 3, {}
     for index, channels, kernel, *_ in CONVOLUTIONS:
         shape = (channels, inner, kernel, kernel)
         features[f"features.{index}.weight"] = 0.05 * torch.randn(shape, generator=generator)
         features[f"features.{index}.bias"] = torch.zeros(channels)
         inner = channels
-    features["classifier.1.weight"] = torch.zeros(4, 4)  # torchvision's file holds more than is needed
+    features["classifier.1.weight"] = torch.zeros(4, 4)  # the file of torchvision has further weights
     torch.save(features, tmp_path / ALEXNET_FILE)
     lin = {f"lin{n}.model.1.weight": torch.rand(1, each[1], 1, 1) for n, each in enumerate(CONVOLUTIONS)}
     torch.save(lin, tmp_path / CHANNELS_FILE)
     return tmp_path
 
 
-def test_distance_grows_with_noise_and_stays_where_the_noise_is(weights: Path):
+def test_distance_increases_with_noise_and_is_local(weights: Path):
     model, true = Lpips.load(weights), RNG.uniform(0, 1, (96, 128, 3))
     assert model.distance(true, true).max() == 0
     noise = RNG.normal(0, 1, true.shape)
@@ -40,8 +40,10 @@ def test_distance_grows_with_noise_and_stays_where_the_noise_is(weights: Path):
     assert where[:24].mean() > 5 * where[-32:].mean()
 
 
-def test_the_mean_is_the_published_sum_of_layers(weights: Path):
-    """Against the formula written out: mean over places of weighted squared differences of unit features."""
+def test_distance_equals_the_published_formula(weights: Path):
+    """Compares with the explicit formula: the mean over positions of weighted squared differences of unit
+    features.
+    """
     model, pair = Lpips.load(weights), RNG.uniform(0, 1, (2, 127, 127, 3))
     images = [torch.as_tensor(image, dtype=torch.float32).permute(2, 0, 1)[None] for image in pair]
     expected = sum(
@@ -56,7 +58,7 @@ def test_small_pictures_are_not_measured(weights: Path):
     assert np.isnan(Lpips.load(weights).distance(np.zeros((40, 90, 3)), np.zeros((40, 90, 3)))).all()
 
 
-def test_missing_and_foreign_weights_are_named(weights: Path, tmp_path: Path):
+def test_missing_and_wrong_weights_are_refused(weights: Path, tmp_path: Path):
     with pytest.raises(InputError, match="MOD-001"):
         Lpips.load(tmp_path / "nowhere")
     torch.save({"features.0.weight": torch.zeros(3)}, weights / ALEXNET_FILE)

@@ -1,4 +1,4 @@
-"""No key of the metrics reaches a reader raw."""
+"""Metric keys are formatted as words."""
 
 import pytest
 
@@ -29,5 +29,5 @@ from pipeline.metrics.words import describe
         ("else/never_heard_of", "never heard of", ""),
     ],
 )  # fmt: skip
-def test_keys_become_words(key: str, text: str, unit: str):
+def test_keys_are_formatted_as_words(key: str, text: str, unit: str):
     assert (describe(key).text, describe(key).unit) == (text, unit)

@@ -1,4 +1,4 @@
-"""The same small walk through a room written the way every app and data set writes it."""
+"""Writers of the same short walk through a room in the format of every supported app and data set."""
 
 import json
 from fractions import Fraction
@@ -14,7 +14,7 @@ from pipeline.geometry import cameras
 from tests.stages.extract_frames.made_recordings import Made, write_zip
 
 START_S = 65575.6
-"""device uptime at which Stray Scanner and TUM begin to count"""
+"""device uptime at the start of Stray Scanner and TUM recordings"""
 
 
 def png(image: np.ndarray) -> bytes:
@@ -44,7 +44,7 @@ def write_movie(
     aspect: Fraction = Fraction(1),
     pixels: str = "yuv444p",
 ) -> None:
-    """Write a video; `tags` are the file's, `aspect` is a pixel's width over its height."""
+    """Write a video; `tags` are container tags, `aspect` is the pixel aspect ratio."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w", options={"movflags": "use_metadata_tags"} if tags else {}) as container:
         container.metadata.update(tags or {})
@@ -61,14 +61,13 @@ def write_movie(
 
 
 def stored_cameras(made: Made) -> np.ndarray:
-    """Camera to world with OpenCV axes of the stored pictures."""
+    """World-from-camera poses with OpenCV axes of the stored pictures."""
     return made.stored_from_upright(made.world_from_camera)
 
 
 def quaternion_poses(made: Made) -> np.ndarray:
-    """[frame 7] qx qy qz qw x y z with OpenCV axes.
-
-    The sign of every second quaternion is flipped, as apps do.
+    """[frame 7] qx qy qz qw x y z with OpenCV axes; every second quaternion has the opposite sign, as in some
+    apps.
     """
     from pipeline.recordings.recording import pose_from_matrix
 
@@ -120,7 +119,7 @@ def polycam(folder: Path, made: Made, corrected: bool = False) -> Path:
 
 
 def polycam_mesh(folder: Path, mesh: trimesh.Trimesh, aligned_from_world: np.ndarray) -> None:
-    """Add the app's own mesh as it stores it: turned to its own axes, and the turn beside it."""
+    """Add the mesh of the app, in its own axes, and the transform beside it."""
     (folder / "raw.glb").write_bytes(mesh.copy().apply_transform(aligned_from_world).export(file_type="glb"))
     (folder / "mesh_info.json").write_text(
         json.dumps({"alignmentTransform": aligned_from_world.T.ravel().tolist()})
@@ -128,7 +127,7 @@ def polycam_mesh(folder: Path, mesh: trimesh.Trimesh, aligned_from_world: np.nda
 
 
 def nerfcapture(folder: Path, made: Made, reach_m: float = 8.0) -> Path:
-    """The streamed folder: depth enlarged to the picture's size, so many metres over the 16 bits."""
+    """The streamed folder: depth upsampled to the picture, with a scale in metres for 16 bits."""
     members, frames, scale = {}, [], reach_m / 65535
     fl_x, fl_y, cx, cy = coefficients(made)
     for i, camera in enumerate(cameras.opencv_from_opengl(stored_cameras(made))):
@@ -146,7 +145,7 @@ def nerfcapture(folder: Path, made: Made, reach_m: float = 8.0) -> Path:
 
 
 def nerfcapture_zip(path: Path, made: Made) -> Path:
-    """What the phone saves: depth that is no metres."""
+    """The archive that the phone saves, with depth that is not metric."""
     frames = [dict(file_path="images/0", transform_matrix=np.eye(4).tolist(), timestamp=0.0)]
     table = dict(w=48, h=64, fl_x=50.0, fl_y=50.0, cx=24.0, cy=32.0, depth_integer_scale=1.0, frames=frames)
     write_zip(path, {"transforms.json": json.dumps(table).encode(), "images/0.png": png(made.color(0))})
@@ -154,7 +153,7 @@ def nerfcapture_zip(path: Path, made: Made) -> Path:
 
 
 def tum(folder: Path, made: Made, poses: bool = True, per_meter: float = 5000) -> Path:
-    """Depth and poses come some milliseconds after the colour, as from a sensor of its own."""
+    """Depth and poses have timestamps some milliseconds after colour, as from separate sensors."""
     times = START_S + made.timestamp_s
     members: dict[str, bytes | str] = {"intrinsics.txt": " ".join(map(str, coefficients(made)))}
     for i, time in enumerate(times):

@@ -1,6 +1,4 @@
-"""Depth of a camera of its own comes out as the colour camera would have measured it, edges and shadows
-included.
-"""
+"""Reprojection of depth from a separate depth camera to the colour camera, with edges and occlusions."""
 
 import numpy as np
 import pytest
@@ -23,7 +21,7 @@ DEPTH_FROM_COLOR = rigid.make(
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5], ids=["same size", "half the size"])
-def test_depth_is_what_the_colour_camera_would_measure(share):
+def test_reprojected_depth_equals_that_of_the_colour_camera(share):
     mesh = textured_room.textured_room(edge_m=0.05)
     caster, place = RayCaster(mesh), textured_room.walk(20)[7]
     size = tuple(round(side * share) for side in DEPTH_SIZE)
@@ -41,8 +39,8 @@ def test_depth_is_what_the_colour_camera_would_measure(share):
     assert (error > 0.1).mean() < 0.03 < (before > 0.1).mean() + 0.02
 
 
-def test_what_the_colour_camera_cannot_see_is_hidden():
-    """A post 1 m away hides another strip of the wall for each camera: the nearer surface wins."""
+def test_occluded_surfaces_are_removed():
+    """A post at 1 m occludes different strips of the wall in each camera: the nearer surface wins."""
     depth = np.full(DEPTH_SIZE, 3.0, np.float32)
     depth[:, 150:170] = 1.0
     camera = DepthCamera(COLOR, rigid.make(np.eye(3), np.array([0.05, 0.0, 0.0])), DEPTH_SIZE)
@@ -54,7 +52,7 @@ def test_what_the_colour_camera_cannot_see_is_hidden():
     assert (shadow == 0).all(), "the depth camera never saw it"
 
 
-def test_files_beside_a_recording_describe_the_depth_camera(tmp_path):
+def test_sidecar_describes_the_depth_camera(tmp_path):
     made = walk(12)
     aligned = open_recording(made_formats.tum(tmp_path / "a", made))
     assert aligned.depth_camera is None

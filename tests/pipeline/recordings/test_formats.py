@@ -1,7 +1,4 @@
-"""One walk, written in every format, comes back the same.
-
-Upright, metric, with its poses, whatever the app stores.
-"""
+"""Readers of all recording formats: the same walk is read back upright, metric and with poses."""
 
 import codecs
 import json
@@ -25,9 +22,9 @@ from tests.pipeline.recordings import made_formats
 from tests.stages.extract_frames.made_recordings import Made, walk, write_zip
 
 LANDSCAPE = 3
-"""quarter turns from upright to the sensor landscape in which iPhones store pictures"""
+"""quarter turns from upright to the landscape orientation in which iPhones store pictures"""
 RATE_HZ = 15.0
-"""of the made walk: all formats can tell its times exactly"""
+"""of the synthetic walk, whose timestamps all formats can represent exactly"""
 CASES = {
     "Stray Scanner": (made_formats.stray, LANDSCAPE),
     "Polycam raw data": (made_formats.polycam, LANDSCAPE),
@@ -48,7 +45,7 @@ def _frames(recording, plan):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_walk_comes_back(tmp_path, name):
+def test_walk_is_read_back(tmp_path, name):
     write, turns = CASES[name]
     made, upright = walk(18, rate_hz=RATE_HZ, quarter_turns=turns), walk(18, rate_hz=RATE_HZ)
     path = write(tmp_path / "walkthrough", made)
@@ -102,7 +99,7 @@ MENDED = {
 
 
 @pytest.mark.parametrize("name", MENDED)
-def test_rows_that_record3d_left_out_cost_no_more_than_themselves(tmp_path, name):
+def test_missing_record3d_rows_drop_only_their_frames(tmp_path, name):
     change, frames, remark = MENDED[name]
     made = walk(12, rate_hz=RATE_HZ)
     made.metadata |= change
@@ -114,7 +111,7 @@ def test_rows_that_record3d_left_out_cost_no_more_than_themselves(tmp_path, name
     )
 
 
-def test_the_first_frames_intrinsics_stand_in_for_missing_ones(tmp_path):
+def test_missing_intrinsics_are_those_of_the_first_frame(tmp_path):
     made = walk(6)
     made.metadata["perFrameIntrinsicCoeffs"] = [
         [51, 53, 25, 31],
@@ -134,18 +131,18 @@ def _powershell(data: bytes) -> bytes:
     return data.decode().encode("utf-16")
 
 
-def _noted(data: bytes) -> bytes:
-    """With the columns in another order and one of words."""
+def _with_text_column(data: bytes) -> bytes:
+    """With reordered columns and a text column."""
     rows = [row.split(b", ") for row in data.split(b"\n")]
     notes = [b"note", *[b"sofa"] * (len(rows) - 1)]
     return b"\n".join(b", ".join([*row[5:], note, *row[:5]]) for row, note in zip(rows, notes, strict=True))
 
 
 @pytest.mark.parametrize(
-    "saved", [_windows, _powershell, _noted, lambda data: data.replace(b"time", b"Time")]
+    "saved", [_windows, _powershell, _with_text_column, lambda data: data.replace(b"time", b"Time")]
 )
-def test_times_of_an_odometry_survive_whatever_saved_it(tmp_path, saved):
-    """The video's own times are counted, four times too fast here: without the column all would be wrong."""
+def test_odometry_times_are_read_from_reformatted_files(tmp_path, saved):
+    """The timestamps of the video are four times too fast, so that only the column is correct."""
     path = made_formats.stray(tmp_path / "a", walk(8, rate_hz=RATE_HZ, quarter_turns=LANDSCAPE))
     (path / "odometry.csv").write_bytes(saved((path / "odometry.csv").read_bytes()))
     np.testing.assert_allclose(open_recording(path).timestamp_s, np.arange(8) / RATE_HZ, atol=1e-6)
@@ -153,7 +150,7 @@ def test_times_of_an_odometry_survive_whatever_saved_it(tmp_path, saved):
 
 @pytest.mark.parametrize("saved", [_windows, _powershell])
 @pytest.mark.parametrize("write", [made_formats.tum, made_formats.video_and_depth, made_formats.seven_scenes])
-def test_text_files_may_come_from_windows(tmp_path, write, saved):
+def test_windows_text_files_are_read(tmp_path, write, saved):
     made = walk(6)
     path = write(tmp_path / "a", made)
     for file in path.glob("*.txt"):
@@ -163,7 +160,7 @@ def test_text_files_may_come_from_windows(tmp_path, write, saved):
     np.testing.assert_allclose(np.abs(recording.pose), np.abs(made_formats.quaternion_poses(made)), atol=1e-6)
 
 
-def test_tum_lists_may_be_written_on_windows(tmp_path):
+def test_windows_tum_lists_are_read(tmp_path):
     path = made_formats.tum(tmp_path / "a", walk(6))
     for name in ("rgb.txt", "depth.txt"):
         text = (path / name).read_text()
@@ -171,7 +168,7 @@ def test_tum_lists_may_be_written_on_windows(tmp_path):
     assert len(open_recording(path).index) == 6
 
 
-def test_hidden_files_of_a_mac_are_not_seen(tmp_path):
+def test_hidden_macos_files_are_ignored(tmp_path):
     path = made_formats.video_and_depth(tmp_path / "a", walk(6))
     before = recording_digest(path)
     for name in ("._clip.mov", ".DS_Store", "depth/._000001.png"):
@@ -181,7 +178,7 @@ def test_hidden_files_of_a_mac_are_not_seen(tmp_path):
 
 
 def test_depth_that_is_numbered_from_1_is_refused(tmp_path):
-    """As ffmpeg numbers pictures: every frame would get its neighbour's depth."""
+    """ffmpeg numbers pictures from 1; every frame would get the depth of its neighbour."""
     path = made_formats.video_and_depth(tmp_path / "a", walk(6))
     for number in range(5, -1, -1):
         (path / f"depth/{number:06d}.png").rename(path / f"depth/{number + 1:06d}.png")
@@ -190,17 +187,17 @@ def test_depth_that_is_numbered_from_1_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("columns", [7, 9, 15])
-def test_every_age_of_stray_scanner_is_read(tmp_path, columns):
+def test_all_versions_of_stray_scanner_are_read(tmp_path, columns):
     made = walk(8, quarter_turns=LANDSCAPE)
     recording = open_recording(made_formats.stray(tmp_path / "a", made, columns))
     np.testing.assert_allclose(recording.intrinsics[5], made.intrinsics, atol=1e-6)
     np.testing.assert_allclose(np.abs(recording.pose), np.abs(made_formats.quaternion_poses(made)), atol=1e-9)
-    if columns > 7:  # the oldest has no times but the video's
+    if columns > 7:  # the oldest version has only the timestamps of the video
         np.testing.assert_allclose(recording.timestamp_s, made.timestamp_s, atol=1e-6)
 
 
 @pytest.mark.parametrize(("app", "folder"), [("stray", "confidence"), ("polycam", "keyframes/confidence")])
-def test_a_frame_without_confidence_is_not_trusted_and_the_others_are_as_measured(tmp_path, app, folder):
+def test_missing_confidence_is_zero_for_that_frame_only(tmp_path, app, folder):
     path = getattr(made_formats, app)(tmp_path / "a", walk(8, quarter_turns=LANDSCAPE))
     sorted((path / folder).iterdir())[3].unlink()
     recording = open_recording(path)
@@ -209,7 +206,7 @@ def test_a_frame_without_confidence_is_not_trusted_and_the_others_are_as_measure
     assert [np.unique(each).tolist() for each in confidence] == [[0] if i == 3 else [1] for i in range(8)]
 
 
-def test_frames_without_depth_shift_nothing(tmp_path):
+def test_frames_without_depth_do_not_shift_others(tmp_path):
     made = walk(12, quarter_turns=LANDSCAPE)
     path = made_formats.stray(tmp_path / "a", made)
     (path / "depth" / "000004.png").unlink()
@@ -219,7 +216,7 @@ def test_frames_without_depth_shift_nothing(tmp_path):
     assert np.abs(recording.read_color(9).astype(int) - made.color(9)).mean() < 4
 
 
-def test_times_of_a_real_odometry_are_its_own():
+def test_odometry_timestamps_are_used():
     text = (
         "timestamp, frame, x, y, z, qx, qy, qz, qw, fx, fy, cx, cy, "
         "distortion_center_x, distortion_center_y\n"
@@ -233,7 +230,7 @@ def test_times_of_a_real_odometry_are_its_own():
     assert rows.coefficients[:, 0].tolist() == [1597.8, 1604.2]
 
 
-def test_lost_tracking_leaves_frames_out_or_all_poses(tmp_path):
+def test_lost_tracking_drops_frames_or_all_poses(tmp_path):
     path = made_formats.seven_scenes(tmp_path / "a", walk(20))
     lost = sorted(path.glob("*.pose.txt"))[5:7]
     for file in lost:
@@ -248,7 +245,7 @@ def test_lost_tracking_leaves_frames_out_or_all_poses(tmp_path):
     assert "50 % of the frames have no device pose" in plan.pose_check.reason
 
 
-def test_corrected_polycam_pictures_win_and_their_borders_are_no_depth(tmp_path):
+def test_corrected_polycam_pictures_are_preferred_and_their_borders_have_no_depth(tmp_path):
     made = walk(6, quarter_turns=LANDSCAPE)
     drawn = Made.color
     dark = walk(6, quarter_turns=LANDSCAPE)
@@ -269,7 +266,7 @@ def test_corrected_polycam_pictures_win_and_their_borders_are_no_depth(tmp_path)
 
 
 @pytest.mark.parametrize("ending", [".png", ".jpg"])
-def test_streams_may_name_pictures_without_their_ending(tmp_path, ending):
+def test_stream_file_names_may_lack_the_extension(tmp_path, ending):
     path = made_formats.nerfcapture(tmp_path / "a", walk(6))
     table = json.loads((path / "transforms.json").read_text())
     for frame in table["frames"]:
@@ -283,7 +280,7 @@ def test_streams_may_name_pictures_without_their_ending(tmp_path, ending):
 
 
 @pytest.mark.parametrize("per_meter", [1000, 5000, 10_000])
-def test_poses_tell_millimetres_from_the_units_of_the_set(tmp_path, per_meter):
+def test_poses_distinguish_millimetres_from_dataset_units(tmp_path, per_meter):
     made = walk(18, rate_hz=RATE_HZ)
     recording = open_recording(made_formats.tum(tmp_path / "a", made, per_meter=per_meter))
     np.testing.assert_allclose(recording.read_depth(3), made.depth(3), atol=1e-3)
@@ -302,7 +299,7 @@ def test_poses_name_the_unit_in_which_depth_would_agree(tmp_path, per_meter, nam
     assert f"depth {named}would agree with them" in plan.pose_check.reason or not named
 
 
-def test_a_file_tells_the_units_of_depth(tmp_path):
+def test_depth_scale_file_gives_the_depth_unit(tmp_path):
     made = walk(6)
     path = made_formats.tum(tmp_path / "a", made, poses=False, per_meter=256)
     (path / "depth_scale.txt").write_text("# units per metre\n256\n")
@@ -315,12 +312,12 @@ def test_a_file_tells_the_units_of_depth(tmp_path):
             open_recording(path)
 
 
-def test_associated_by_time():
+def test_streams_are_associated_by_time():
     times = np.array([0.0, 0.1, 0.2, 5.0])
     assert tum.nearest(times, np.array([0.015, 0.19]), 0.02).tolist() == [0, -1, 1, -1]
 
 
-def test_a_video_knows_its_damage(tmp_path):
+def test_damaged_frames_of_a_video_are_reported(tmp_path):
     made = walk(40)
     made_formats.write_movie(tmp_path / "a.mp4", [made.color(i) for i in range(40)], rate=15)
     data = bytearray((tmp_path / "a.mp4").read_bytes())
@@ -339,7 +336,7 @@ def test_a_video_knows_its_damage(tmp_path):
     assert 20 < sum(right) < 40
 
 
-def test_a_video_is_read_in_any_order(tmp_path):
+def test_video_frames_are_read_in_any_order(tmp_path):
     made = walk(30)
     made_formats.write_movie(tmp_path / "a.mp4", [made.color(i) for i in range(30)])
     movie = Movie(tmp_path / "a.mp4")
@@ -347,25 +344,27 @@ def test_a_video_is_read_in_any_order(tmp_path):
         assert np.abs(movie.read(number).astype(int) - made.color(number)).mean() < 0.6, number
 
 
-def test_pictures_stored_behind_a_later_key_frame_are_found(tmp_path):
-    """HEVC of phones: decoding from that key frame alone would leave them out."""
+def test_pictures_stored_after_a_later_key_frame_are_decoded(tmp_path):
+    """HEVC of phones: decoding from that key frame alone would drop them."""
     open_groups = "log-level=none:keyint=10:min-keyint=10:bframes=4:open-gop=1:scenecut=0"
     pictures = [np.full((64, 64, 3), 5 * i, np.uint8) for i in range(40)]
     made_formats.write_movie(
         tmp_path / "a.mov", pictures, codec="libx265", options={"x265-params": open_groups}
     )
-    for number in range(39, -1, -1):  # backwards: every one is looked for anew
+    for number in range(39, -1, -1):  # backwards: each requires a new seek
         found = Movie(tmp_path / "a.mov").read(number)
         assert found is not None and abs(float(found.mean()) - 5 * number) < 3, number
 
 
 BT2020_FROM_BT709 = np.array([[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]])
 MASTERED = "G(8500,39850)B(6550,2300)R(35400,14600)WP(15635,16450)L(10000000,1)"
-"""on a display of 1000 cd/m2, as Samsung writes"""
+"""mastering display of 1000 cd/m2, as written by Samsung phones"""
 
 
 def _hdr(srgb, curve):
-    """Encode a picture whose white is 203 cd/m2 (ITU-R BT.2408) by the curves of ITU-R BT.2100, 0..1."""
+    """Encode a picture with a white of 203 cd/m2 (ITU-R BT.2408) by the transfer functions of ITU-R BT.2100,
+    0..1.
+    """
     shown = 0.203 * images.linear_from_srgb(srgb / 255) @ BT2020_FROM_BT709.T  # of 1000 cd/m2
     if curve == "smpte2084":
         power = (shown / 10) ** 0.1593017578125
@@ -375,10 +374,12 @@ def _hdr(srgb, curve):
     return np.where(light < 1 / 12, dark, 0.17883277 * bright + 0.55991073)
 
 
-@pytest.mark.slow  # tables of colours, once per video
+@pytest.mark.slow  # colour look-up tables, once per video
 @pytest.mark.parametrize("curve", ["arib-std-b67", "smpte2084"])
-def test_hdr_has_the_colours_of_an_ordinary_video(tmp_path, curve):
-    """iPhone writes HLG, Samsung PQ: as they are they look washed out. 8 bits of HDR tell 8 levels apart."""
+def test_hdr_is_converted_to_standard_colours(tmp_path, curve):
+    """iPhones write HLG, Samsung phones PQ, which look washed out without conversion. Tolerance: 8 levels,
+    since 8-bit HDR is coarse.
+    """
     color = np.array([[40, 40, 40], [128, 128, 128], [235, 235, 235], [200, 40, 40], [224, 172, 140]])
     picture = np.repeat(np.repeat(color[None], 32, axis=0), 32, axis=1)
     stored = np.rint(255 * _hdr(picture, curve)).astype(np.uint8)
@@ -392,7 +393,7 @@ def test_hdr_has_the_colours_of_an_ordinary_video(tmp_path, curve):
 
 
 @pytest.mark.parametrize(("rows", "matrix"), [(720, Colorspace.ITU709), (480, Colorspace.SMPTE170M)])
-def test_video_that_names_no_color_matrix_is_read_by_that_of_its_size(tmp_path, rows, matrix):
+def test_default_color_matrix_depends_on_the_video_size(tmp_path, rows, matrix):
     color = np.array([200, 40, 40], np.uint8)
     made = av.VideoFrame.from_ndarray(np.tile(color, (rows, rows, 1)), format="rgb24")
     with av.open(str(tmp_path / "a.mp4"), "w") as written:
@@ -407,7 +408,7 @@ def test_video_that_names_no_color_matrix_is_read_by_that_of_its_size(tmp_path, 
 
 
 def _remux(path, source, *, still=False, **options):
-    """Copy a video to another file, behind a track of one still picture, like the one of a live photo."""
+    """Copy a video to another file, after a track with a single still picture, as in live photos."""
     with av.open(str(source)) as read, av.open(str(path), "w", options=options) as written:
         first = written.add_stream("mjpeg", rate=1) if still else None
         track = written.add_stream_from_template(read.streams.video[0])
@@ -421,7 +422,7 @@ def _remux(path, source, *, still=False, **options):
                 written.mux(packet)
 
 
-def test_a_still_picture_before_the_video_is_none(tmp_path):
+def test_still_picture_track_is_ignored(tmp_path):
     made = walk(12)
     made_formats.write_movie(tmp_path / "a.mp4", [made.color(i) for i in range(12)])
     _remux(tmp_path / "live.mov", tmp_path / "a.mp4", still=True)
@@ -430,7 +431,7 @@ def test_a_still_picture_before_the_video_is_none(tmp_path):
     assert np.abs(movie.read(5).astype(int) - made.color(5)).mean() < 0.6
 
 
-def test_a_copy_that_was_cut_off_lacks_its_last_pictures(tmp_path):
+def test_truncated_video_lacks_its_last_pictures(tmp_path):
     made = walk(40)
     made_formats.write_movie(tmp_path / "a.mp4", [made.color(i) for i in range(40)])
     _remux(tmp_path / "b.mp4", tmp_path / "a.mp4", movflags="faststart")
@@ -443,16 +444,16 @@ def test_a_copy_that_was_cut_off_lacks_its_last_pictures(tmp_path):
 
 
 @pytest.mark.parametrize("turns", range(4))
-def test_a_mirrored_display_is_turned_alone(tmp_path, turns):
-    """A selfie app may have players mirror what the camera saw."""
+def test_mirrored_display_matrix_is_reduced_to_a_rotation(tmp_path, turns):
+    """Selfie apps may ask players to mirror the picture."""
     made_formats.write_movie(tmp_path / "a.mp4", [walk(3).color(i) for i in range(3)])
     _turn_track(tmp_path / "a.mp4", turns, mirrored=True)
     assert Movie(tmp_path / "a.mp4").quarter_turns == turns
 
 
 @pytest.mark.parametrize(("captured", "times_slower"), [("240.0", 8), ("60.0", 1), ("1", 1 / 30), ("?", 1)])
-def test_slow_motion_of_android_has_the_times_of_life(tmp_path, captured, times_slower):
-    """An ordinary video of 60 pictures a second falls to 30 in dim light, and keeps its times."""
+def test_android_slow_motion_has_real_time_timestamps(tmp_path, captured, times_slower):
+    """Ordinary 60 Hz video that drops to 30 Hz in dim light keeps its timestamps."""
     path = tmp_path / "a.mp4"
     tags = {"com.android.capture.fps": captured}
     made_formats.write_movie(path, [walk(6).color(i) for i in range(6)], rate=30, tags=tags)
@@ -460,8 +461,8 @@ def test_slow_motion_of_android_has_the_times_of_life(tmp_path, captured, times_
 
 
 @pytest.mark.parametrize(("aspect", "width"), [(Fraction(4, 3), 64), (Fraction(1), 48), (Fraction(90), 48)])
-def test_a_video_alone_has_square_pixels(tmp_path, aspect, width):
-    """Its lens is calibrated with one focal length; beside depth it stays as its intrinsics describe it."""
+def test_video_without_depth_has_square_pixels(tmp_path, aspect, width):
+    """A video without depth is calibrated with one focal length; with depth its intrinsics are kept."""
     path, made = tmp_path / "a.mp4", walk(6)
     made_formats.write_movie(path, [made.color(i) for i in range(6)], aspect=aspect)
     recording = open_recording(path)
@@ -578,7 +579,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("code", FAULTS)
-def test_what_cannot_be_used_is_refused_with_a_remedy(tmp_path, code):
+def test_unusable_recordings_are_refused_with_a_remedy(tmp_path, code):
     path = FAULTS[code](tmp_path / "a", walk(6))
     with pytest.raises(InputError) as refused:
         _understand(path)
@@ -590,15 +591,15 @@ def test_what_cannot_be_used_is_refused_with_a_remedy(tmp_path, code):
 @pytest.mark.parametrize(
     ("color", "depth"), [((1920, 1440), (256, 192)), ((1080, 1920), (144, 256)), ((768, 1366), (27, 48))]
 )
-def test_pictures_and_depth_of_one_shape_may_be_rounded(color, depth):
+def test_aspect_ratios_may_differ_by_rounding(color, depth):
     extraction._refuse_other_shape(color, depth, "a")
     with pytest.raises(InputError, match=f"CAP-008.*depth of {depth[0]} x {depth[1]}"):
         extraction._refuse_other_shape(color, depth[::-1], "a")
 
 
 @pytest.mark.parametrize("turns", range(4))
-def test_the_rotation_tag_of_a_video_makes_it_upright(tmp_path, turns):
-    """Phones store landscape and write into the track header how players are to turn it."""
+def test_display_matrix_makes_a_video_upright(tmp_path, turns):
+    """Phones store landscape pictures and a display matrix in the track header."""
     stored, upright = walk(8, quarter_turns=-turns % 4), walk(8)
     path = made_formats.video_and_depth(tmp_path / "a", stored)
     _turn_track(path / "clip.mov", turns)
@@ -623,8 +624,8 @@ def _turn_track(path, turns, *, mirrored=False):
     path.write_bytes(data)
 
 
-def test_frames_that_an_edit_list_hides_are_none(tmp_path):
-    """A phone that trims a video keeps its pictures from the last key frame on and writes where to begin."""
+def test_frames_before_the_edit_list_are_dropped(tmp_path):
+    """A trimmed video keeps the pictures from the last key frame on, and an edit list with the start."""
     made = walk(20)
     path = tmp_path / "a.mp4"
     made_formats.write_movie(path, [made.color(i) for i in range(20)], rate=15)
@@ -637,7 +638,7 @@ def test_frames_that_an_edit_list_hides_are_none(tmp_path):
     assert all(np.abs(movie.read(i).astype(int) - made.color(i + 5)).mean() < 4 for i in range(15))
 
 
-def test_polycams_own_mesh_stands_where_its_cameras_do(tmp_path):
+def test_polycam_mesh_is_in_the_frame_of_its_cameras(tmp_path):
     box = trimesh.creation.box((4.0, 2.5, 5.0), rigid.make(np.eye(3), np.array([2.0, 1.25, 2.5])))
     folder = made_formats.polycam(tmp_path / "a", walk(12))
     assert open_recording(folder).read_mesh is None
@@ -654,8 +655,8 @@ def test_polycams_own_mesh_stands_where_its_cameras_do(tmp_path):
 
 
 @pytest.mark.parametrize(("up_deg", "known"), [(0, True), (10, True), (90, False), (180, False)])
-def test_an_up_direction_that_the_floor_contradicts_is_not_used(tmp_path, monkeypatch, up_deg, known):
-    """An app may export z up under the name of a format with y up."""
+def test_up_direction_that_contradicts_the_floor_is_ignored(tmp_path, monkeypatch, up_deg, known):
+    """An app may export z up in a format with y up."""
     up = np.array([0, np.cos(np.radians(up_deg)), np.sin(np.radians(up_deg))])
     monkeypatch.setattr(extraction, "up_from_room", lambda *_: up)
     recording, plan = _understand(walk(60).write(tmp_path / "a.r3d"))

@@ -1,4 +1,4 @@
-"""Frames are chosen by time: no doubles, true times, gaps kept."""
+"""Frame selection by time: no duplicates, true timestamps, gaps preserved."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -20,7 +20,7 @@ def test_every_tick_with_a_frame_gets_its_nearest_one(steps_s, rate_hz):
         assert abs(timestamp_s[index] - tick[index] / rate_hz) == baselines.min() <= 0.5 / rate_hz + 1e-9
 
 
-def test_a_gap_stays_a_gap():
+def test_gaps_are_preserved():
     timestamp_s = np.concatenate([np.arange(0, 0.95, 1 / 30), np.arange(2, 2.95, 1 / 30)])
     chosen_s = timestamp_s[choose_frames(timestamp_s, 10.0)]
     assert len(chosen_s) == 20

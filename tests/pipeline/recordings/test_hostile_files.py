@@ -1,6 +1,4 @@
-"""What an attacker, or a dying disk, hands in: a coded error within seconds and little memory, or the right
-result.
-"""
+"""Malicious or damaged files give an error code, or the correct result, within bounded time and memory."""
 
 import io
 import json
@@ -30,9 +28,7 @@ HUGE = int("9" * 400)
 
 
 def _archive(path: Path, members: dict[str, bytes]) -> Path:
-    """Write a stored 64-bit ZIP of very many members; zipfile takes half a minute for what this does in one
-    second.
-    """
+    """Write a stored ZIP64 archive with very many members, much faster than zipfile."""
     parts, directory, at = [], [], 0
     for name, data in members.items():
         fields = struct.pack("<4H3L2H", 0, 0, 0, 33, zlib.crc32(data), len(data), len(data), len(name), 0)
@@ -52,7 +48,7 @@ def _archive(path: Path, members: dict[str, bytes]) -> Path:
 
 @pytest.mark.slow
 def test_twenty_minutes_of_record3d_are_read(tmp_path):
-    """72,000 frames of three files each: 216,001 members, refused as hostile before."""
+    """72,000 frames of three files each: 216,001 members."""
     count, made = 72_000, walk(2)
     made.write(tmp_path / "short.r3d")
     with zipfile.ZipFile(tmp_path / "short.r3d") as short:
@@ -82,8 +78,8 @@ def test_more_members_than_declared_frames_are_refused(tmp_path):
         open_recording(tmp_path / "a.r3d")
 
 
-def test_a_directory_of_millions_is_not_listed(tmp_path):
-    """The end of a ZIP declares its members: five million are refused before any is read."""
+def test_archive_with_millions_of_members_is_refused(tmp_path):
+    """The end record of a ZIP declares its members: five million are refused before any is read."""
     entry = struct.pack("<4s4B4HL2L5H2L", b"PK\x01\x02", *[20, 3, 20, 0], *[0] * 14)
     data = entry * 5_000_000
     end = struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, 0xFFFF, 0xFFFF, len(data), 0, 0)
@@ -112,12 +108,12 @@ def _with_metadata(path: Path, change) -> Path:
     ],
     ids=["w", "K", "times", "camera", "fps"],
 )
-def test_integers_of_400_digits_in_metadata(tmp_path, change):
+def test_huge_integers_in_metadata_are_refused(tmp_path, change):
     with pytest.raises(InputError, match="CAP-004"):
         open_recording(_with_metadata(tmp_path / "a.r3d", change))
 
 
-def test_damaged_lzma_and_lying_lzfse(tmp_path):
+def test_damaged_lzma_and_wrong_lzfse_sizes_are_refused(tmp_path):
     made = walk(8)
     made.write(tmp_path / "a.r3d")
     with zipfile.ZipFile(tmp_path / "a.r3d") as whole:
@@ -150,9 +146,9 @@ def _exr(path: Path, header: dict, channels: dict) -> Path:
     return path
 
 
-def test_a_decoy_data_window_does_not_hide_the_size_of_an_exr(tmp_path):
-    """The first `dataWindow` in the bytes stands inside a text attribute; the true one asks for 20,000 x
-    20,000.
+def test_true_data_window_of_an_exr_is_checked(tmp_path):
+    """The first `dataWindow` in the bytes is inside a text attribute; the true one declares 20,000 x 20,000
+    pixels.
     """
     path = _exr(
         tmp_path / "a.exr",
@@ -168,14 +164,14 @@ def test_a_decoy_data_window_does_not_hide_the_size_of_an_exr(tmp_path):
         images.read_depth(path)
 
 
-def test_many_channels_count_as_many_pictures(tmp_path):
+def test_exr_size_limit_includes_channels(tmp_path):
     channels = {f"c{number:02d}": np.zeros((1200, 1200), np.float16) for number in range(25)}
     assert images.read_depth(_exr(tmp_path / "few.exr", {}, {"Z": np.ones((1200, 1200), np.float16)})).all()
     with pytest.raises(InputError, match="sensible size"):
         images.read_depth(_exr(tmp_path / "many.exr", {}, channels), channel="c00")
 
 
-def test_a_full_disk_is_told_when_depth_is_written():
+def test_full_disk_while_writing_depth_is_reported():
     with pytest.raises(InputError, match="SYS-001"), coded_disk_errors("frames"):
         images.write_depth(Path("/dev/full"), np.ones((64, 64)))
 
@@ -196,20 +192,20 @@ def _movie(path: Path, size: int = 64, **metadata: str) -> Path:
     return path
 
 
-def test_a_latin_1_title_does_not_matter(tmp_path):
+def test_latin_1_title_is_accepted(tmp_path):
     movie = movies.Movie(_movie(tmp_path / "a.mp4", title="B\xe4r und M\xfccke"))
     assert len(movie) == 3
     assert movie.read(2).mean() == pytest.approx(160, abs=6)
 
 
-def test_pictures_larger_than_any_phones_are_not_decoded(tmp_path, monkeypatch):
+def test_huge_video_frames_are_refused(tmp_path, monkeypatch):
     _movie(tmp_path / "a.mp4", size=256)
     monkeypatch.setattr(movies, "MAX_PIXELS", 255 * 255)
     with pytest.raises(InputError, match="CAP-001.*larger than any"):
         movies.Movie(tmp_path / "a.mp4")
 
 
-def test_a_list_of_neighbours_is_no_video(tmp_path):
+def test_playlist_is_not_read_as_a_video(tmp_path):
     _movie(tmp_path / "secret.mp4")
     (tmp_path / "a.mp4").write_text("ffconcat version 1.0\nfile secret.mp4\n")
     with pytest.raises(InputError, match="CAP-001"):
@@ -217,7 +213,7 @@ def test_a_list_of_neighbours_is_no_video(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["pipe", "link"])
-def test_pipes_and_links_in_a_folder_are_not_read(tmp_path, kind):
+def test_pipes_and_links_are_not_read(tmp_path, kind):
     made_formats.tum(tmp_path / "walk", walk(8))
     listed = tmp_path / "walk" / "rgb.txt"
     listed.rename(tmp_path / "elsewhere.txt")
@@ -241,22 +237,22 @@ PLY_HEADS = {
 
 
 @pytest.mark.parametrize("head", PLY_HEADS.values(), ids=PLY_HEADS)
-def test_a_ply_header_that_cannot_be(tmp_path, head):
+def test_impossible_ply_header_is_refused(tmp_path, head):
     (tmp_path / "a.ply").write_text(head)
     with pytest.raises(InputError, match="ART-020"):
         ply.read_ply(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("number", [HUGE, -1, float("inf"), "x"], ids=["huge", "negative", "inf", "text"])
-def test_clicks_in_frames_that_cannot_be(tmp_path, number):
+def test_impossible_frame_numbers_of_clicks_are_refused(tmp_path, number):
     spot = {"recording": "a", "source_index": number, "pixel": [0.5, 0.5]}
     (tmp_path / "clicks.json").write_text(json.dumps({"pairs": [{"seen": spot, "reference": spot}]}))
     with pytest.raises(InputError, match="EVA-001"):
         clicks.read(tmp_path / "clicks.json")
 
 
-def test_a_small_mesh_that_asks_for_gigabytes_is_not_read(tmp_path):
-    """A sparse accessor has no bytes for most of what it counts."""
+def test_mesh_that_expands_to_gigabytes_is_refused(tmp_path):
+    """A sparse accessor stores no bytes for most of its declared elements."""
     folder = made_formats.polycam(tmp_path / "scan", walk(8))
     made_formats.polycam_mesh(folder, trimesh.creation.box(), np.eye(4))
     data = (folder / "raw.glb").read_bytes()
@@ -278,13 +274,13 @@ def test_a_small_mesh_that_asks_for_gigabytes_is_not_read(tmp_path):
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000, "kB"
 
 
-def test_control_characters_do_not_reach_the_terminal():
-    told = str(InputError("CAP-001", "damaged \x1b[2J", "a\x1b]0;x\x07\nb.r3d", "again"))
-    assert "\x1b" not in told
-    assert told.count("\n") == 1, "only the remedy has a line of its own"
+def test_control_characters_are_escaped_in_messages():
+    message = str(InputError("CAP-001", "damaged \x1b[2J", "a\x1b]0;x\x07\nb.r3d", "again"))
+    assert "\x1b" not in message
+    assert message.count("\n") == 1, "only the remedy has a line of its own"
 
 
-def test_a_small_png_or_jpeg_that_asks_for_gigabytes_is_not_decoded(tmp_path):
+def test_picture_that_expands_to_gigabytes_is_refused(tmp_path):
     png = bytearray(made_formats.png(np.zeros((8, 8), np.uint16)))
     struct.pack_into(">2I", png, 16, 30_000, 30_000)
     struct.pack_into(">I", png, 29, zlib.crc32(png[12:29]))

@@ -1,4 +1,4 @@
-"""The depth tells what device poses mean: every wrong reading is found out, meaningless poses are refused."""
+"""Detection of pose conventions from depth: wrong conventions are found, meaningless poses are refused."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from tests.stages.extract_frames.made_recordings import COLOR_SIZE, DEPTH_SIZE, 
 
 
 def _check(made, pose, size=1.0):
-    """Judge poses of a walk through the room made so many times larger, with noise of LiDAR."""
+    """Check poses of a walk through a room scaled by a factor, with LiDAR noise."""
     intrinsics = cameras.scale_intrinsics(made.intrinsics, COLOR_SIZE, DEPTH_SIZE)
     rng = np.random.default_rng(0)
 
@@ -23,7 +23,7 @@ def _check(made, pose, size=1.0):
 
 
 def _stored(made, convention):
-    """Write the true poses the way another app would."""
+    """Convert true poses to the convention of another app."""
     camera = cameras.turn_camera(made.world_from_camera, convention.quarter_turns)
     if convention.axes == "opengl":
         camera = cameras.opencv_from_opengl(camera)
@@ -35,7 +35,7 @@ def _stored(made, convention):
 
 
 @pytest.mark.parametrize("convention", conventions.CONVENTIONS)
-def test_reading_undoes_writing(convention):
+def test_reading_inverts_writing(convention):
     made = walk()
     read = conventions.odometry_from_pose(_stored(made, convention), convention)
     np.testing.assert_allclose(read, made.world_from_camera, atol=1e-9)
@@ -51,7 +51,7 @@ def test_documented_convention_is_kept():
 @pytest.mark.parametrize(
     "changes", [{"axes": "opencv"}, {"direction": "world_to_camera"}, {"quarter_turns": 1}]
 )
-def test_another_convention_is_found(changes):
+def test_other_conventions_are_detected(changes):
     made = walk(60)
     convention = conventions.Convention(**changes)
     check = _check(made, _stored(made, convention))
@@ -67,7 +67,7 @@ def _read(made, convention, check):
     return conventions.odometry_from_pose(_stored(made, convention), check.convention)
 
 
-def test_meaningless_poses_are_unusable():
+def test_meaningless_poses_are_refused():
     made = walk(40)
     pose = made.poses()
     rng = np.random.default_rng(0)
@@ -85,7 +85,7 @@ def test_meaningless_poses_are_unusable():
 
 
 @pytest.mark.parametrize("size", [1.0, 3.0])
-def test_poses_that_drift_are_used_whatever_the_size_of_the_room(size):
+def test_drifting_poses_are_accepted_in_rooms_of_any_size(size):
     made = walk(40)
     pose = made.poses()
     pose[:, 4:] += 0.08 * made.timestamp_s[:, None]
@@ -95,7 +95,7 @@ def test_poses_that_drift_are_used_whatever_the_size_of_the_room(size):
     assert check.tolerance_m < check.residual_m < 4 * check.tolerance_m
 
 
-def test_a_still_phone_proves_nothing():
+def test_static_phone_is_inconclusive():
     made = walk(40)
     made.world_from_camera[:] = made.world_from_camera[0]
     made.world_from_camera[:, 0, 3] += np.linspace(0, 0.01, 40)
@@ -103,18 +103,18 @@ def test_a_still_phone_proves_nothing():
 
 
 @pytest.mark.parametrize("turns", range(4))
-def test_gravity_gives_the_turn_that_makes_upright(turns):
+def test_gravity_gives_the_upright_rotation(turns):
     stored = cameras.turn_camera(walk().world_from_camera, turns)
     assert (turns + upright.quarter_turns_from_gravity(stored)) % 4 == 0
 
 
-def test_a_phone_that_looks_down_is_left_alone():
+def test_downward_camera_is_not_rotated():
     down = rigid.look_at(np.array([1.0, 2, 1]), np.array([1.0, 0, 1.001]), np.array([0.0, 0, 1]))
     assert upright.quarter_turns_from_gravity(cameras.turn_camera(down[None], 1)) == 0
 
 
 @pytest.mark.parametrize("turns", range(4))
-def test_surfaces_give_the_turn_where_nothing_else_does(turns):
+def test_surfaces_give_the_upright_rotation_without_poses(turns):
     room = textured_room.MemoryClip(
         RayCaster(textured_room.textured_room(edge_m=0.2)), textured_room.walk(6), None
     )

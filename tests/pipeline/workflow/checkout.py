@@ -1,6 +1,4 @@
-"""A small house of its own for tests of the orchestration: the real ground floor, tiny stages, real
-recipes.
-"""
+"""A small checkout for tests of the workflow: the real `pipeline` package, tiny stages, real recipes."""
 
 import os
 import shutil
@@ -25,7 +23,7 @@ WITHOUT = (
     "baselines",
     "metrics",
 )
-"""Packages that the planner and the runner do not need."""
+"""Packages that planner and runner do not need."""
 SETTINGS = {
     "synthesize_capture": (
         "    session_count: int = 2\n    heldout_of: int = 1\n    foreign_sessions: int = 0\n"
@@ -74,7 +72,7 @@ def run(inputs, config, out):
             for file in files:
                 digest.update(file.read_bytes())
     if config.fail:
-        raise InputError("TST-001", "told to fail", {stage!r}, "do not")
+        raise InputError("TST-001", "fails on request", {stage!r}, "do not")
     for i in range(3):
         (out / f"{{i}}.bin").write_bytes(digest.digest() * 64 * (i + 1))
         time.sleep(config.pause_s)
@@ -98,7 +96,7 @@ class Checkout:
     folder: Path
 
     def python(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """Run a module of the house as Make does."""
+        """Run a module of the checkout as Make does."""
         return subprocess.run(
             [sys.executable, "-SE", "-m", *arguments], cwd=self.folder, capture_output=True, text=True
         )
@@ -115,7 +113,7 @@ class Checkout:
         path.write_text(text)
 
     def tree(self) -> dict[str, bytes]:
-        """Return every file and its bytes, apart from Python's own caches."""
+        """Return every file with its bytes, except caches of Python."""
         files = (
             path for path in self.folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts
         )
@@ -123,7 +121,7 @@ class Checkout:
 
 
 def create(folder: Path) -> Checkout:
-    """Make a working copy in `folder` with the agent `toy`."""
+    """Create a working copy in `folder` with the agent `toy`."""
     shutil.copytree(
         ROOT / "pipeline", folder / "pipeline", ignore=shutil.ignore_patterns("__pycache__", *WITHOUT)
     )
@@ -151,7 +149,7 @@ def create(folder: Path) -> Checkout:
 
 
 def _fields(stage: str) -> str:
-    """Return the fields of the stage's `Inputs`, as the flow declares its inputs."""
+    """Return the fields of `Inputs` of the stage, as declared in the flow."""
     nodes = [node for node in dag.FLOW if node.stage == stage]
     kinds, in_every = (
         {},
@@ -187,9 +185,7 @@ def _fields(stage: str) -> str:
 
 
 def alive_of_group(group: int) -> list[int]:
-    """Return the processes of a process group that have not ended yet; those that nobody has waited for
-    have.
-    """
+    """Return the running processes of a process group, without zombies."""
     alive = []
     for process in map(int, filter(str.isdigit, os.listdir("/proc"))):
         try:
@@ -202,6 +198,6 @@ def alive_of_group(group: int) -> list[int]:
 
 
 def wait_for_group(group: int) -> None:
-    """Wait until a killed process group has ended: Make may be gone before what it started."""
+    """Wait until a killed process group has ended: Make may end before its children."""
     while alive_of_group(group):
         time.sleep(0.01)

@@ -1,4 +1,4 @@
-"""An artifact is complete or absent."""
+"""Artifacts are complete or absent."""
 
 import json
 import os
@@ -21,7 +21,7 @@ def make(out: Path, text: str, key: str | None = "k") -> None:
         (folder / "inner" / "data.txt").write_text(text)
 
 
-def test_what_is_written_is_described(tmp_path):
+def test_manifest_describes_the_files(tmp_path):
     make(tmp_path / "x", "hello")
     manifest = artifact.opened(tmp_path / "x", "x")
     assert manifest.key == "k"
@@ -39,7 +39,7 @@ def test_equal_files_have_equal_content_and_bytes(tmp_path):
 
 
 @pytest.mark.parametrize("before", [False, True])
-def test_failure_leaves_what_was_there(tmp_path, before):
+def test_failed_writer_keeps_the_old_artifact(tmp_path, before):
     if before:
         make(tmp_path / "x", "old")
     with (
@@ -70,14 +70,14 @@ SOUND = {
           if (name, value) not in (("key", None), ("config", {"x": 3}))),
     ],
 )  # fmt: skip
-def test_what_is_no_manifest_makes_no_artifact(tmp_path, text):
+def test_invalid_manifest_is_refused(tmp_path, text):
     (tmp_path / "manifest.json").write_text(text)
     with pytest.raises(InputError, match="ART-001"):
         artifact.opened(tmp_path, "x")
     assert artifact.damaged(tmp_path) == []
 
 
-def test_an_empty_artifact_is_refused(tmp_path):
+def test_empty_artifact_is_refused(tmp_path):
     with (
         pytest.raises(InputError, match="ART-002"),
         artifact.create(tmp_path / "x", stage="s", config={}, inputs={}),
@@ -86,15 +86,15 @@ def test_an_empty_artifact_is_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_without_manifest_is_no_artifact(tmp_path):
+def test_folder_without_manifest_is_no_artifact(tmp_path):
     with pytest.raises(InputError, match="ART-001"):
         artifact.opened(tmp_path, "frames")
     (tmp_path / "manifest.json").write_text('{"half":')
     assert artifact.read_manifest(tmp_path) is None
 
 
-def test_a_killed_writer_leaves_nothing_that_counts(tmp_path):
-    """SIGKILL while writing: the old artifact stands, the rest is cleaned away by the next job."""
+def test_killed_writer_keeps_the_old_artifact(tmp_path):
+    """SIGKILL while writing: the old artifact is kept, and the next job removes the rest."""
     make(tmp_path / "x", "old")
     program = (
         "import os, signal\nfrom pathlib import Path\nfrom pipeline.workflow import artifact\n"
@@ -112,7 +112,7 @@ def test_a_killed_writer_leaves_nothing_that_counts(tmp_path):
     assert (tmp_path / "x/inner/data.txt").read_text() == "old"
 
 
-def test_an_unchanged_file_keeps_its_age(tmp_path):
+def test_unchanged_file_keeps_its_modification_time(tmp_path):
     path = tmp_path / "deep" / "file"
     assert artifact.write_if_changed(path, "a")
     os.utime(path, ns=(1, 1))

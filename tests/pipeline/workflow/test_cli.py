@@ -1,4 +1,4 @@
-"""The door of a stage: options, refusals, exit codes, and the artifact it leaves."""
+"""Command lines of stages: options, refusals, exit codes, and artifacts."""
 
 import json
 import subprocess
@@ -72,7 +72,7 @@ def stage(tmp_path):
     return call
 
 
-def test_a_stage_runs_by_hand(stage, tmp_path):
+def test_stage_runs_from_the_command_line(stage, tmp_path):
     (tmp_path / "slice.toml").write_text("seed = 4")
     assert stage("--out", "out", "--config", "slice.toml", "--threads", "2").returncode == 0
     manifest = artifact.opened(tmp_path / "out", "out")
@@ -81,26 +81,26 @@ def test_a_stage_runs_by_hand(stage, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("end", "code", "told"),
+    ("end", "code", "message"),
     [
         ("refused", 2, "error: TST-001 here: it is bad\n  -> make it good\n"),
         ("full", 2, "error: SYS-001"),
         ("broken", 1, "Traceback"),
     ],
 )
-def test_ways_to_fail(stage, tmp_path, end, code, told):
+def test_exit_codes_of_failures(stage, tmp_path, end, code, message):
     (tmp_path / "slice.json").write_text(json.dumps({"end": end}))
     before = sorted(tmp_path.iterdir())
     failed = stage("--out", "out", "--config", "slice.json")
     assert failed.returncode == code
-    assert failed.stderr.startswith(told)
+    assert failed.stderr.startswith(message)
     assert sorted(tmp_path.iterdir()) == before
 
 
 @pytest.mark.parametrize(
     "arguments", [(), ("--out", "out", "--threads", "two"), ("--out", "out", "--tempo", "3")]
 )
-def test_a_command_line_that_is_not_understood_is_refused_by_code(stage, arguments):
+def test_invalid_command_line_is_refused_with_a_code(stage, arguments):
     failed = stage(*arguments)
     assert failed.returncode == 2
     assert failed.stderr.startswith("error: RUN-004 python -m stages.example: ")
@@ -108,13 +108,13 @@ def test_a_command_line_that_is_not_understood_is_refused_by_code(stage, argumen
 
 
 def test_help_is_the_docstring(stage):
-    told = stage("--help").stdout
-    assert "Tell what this stage does." in told
-    assert "--scene-template PATH" in told
-    assert "\n  seed = 0  Seed.\n  end = 'well'  How to end.\n" in told
+    usage = stage("--help").stdout
+    assert "Tell what this stage does." in usage
+    assert "--scene-template PATH" in usage
+    assert "\n  seed = 0  Seed.\n  end = 'well'  How to end.\n" in usage
 
 
-def test_an_input_must_be_finished(stage, tmp_path):
+def test_incomplete_input_is_refused(stage, tmp_path):
     videos = [dict(id="v002", file="x", role="session", split="train", sha256=None)]
     (tmp_path / "videos.json").write_text(json.dumps(videos))
     (tmp_path / "frames" / "v002").mkdir(parents=True)
@@ -133,7 +133,7 @@ def test_an_input_must_be_finished(stage, tmp_path):
     assert artifact.opened(tmp_path / "out", "").inputs == {"frames/v002": content}
 
 
-def test_the_recording_to_treat_must_be_listed(stage, tmp_path):
+def test_unlisted_recording_is_refused(stage, tmp_path):
     video = dict(id="v002", file="x", role="session", split="train", sha256=None)
     (tmp_path / "videos.json").write_text(json.dumps([video]))
     call = ("--out", "out", "--videos", "videos.json", "--video")
@@ -142,7 +142,7 @@ def test_the_recording_to_treat_must_be_listed(stage, tmp_path):
     assert stage(*call, "v003").stderr.startswith("error: ART-004 example: which recording is 'v003'?")
 
 
-def test_of_several_processes_the_first_alone_publishes(stage, tmp_path, monkeypatch):
+def test_only_the_first_of_several_processes_publishes(stage, tmp_path, monkeypatch):
     monkeypatch.setenv("TORCHELASTIC_RUN_ID", "none")
     monkeypatch.setenv("RANK", "1")
     assert stage("--out", "out").returncode == 0
@@ -181,7 +181,7 @@ def test_inputs_are_derived_from_the_fields():
         ("tabulate_behavior", "behavior_trials", ["ats-0", "ats-1", "world-0", "world-1"]),
     ],
 )
-def test_the_flow_decides_which_recordings_and_trials_a_field_holds(tmp_path, stage, field, expected):
+def test_fields_receive_recordings_and_trials_of_the_flow(tmp_path, stage, field, expected):
     node = dag.NODES[field]
     for name in expected:
         with artifact.create(tmp_path / field / name, stage=node.stage, config={}, inputs={}) as folder:

@@ -1,10 +1,10 @@
-"""The declaration holds together."""
+"""The declaration of the flow is consistent."""
 
 from pipeline.workflow import dag
 
 
 def test_every_input_is_declared_before_it_is_used():
-    """And it exists for every recording that asks for it."""
+    """Also checks that it exists for every recording that requires it."""
     declared: dict[str, dag.Node] = {}
     for node in dag.FLOW:
         for need in dag.needs_of(node):
@@ -18,7 +18,7 @@ def test_every_input_is_declared_before_it_is_used():
         declared[node.artifact] = node
 
 
-def test_no_model_sees_the_second_phone():
+def test_held_out_phone_is_not_used_by_models():
     for node in dag.FLOW:
         for need in dag.needs_of(node):
             roles = need.roles or (
@@ -31,11 +31,11 @@ def test_no_model_sees_the_second_phone():
             }, node.artifact
 
 
-def test_the_feature_basis_does_not_see_the_test_session():
+def test_feature_basis_does_not_use_the_test_session():
     (need,) = dag.needs_of(dag.NODES["feature_basis"])
     assert "test" not in need.splits
 
 
-def test_programs_that_make_two_artifacts_have_a_table_for_each():
+def test_stages_with_two_artifacts_have_two_tables():
     assert dag.table_of(dag.NODES["scene_localizer"]) == "scene_localizer"
     assert dag.table_of(dag.NODES["masks"]) == "segment_agent"

@@ -1,4 +1,4 @@
-"""The doctor looks at everything it says it does, and fails only for what every build needs."""
+"""The doctor runs all its checks and fails only for requirements of every build."""
 
 import os
 import subprocess
@@ -11,11 +11,11 @@ from pipeline.workflow import doctor
 ROOT = Path(__file__).parents[3]
 
 
-def test_a_machine_that_runs_these_tests_is_fit(capsys, monkeypatch):
+def test_this_machine_passes(capsys, monkeypatch):
     monkeypatch.setattr(doctor, "LIBRARIES", ("numpy", "torch"))
     assert doctor.main() == 0
-    told = capsys.readouterr().out
-    assert [line.split()[1] for line in told.splitlines()] == [
+    output = capsys.readouterr().out
+    assert [line.split()[1] for line in output.splitlines()] == [
         "python",
         "libraries",
         "OpenGL",
@@ -29,7 +29,7 @@ def test_a_machine_that_runs_these_tests_is_fit(capsys, monkeypatch):
     ]
 
 
-def test_a_missing_library_is_named(monkeypatch):
+def test_missing_library_is_named(monkeypatch):
     monkeypatch.setattr(doctor, "LIBRARIES", ("no_such_library",))
     finding = doctor.libraries()
     assert finding.state == "fail"
@@ -40,7 +40,7 @@ def test_a_missing_library_is_named(monkeypatch):
     ("kind", "gpu", "state"),
     [("cpu", False, "ok"), ("cpu", True, "warn"), ("cuda", False, "ok"), ("cuda", True, "ok")],
 )
-def test_a_lock_that_does_not_fit_the_machine_is_named(tmp_path, monkeypatch, kind, gpu, state):
+def test_unsuitable_lock_is_named(tmp_path, monkeypatch, kind, gpu, state):
     monkeypatch.chdir(tmp_path)
     assert doctor.lock().state == "warn", "no environment of envs/setup"
     (tmp_path / ".venv").mkdir()
@@ -50,7 +50,7 @@ def test_a_lock_that_does_not_fit_the_machine_is_named(tmp_path, monkeypatch, ki
     assert ("LOCK=cuda" in doctor.lock().text) == (state == "warn")
 
 
-def test_a_lock_that_does_not_exist_is_refused():
+def test_unknown_lock_is_refused():
     refused = subprocess.run([ROOT / "envs/setup", "metal"], capture_output=True, text=True)
     assert refused.returncode == 2
     assert "ENV-002 LOCK=metal" in refused.stderr
@@ -59,7 +59,7 @@ def test_a_lock_that_does_not_exist_is_refused():
 @pytest.mark.parametrize(
     ("cores", "memory_mb", "jobs"), [(8, 8000, 2), (8, 64000, 8), (2, 2000, 1), (4, 0, 4)]
 )
-def test_no_more_jobs_at_once_than_memory_holds(tmp_path, cores, memory_mb, jobs):
+def test_parallel_jobs_are_limited_by_memory(tmp_path, cores, memory_mb, jobs):
     pages = memory_mb * 1024 // 4
     for name, text in {
         "nproc": f"echo {cores}",

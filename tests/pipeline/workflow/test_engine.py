@@ -1,4 +1,4 @@
-"""What the Snakefile is told: homes, resources, and several agents in one call."""
+"""Snakemake: homes, resources, and several agents in one call."""
 
 import os
 import shutil
@@ -14,7 +14,7 @@ from tests.pipeline.workflow import checkout
 
 
 @pytest.fixture
-def house(tmp_path, monkeypatch):
+def small_checkout(tmp_path, monkeypatch):
     made = checkout.create(tmp_path)
     monkeypatch.chdir(tmp_path)
     engine._known.clear()
@@ -33,7 +33,7 @@ def test_homes_are_one_agent_several_or_a_table(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["name\nluna\n", "\xff\xfe\x00"])
-def test_a_table_of_homes_that_is_none_is_refused(tmp_path, text):
+def test_invalid_table_of_homes_is_refused(tmp_path, text):
     (tmp_path / "homes.tsv").write_bytes(text.encode("latin-1"))
     with pytest.raises(InputError, match="REC-003"):
         engine.homes({"homes": str(tmp_path / "homes.tsv")})
@@ -41,14 +41,14 @@ def test_a_table_of_homes_that_is_none_is_refused(tmp_path, text):
         engine.homes({"agents": ["../x"]})
 
 
-def test_memory_and_time_grow_with_frames_and_attempts(house):
-    house.python("pipeline.workflow.plan", "plan", "toy")
+def test_resources_grow_with_frames_and_attempts(small_checkout):
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
     node, home = dag.NODES["reconstruction"], SimpleNamespace(home="toy")
     unknown = engine.memory_mb(node)(home, 1)
     for cached in (engine._frames, engine._frames_in):
         cached.cache_clear()
     for video in ("v000", "v001", "v002", "v003"):
-        color = house.folder / f"build/toy/frames/{video}/color"
+        color = small_checkout.folder / f"build/toy/frames/{video}/color"
         color.mkdir(parents=True)
         for frame in range(10):
             (color / f"{frame:06d}.jpg").touch()
@@ -59,8 +59,8 @@ def test_memory_and_time_grow_with_frames_and_attempts(house):
 
 
 @pytest.mark.slow
-def test_snakemake_builds_several_agents(house):
-    shutil.copy(house.folder / "agents/toy.toml", house.folder / "agents/luna.toml")
+def test_snakemake_builds_several_agents(small_checkout):
+    shutil.copy(small_checkout.folder / "agents/toy.toml", small_checkout.folder / "agents/luna.toml")
     command = [
         sys.executable,
         "-m",
@@ -73,10 +73,12 @@ def test_snakemake_builds_several_agents(house):
         "all",
     ]
     targets = [f"build/{agent}/flow/v001/.ok" for agent in ("toy", "luna")]
-    made = subprocess.run([*command, "--", *targets], cwd=house.folder, capture_output=True, text=True)
+    made = subprocess.run(
+        [*command, "--", *targets], cwd=small_checkout.folder, capture_output=True, text=True
+    )
     assert made.returncode == 0, made.stderr
-    assert all((house.folder / target).is_file() for target in targets)
-    assert not (house.folder / "build/toy/masks").exists()
+    assert all((small_checkout.folder / target).is_file() for target in targets)
+    assert not (small_checkout.folder / "build/toy/masks").exists()
 
 
 APPTAINER = """#!/bin/sh
@@ -85,19 +87,19 @@ echo "$*" >>calls.txt
 while [ "$1" != sh ] && [ "$1" != bash ]; do shift; done
 PATH=image:$PATH exec "$@"
 """
-"""What it is asked for is written down, and done here with the `python` that is the image's."""
+"""A fake apptainer that logs its arguments and runs the command with the `python` of the image."""
 
 
 @pytest.mark.slow
-def test_jobs_run_in_the_container_that_is_named(house, monkeypatch):
+def test_jobs_run_in_the_given_container(small_checkout, monkeypatch):
     for name, text in (
         ("bin/apptainer", APPTAINER),
         ("image/python", f'#!/bin/sh\nexec {sys.executable} "$@"\n'),
     ):
-        house.write(name, text)
-        (house.folder / name).chmod(0o755)
-    house.write("agent-to-sim.sif", "")
-    monkeypatch.setenv("PATH", f"{house.folder}/bin:{os.environ['PATH']}")
+        small_checkout.write(name, text)
+        (small_checkout.folder / name).chmod(0o755)
+    small_checkout.write("agent-to-sim.sif", "")
+    monkeypatch.setenv("PATH", f"{small_checkout.folder}/bin:{os.environ['PATH']}")
     command = [sys.executable, "-m", "snakemake", "--cores", "1", "--quiet", "all"]
     command += [
         "--software-deployment-method",
@@ -107,8 +109,8 @@ def test_jobs_run_in_the_container_that_is_named(house, monkeypatch):
         "container=agent-to-sim.sif",
     ]
     target = "build/toy/frames/v001/.ok"
-    made = subprocess.run([*command, "--", target], cwd=house.folder, capture_output=True, text=True)
+    made = subprocess.run([*command, "--", target], cwd=small_checkout.folder, capture_output=True, text=True)
     assert made.returncode == 0, made.stderr
-    assert (house.folder / target).is_file()
-    calls = (house.folder / "calls.txt").read_text().splitlines()
+    assert (small_checkout.folder / target).is_file()
+    calls = (small_checkout.folder / "calls.txt").read_text().splitlines()
     assert sum("agent-to-sim.sif" in call and "pipeline.workflow.run" in call for call in calls) == 2

@@ -1,4 +1,4 @@
-"""`pip install .` brings everything that the stages need, and the command works outside the checkout."""
+"""`pip install .` contains all files of the stages, and the command works outside the checkout."""
 
 import shutil
 import subprocess
@@ -18,7 +18,7 @@ ASSETS = (
 
 
 @pytest.mark.slow
-def test_a_wheel_installs_and_runs_outside_the_checkout(tmp_path):
+def test_wheel_runs_outside_the_checkout(tmp_path):
     target = tmp_path / "installed"
     options = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--target", str(target)]
     source = tmp_path / "source"
@@ -41,7 +41,7 @@ def test_a_wheel_installs_and_runs_outside_the_checkout(tmp_path):
     assert "working_side_px = 1280" in called.stdout
 
 
-def test_package_citation_and_changelog_name_one_version():
+def test_versions_of_package_citation_and_changelog_agree():
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
     headings = [line for line in (ROOT / "CHANGELOG.md").read_text().splitlines() if line.startswith("## ")]
@@ -58,7 +58,7 @@ def test_package_citation_and_changelog_name_one_version():
         (["fly"], 2, "error: RUN-003"),
     ],
 )
-def test_the_command_refuses_what_it_does_not_know(arguments, code, text):
+def test_unknown_subcommands_are_refused(arguments, code, text):
     called = subprocess.run(
         [sys.executable, "-m", "pipeline.workflow.command", *arguments],
         cwd=ROOT,

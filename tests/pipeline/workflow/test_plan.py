@@ -1,4 +1,4 @@
-"""The planner: roles, split, ids, keys, and refusals that change nothing."""
+"""The planner: roles, split, ids, keys, and refusals without side effects."""
 
 import json
 import os
@@ -13,7 +13,7 @@ from tests.pipeline.workflow import checkout
 
 
 @pytest.fixture
-def house(tmp_path):
+def small_checkout(tmp_path):
     return checkout.create(tmp_path)
 
 
@@ -25,7 +25,7 @@ def assigned(names, ids=None, **said):
 NAMES = ["walkthrough.r3d", "b.r3d", "a.r3d", "turnaround 1.r3d", "heldout.r3d"]
 
 
-def test_names_decide_roles_order_and_split():
+def test_file_names_determine_roles_order_and_split():
     videos = assigned(NAMES)
     assert [(v.id, v.file, v.role, v.split) for v in sorted(videos.values(), key=lambda v: v.id)] == [
         ("v000", "walkthrough.r3d", "walkthrough", "none"),
@@ -36,7 +36,7 @@ def test_names_decide_roles_order_and_split():
     ]
 
 
-def test_the_recipe_decides_against_the_name():
+def test_recipe_overrides_file_names():
     videos = assigned(
         NAMES, a=Remarks(split="test"), heldout=Remarks(synchronized_with="a.r3d", offset_s=0.5)
     )
@@ -47,30 +47,33 @@ def test_the_recipe_decides_against_the_name():
     )
 
 
-def test_one_session_is_no_test():
+def test_single_session_is_not_a_test_session():
     assert assigned(["walkthrough.r3d", "turnaround.r3d", "x.r3d"])["x.r3d"].split == "train"
 
 
-def test_ids_stay_and_are_never_reused():
+def test_ids_are_stable_and_never_reused():
     first = {name: video.id for name, video in assigned(NAMES).items()}
     later = assigned([*[n for n in NAMES if n != "a.r3d"], "0.r3d"], ids=first)
     assert all(later[name].id == first[name] for name in later if name in first)
     assert later["0.r3d"].id == "v005"
 
 
-def test_what_was_written_down_is_written_anew_when_it_is_broken(house):
-    house.python("pipeline.workflow.plan", "plan", "toy")
-    sound = {name: house.folder / f"build/toy/plan/{name}" for name in ("ids.json", "cache.json", "rules.mk")}
+def test_damaged_plan_files_are_rewritten(small_checkout):
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    sound = {
+        name: small_checkout.folder / f"build/toy/plan/{name}"
+        for name in ("ids.json", "cache.json", "rules.mk")
+    }
     before = {name: path.read_bytes() for name, path in sound.items()}
     for broken in ("[]", '{"a": 1}', '{"a": {"mark": [], "value": {}}}'):
         for name in ("ids.json", "cache.json"):
             sound[name].write_text(broken)
-        assert house.python("pipeline.workflow.plan", "plan", "toy").stderr == ""
+        assert small_checkout.python("pipeline.workflow.plan", "plan", "toy").stderr == ""
         assert {name: path.read_bytes() for name, path in sound.items()} == before
 
 
 @pytest.mark.parametrize("missing", ["walkthrough", "turnaround", "session"])
-def test_a_partial_capture_is_refused(missing):
+def test_incomplete_capture_is_refused(missing):
     names = [
         name for name in ("walkthrough.r3d", "turnaround.r3d", "session.r3d") if not name.startswith(missing)
     ]
@@ -81,19 +84,19 @@ def test_a_partial_capture_is_refused(missing):
 @pytest.mark.parametrize(
     "remark", [Remarks(role="film"), Remarks(split="tset"), Remarks(synchronized_with="c.r3d")]
 )
-def test_an_impossible_remark_is_refused(remark):
+def test_invalid_sidecar_is_refused(remark):
     with pytest.raises(InputError, match="CAP-041"):
         assigned(NAMES, a=remark)
 
 
-def test_the_builtin_capture_has_a_partner_for_its_second_phone():
+def test_builtin_capture_has_a_session_for_the_held_out_phone():
     said = builtin(3, heldout_of=2)
     videos = {v.file: v for v in assign(said, {}, dict.fromkeys(said), "")}
     assert videos["heldout.r3d"].synchronized_with == videos["session-2.r3d"].id
     assert "heldout.r3d" not in builtin(3, heldout_of=0)
 
 
-def test_each_turnaround_of_several_names_its_animal():
+def test_turnarounds_of_several_animals_are_assigned_by_name():
     names = ["walkthrough.r3d", "turnaround_cat.r3d", "TURNAROUND_Rex.r3d", "a.r3d"]
     assert {v.file: v.animal for v in assigned(names).values()} == dict(
         zip(names, (None, "cat", "rex", None), strict=True)
@@ -114,21 +117,21 @@ TWO = {f"captures/toy/{name}.r3d": name for name in ("walkthrough", "turnaround_
 
 
 @pytest.mark.slow
-def test_animals_of_one_home_share_what_shows_none_of_them(house):
+def test_animals_of_a_home_share_the_scene_artifacts(small_checkout):
     for name, text in TWO.items():
-        house.write(name, text)
-    made = house.make("-j2", "toy.behavior_data")
+        small_checkout.write(name, text)
+    made = small_checkout.make("-j2", "toy.behavior_data")
     assert made.returncode == 0, made.stderr
     for shared in ("frames/v000", "flow/v001", "features/v002", "scene_localizer", "identities"):
-        assert (house.folder / "build/toy" / shared / "manifest.json").exists(), shared
+        assert (small_checkout.folder / "build/toy" / shared / "manifest.json").exists(), shared
     for name, own, other in (("cat", "v001", "v002"), ("dog", "v002", "v001")):
-        folder = house.folder / "build/toy/animals" / name
+        folder = small_checkout.folder / "build/toy/animals" / name
         assert (folder / "masks" / own / "manifest.json").exists()
         assert not (folder / "masks" / other).exists(), "the other's turnaround is not its own"
         assert not (folder / "frames").exists(), "shared"
-    page = house.make("-j2", "toy.home_simulator")
+    page = small_checkout.make("-j2", "toy.home_simulator")
     assert page.returncode == 0, page.stderr
-    planned = json.loads((house.folder / "build/toy/plan/dag.json").read_text())
+    planned = json.loads((small_checkout.folder / "build/toy/plan/dag.json").read_text())
     job = next(job for job in planned if job["id"] == "home_simulator")
     assert sorted(each["name"] for each in job["inputs"]) == sorted(
         f"{name}/{part}"
@@ -136,20 +139,22 @@ def test_animals_of_one_home_share_what_shows_none_of_them(house):
         for part in ("reconstruction", "splats", "behavior", "behavior_data")
     )
     contents = [
-        (house.folder / f"build/toy/animals/{name}/reconstruction/0.bin").read_bytes()
+        (small_checkout.folder / f"build/toy/animals/{name}/reconstruction/0.bin").read_bytes()
         for name in ("cat", "dog")
     ]
     assert contents[0] != contents[1]
-    again = house.make("-j2", "toy.behavior_data")
+    again = small_checkout.make("-j2", "toy.behavior_data")
     assert "begins" not in again.stderr, "nothing changed"
     asked = ("behavior", "behavior_data")
-    together = house.python("pipeline.workflow.plan", "together", "toy", *asked)
+    together = small_checkout.python("pipeline.workflow.plan", "together", "toy", *asked)
     assert together.stdout == "--animals build/toy/animals\n"
-    one = house.python("pipeline.workflow.plan", "together", "toy/animals/cat", *asked).stdout
+    one = small_checkout.python("pipeline.workflow.plan", "together", "toy/animals/cat", *asked).stdout
     assert one.startswith("--behavior build/toy/animals/cat/behavior ")
     for home, code in (("toy", "REC-008"), ("toy/animals/bird", "REC-007.*bird: no such animal\n.*cat, dog")):
-        assert re.search(code, house.python("pipeline.workflow.plan", "inputs", home, *asked).stderr), code
-    refused = house.python("pipeline.workflow.plan", "plan", "toy/variants/other")
+        assert re.search(
+            code, small_checkout.python("pipeline.workflow.plan", "inputs", home, *asked).stderr
+        ), code
+    refused = small_checkout.python("pipeline.workflow.plan", "plan", "toy/variants/other")
     assert refused.returncode == 2
     assert "REC-008" in refused.stderr
 
@@ -159,22 +164,22 @@ HOSTILE = ["$(shell touch hacked).r3d", "`touch hacked`.r3d", "a b'\"\n;c.r3d", 
 
 
 @pytest.mark.slow
-def test_file_names_are_never_executed(house):
+def test_file_names_are_never_executed(small_checkout):
     for name in ["walkthrough.r3d", "turnaround.r3d", *HOSTILE]:
-        house.write(f"captures/toy/{name}", name)
-    made = house.make("-j2", "toy.frames")
+        small_checkout.write(f"captures/toy/{name}", name)
+    made = small_checkout.make("-j2", "toy.frames")
     assert made.returncode == 0, made.stderr
-    assert not (house.folder / "hacked").exists()
-    videos = json.loads((house.folder / "build/toy/plan/videos.json").read_text())
+    assert not (small_checkout.folder / "hacked").exists()
+    videos = json.loads((small_checkout.folder / "build/toy/plan/videos.json").read_text())
     assert {video["file"] for video in videos} >= set(HOSTILE)
 
 
-def test_what_is_amiss_with_a_stranger_is_told(house):
-    house.write("captures/toy/scan/inner/rgb.mp4", "")
-    house.write("captures/toy/scan/inner/odometry.csv", "")
-    (house.folder / "captures/toy/monday.r3d").symlink_to("/nowhere")
-    told = house.python("pipeline.workflow.plan", "plan", "toy").stderr
-    assert "'monday.r3d' (a link that leads nowhere), 'scan' (move 'inner' out of it: that is one)" in told
+def test_unknown_agents_are_refused_with_a_reason(small_checkout):
+    small_checkout.write("captures/toy/scan/inner/rgb.mp4", "")
+    small_checkout.write("captures/toy/scan/inner/odometry.csv", "")
+    (small_checkout.folder / "captures/toy/monday.r3d").symlink_to("/nowhere")
+    output = small_checkout.python("pipeline.workflow.plan", "plan", "toy").stderr
+    assert "'monday.r3d' (a link that leads nowhere), 'scan' (move 'inner' out of it: that is one)" in output
 
 
 @pytest.mark.parametrize(
@@ -205,62 +210,64 @@ def test_what_is_amiss_with_a_stranger_is_told(house):
         (["plan", "toy"], {"captures/toy/walkthrough.r3d": "x", "captures/toy/a.r3d": "x"}, "CAP-040"),
     ],
 )
-def test_refusals_change_nothing(house, arguments, files, code):
+def test_refusals_have_no_side_effects(small_checkout, arguments, files, code):
     for name, text in files.items():
-        house.write(name, text)
-    before = house.tree()
-    refused = house.python("pipeline.workflow.plan", *arguments)
+        small_checkout.write(name, text)
+    before = small_checkout.tree()
+    refused = small_checkout.python("pipeline.workflow.plan", *arguments)
     assert refused.returncode == 2
     assert refused.stderr.startswith(f"error: {code} ")
     assert "\n  -> " in refused.stderr
     assert "Traceback" not in refused.stderr
-    assert house.tree() == before
+    assert small_checkout.tree() == before
 
 
-def test_a_name_that_a_terminal_would_obey_is_spelled_out(house):
+def test_control_characters_in_names_are_escaped(small_checkout):
     for name, text in RECORDED.items():
-        house.write(name, text)
-    house.write("captures/toy/\x1b[2Jnot\na recording", "")
-    house.write("captures/toy/heldout\x1b[2J\n.r3d", "x")
-    for _ in range(2):  # once planned, once remembered
-        told = house.python("pipeline.workflow.plan", "plan", "toy").stdout
-        assert "\x1b" not in told and len(told.splitlines()) == 2
+        small_checkout.write(name, text)
+    small_checkout.write("captures/toy/\x1b[2Jnot\na recording", "")
+    small_checkout.write("captures/toy/heldout\x1b[2J\n.r3d", "x")
+    for _ in range(2):  # planned first, then from the cache
+        output = small_checkout.python("pipeline.workflow.plan", "plan", "toy").stdout
+        assert "\x1b" not in output and len(output.splitlines()) == 2
 
 
-def test_links_that_lead_in_circles_are_not_followed(house):
+def test_circular_links_are_not_followed(small_checkout):
     for name, text in RECORDED.items():
-        house.write(name, text)
-    house.write("captures/toy/scan/rgb.mp4", "x")
-    house.write("captures/toy/scan/odometry.csv", "x")
+        small_checkout.write(name, text)
+    small_checkout.write("captures/toy/scan/rgb.mp4", "x")
+    small_checkout.write("captures/toy/scan/odometry.csv", "x")
     for link, target in (("scan/a", "."), ("scan/b", "."), ("c.r3d", "c.r3d"), ("elsewhere", "/nowhere")):
-        (house.folder / "captures/toy" / link).symlink_to(target)
+        (small_checkout.folder / "captures/toy" / link).symlink_to(target)
     for _ in range(2):
-        told = house.python("pipeline.workflow.plan", "plan", "toy")
-        assert told.returncode == 0, told.stderr
-        assert "'c.r3d' (a link that leads nowhere)" in told.stdout
+        completed = small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+        assert completed.returncode == 0, completed.stderr
+        assert "'c.r3d' (a link that leads nowhere)" in completed.stdout
 
 
-def test_a_recording_that_is_a_link_is_watched(house):
+def test_changes_behind_a_linked_recording_are_detected(small_checkout):
     for name, text in RECORDED.items():
-        house.write(name, text)
-    house.write("phone/scan/rgb.mp4", "x")
-    house.write("phone/scan/odometry.csv", "x")
-    (house.folder / "captures/toy/scan").symlink_to(house.folder / "phone/scan")
+        small_checkout.write(name, text)
+    small_checkout.write("phone/scan/rgb.mp4", "x")
+    small_checkout.write("phone/scan/odometry.csv", "x")
+    (small_checkout.folder / "captures/toy/scan").symlink_to(small_checkout.folder / "phone/scan")
     hashes = set()
     for text in "xy":
-        house.write("phone/scan/rgb.mp4", text)
-        assert house.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
-        videos = json.loads((house.folder / "build/toy/plan/videos.json").read_text())
+        small_checkout.write("phone/scan/rgb.mp4", text)
+        assert small_checkout.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
+        videos = json.loads((small_checkout.folder / "build/toy/plan/videos.json").read_text())
         hashes.add(next(video["sha256"] for video in videos if video["file"] == "scan"))
     assert len(hashes) == 2
 
 
-def test_what_a_variant_does_not_touch_is_its_agents(house):
-    house.write("agents/variants/other.toml", "[train_behavior]\nseed = 3\n")
+def test_variant_shares_unaffected_artifacts(small_checkout):
+    small_checkout.write("agents/variants/other.toml", "[train_behavior]\nseed = 3\n")
     for home, own in (("toy", "build/toy"), ("toy/variants/other", "build/toy/variants/other")):
-        house.python("pipeline.workflow.plan", "plan", home)
-        told = house.python("pipeline.workflow.plan", "inputs", home, "simulator", "behavior_data", "frames")
-        assert told.stdout.split() == [
+        small_checkout.python("pipeline.workflow.plan", "plan", home)
+        completed = small_checkout.python(
+            "pipeline.workflow.plan", "inputs", home, "simulator", "behavior_data", "frames"
+        )
+        assert completed.stdout.split() == [
             "--simulator",
             f"{own}/simulator",
             "--behavior-data",
@@ -268,28 +275,28 @@ def test_what_a_variant_does_not_touch_is_its_agents(house):
             "--frames",
             "build/toy/frames",
         ]
-    refused = house.python("pipeline.workflow.plan", "inputs", "toy", "simulators")
+    refused = small_checkout.python("pipeline.workflow.plan", "inputs", "toy", "simulators")
     assert refused.returncode == 2 and refused.stderr.startswith("error: REC-007 ")
 
 
-def key_files(house):
-    folder = house.folder / "build/toy/plan/keys"
+def key_files(small_checkout):
+    folder = small_checkout.folder / "build/toy/plan/keys"
     return {path.name: path.read_text() for path in folder.iterdir()}
 
 
-def test_only_what_matters_changes_a_key(house):
-    house.python("pipeline.workflow.plan", "plan", "toy")
-    before = key_files(house)
-    front = house.folder / "stages/segment_agent/__main__.py"
+def test_only_relevant_changes_change_a_key(small_checkout):
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    before = key_files(small_checkout)
+    front = small_checkout.folder / "stages/segment_agent/__main__.py"
     text = front.read_text()
     front.write_text(text.replace('"""Hash the inputs."""', '"""Other words."""  # and a comment\n'))
-    house.python("pipeline.workflow.plan", "plan", "toy")
-    assert key_files(house) == before
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    assert key_files(small_checkout) == before
     front.write_text(text.replace("* 64", "* 65"))
-    house.write("stages/report/page.html", "<p>")
-    house.write("agents/toy.toml", "[estimate_flow]\nseed = 2\n")
-    house.python("pipeline.workflow.plan", "plan", "toy")
-    after = key_files(house)
+    small_checkout.write("stages/report/page.html", "<p>")
+    small_checkout.write("agents/toy.toml", "[estimate_flow]\nseed = 2\n")
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    after = key_files(small_checkout)
     assert {name for name in after if after[name] != before[name]} == {
         "masks.json",
         "report.json",
@@ -297,14 +304,14 @@ def test_only_what_matters_changes_a_key(house):
     }
 
 
-def test_a_new_session_does_not_touch_the_maps(house):
+def test_new_session_does_not_change_the_templates(small_checkout):
     for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d", "b.r3d"):
-        house.write(f"captures/toy/{name}", name)
-    house.python("pipeline.workflow.plan", "plan", "toy")
-    before = key_files(house)
-    house.write("captures/toy/c.r3d", "c")
-    house.python("pipeline.workflow.plan", "plan", "toy")
-    after = key_files(house)
+        small_checkout.write(f"captures/toy/{name}", name)
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    before = key_files(small_checkout)
+    small_checkout.write("captures/toy/c.r3d", "c")
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    after = key_files(small_checkout)
     changed = {name for name in before if after[name] != before[name]}
     assert changed >= {"registration.json", "reconstruction.json", "behavior_data.json"}
     assert not changed & {
@@ -316,80 +323,86 @@ def test_a_new_session_does_not_touch_the_maps(house):
     }
 
 
-def test_a_recording_that_changed_within_its_size_and_time_is_noticed(house):
+def test_changed_recording_with_the_same_size_and_time_is_detected(small_checkout):
     for name, text in RECORDED.items():
-        house.write(name, text)
-    house.python("pipeline.workflow.plan", "plan", "toy")
-    before, path = key_files(house), house.folder / "captures/toy/a.r3d"
+        small_checkout.write(name, text)
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    before, path = key_files(small_checkout), small_checkout.folder / "captures/toy/a.r3d"
     age = path.stat()
     path.write_text("b")
     os.utime(path, ns=(age.st_atime_ns, age.st_mtime_ns))
-    house.python("pipeline.workflow.plan", "plan", "toy")
-    after = key_files(house)
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    after = key_files(small_checkout)
     assert {name for name in after if before.get(name) != after[name]} == {"video.v002.json"}
 
 
-def test_a_walkthrough_without_depth_is_told_metres_by_sessions_that_train(house):
+def test_walkthrough_without_depth_is_scaled_by_training_sessions(small_checkout):
     for name in ("walkthrough.mp4", "turnaround.r3d", "a.r3d", "b.mp4", "c.r3d"):
-        house.write(f"captures/toy/{name}", name)
-    house.python("pipeline.workflow.plan", "plan", "toy")
-    told = {job["id"]: job for job in json.loads((house.folder / "build/toy/plan/dag.json").read_text())}
-    walk = told["frames.v000"]
+        small_checkout.write(f"captures/toy/{name}", name)
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    jobs = {
+        job["id"]: job for job in json.loads((small_checkout.folder / "build/toy/plan/dag.json").read_text())
+    }
+    walk = jobs["frames.v000"]
     assert walk["arguments"][walk["arguments"].index("--captures") + 1] == "captures/toy"
     assert [key.rpartition("/")[2] for key in walk["keys"]] == [
         "frames.json",
         "video.v000.json",
         "video.v002.json",
     ]
-    assert not [id for id, job in told.items() if "--captures" in job["arguments"] and id != "frames.v000"]
+    assert not [id for id, job in jobs.items() if "--captures" in job["arguments"] and id != "frames.v000"]
 
 
-def test_clicks_are_read_by_reconstruction_metrics_alone(house):
+def test_clicks_are_an_input_of_reconstruction_metrics_only(small_checkout):
     for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d"):
-        house.write(f"captures/toy/{name}", name)
-    house.python("pipeline.workflow.plan", "plan", "toy")
-    before = key_files(house)
-    house.write("captures/toy/clicks.json", "not even JSON")
-    house.python("pipeline.workflow.plan", "plan", "toy")
-    after = key_files(house)
+        small_checkout.write(f"captures/toy/{name}", name)
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    before = key_files(small_checkout)
+    small_checkout.write("captures/toy/clicks.json", "not even JSON")
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    after = key_files(small_checkout)
     assert {name for name in after if before.get(name) != after[name]} == {"extra.clicks.json"}
-    jobs = json.loads((house.folder / "build/toy/plan/dag.json").read_text())
+    jobs = json.loads((small_checkout.folder / "build/toy/plan/dag.json").read_text())
     readers = [job["id"] for job in jobs if "--clicks" in job["arguments"]]
     assert readers == ["reconstruction_metrics"]
     assert all("extra.clicks.json" in str(job["keys"]) for job in jobs if job["id"] in readers)
 
 
-def test_a_former_reconstruction_is_begun_from_but_not_by_variants(house):
+def test_earlier_reconstruction_is_an_input_except_for_variants(small_checkout):
     for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d"):
-        house.write(f"captures/toy/{name}", name)
-    house.write("captures/toy/former/motion.npz", "unfinished")
-    assert house.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
-    before = key_files(house)
+        small_checkout.write(f"captures/toy/{name}", name)
+    small_checkout.write("captures/toy/former/motion.npz", "unfinished")
+    assert small_checkout.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
+    before = key_files(small_checkout)
     assert not any("former" in name for name in before), "no artifact"
-    house.write("captures/toy/former/manifest.json", "{}")
-    house.write("agents/variants/longer.toml", "[reconstruct]\nseed = 7\n")
+    small_checkout.write("captures/toy/former/manifest.json", "{}")
+    small_checkout.write("agents/variants/longer.toml", "[reconstruct]\nseed = 7\n")
     for home in ("toy", "toy/variants/longer"):
-        assert house.python("pipeline.workflow.plan", "plan", home).returncode == 0
-    after = key_files(house)
+        assert small_checkout.python("pipeline.workflow.plan", "plan", home).returncode == 0
+    after = key_files(small_checkout)
     assert {name for name in after if before.get(name) != after[name]} == {"extra.former"}
-    plans = [house.folder / "build/toy" / inside / "plan/dag.json" for inside in (".", "variants/longer")]
+    plans = [
+        small_checkout.folder / "build/toy" / inside / "plan/dag.json" for inside in (".", "variants/longer")
+    ]
     for plan, readers in zip(plans, (["reconstruction"], []), strict=True):
         assert [
             job["id"] for job in json.loads(plan.read_text()) if "--former" in job["arguments"]
         ] == readers
-    assert captures.unknown_files(house.folder / "captures/toy") == []
+    assert captures.unknown_files(small_checkout.folder / "captures/toy") == []
 
 
-def test_further_homes_are_inputs_of_the_behavior_model_alone(house):
+def test_further_homes_are_inputs_of_the_behavior_model_only(small_checkout):
     for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d"):
-        house.write(f"captures/toy/{name}", name)
-    house.write("agents/toy.toml", '[train_behavior]\nhomes = ["summer"]\n')
-    missing = house.python("pipeline.workflow.plan", "plan", "toy")
+        small_checkout.write(f"captures/toy/{name}", name)
+    small_checkout.write("agents/toy.toml", '[train_behavior]\nhomes = ["summer"]\n')
+    missing = small_checkout.python("pipeline.workflow.plan", "plan", "toy")
     assert missing.returncode == 2 and "ART-003" in missing.stderr and "make summer" in missing.stderr
     for artifact in ("behavior_data", "feature_basis", "scene_template"):
-        house.write(f"build/summer/{artifact}/world.json", "{}")
-    assert house.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
-    jobs = {job["id"]: job for job in json.loads((house.folder / "build/toy/plan/dag.json").read_text())}
+        small_checkout.write(f"build/summer/{artifact}/world.json", "{}")
+    assert small_checkout.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
+    jobs = {
+        job["id"]: job for job in json.loads((small_checkout.folder / "build/toy/plan/dag.json").read_text())
+    }
     readers = {id for id, job in jobs.items() if any("summer" in each["path"] for each in job["inputs"])}
     assert readers == {"behavior"}
     assert [each["path"] for each in jobs["behavior"]["inputs"]] == [
@@ -405,44 +418,46 @@ def test_further_homes_are_inputs_of_the_behavior_model_alone(house):
 
 
 @pytest.mark.parametrize("name", ["toy", "../cat", "pair/animals/dog"])
-def test_a_home_that_is_no_other_build_is_refused(house, name):
-    house.write("agents/toy.toml", f'[train_behavior]\nhomes = ["{name}"]\n')
-    refused = house.python("pipeline.workflow.plan", "plan", "toy")
+def test_home_that_is_no_other_build_is_refused(small_checkout, name):
+    small_checkout.write("agents/toy.toml", f'[train_behavior]\nhomes = ["{name}"]\n')
+    refused = small_checkout.python("pipeline.workflow.plan", "plan", "toy")
     assert refused.returncode == 2 and "REC-002" in refused.stderr and name in refused.stderr
 
 
-def test_a_prompt_beside_a_recording_reaches_its_masks_alone(house):
+def test_prompt_is_an_input_of_the_masks_of_its_recording_only(small_checkout):
     for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d", "b.r3d"):
-        house.write(f"captures/toy/{name}", name)
-    house.python("pipeline.workflow.plan", "plan", "toy")
-    before = key_files(house)
-    house.write("captures/toy/b.r3d.prompt.toml", "time_s = 2\nclick = [0.5, 0.5]")
-    house.python("pipeline.workflow.plan", "plan", "toy")
-    after = key_files(house)
+        small_checkout.write(f"captures/toy/{name}", name)
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    before = key_files(small_checkout)
+    small_checkout.write("captures/toy/b.r3d.prompt.toml", "time_s = 2\nclick = [0.5, 0.5]")
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    after = key_files(small_checkout)
     assert {name for name in after if before.get(name) != after[name]} == {"prompt.v003.json"}
-    jobs = json.loads((house.folder / "build/toy/plan/dag.json").read_text())
-    told = {job["id"]: job for job in jobs if "--prompt" in job["arguments"]}
-    assert list(told) == ["masks.v003"], "b.r3d"
-    assert "captures/toy/b.r3d.prompt.toml" in told["masks.v003"]["arguments"]
-    assert any(key.endswith("keys/prompt.v003.json") for key in told["masks.v003"]["keys"])
-    assert captures.unknown_files(house.folder / "captures/toy") == []
+    jobs = json.loads((small_checkout.folder / "build/toy/plan/dag.json").read_text())
+    prompted = {job["id"]: job for job in jobs if "--prompt" in job["arguments"]}
+    assert list(prompted) == ["masks.v003"], "b.r3d"
+    assert "captures/toy/b.r3d.prompt.toml" in prompted["masks.v003"]["arguments"]
+    assert any(key.endswith("keys/prompt.v003.json") for key in prompted["masks.v003"]["keys"])
+    assert captures.unknown_files(small_checkout.folder / "captures/toy") == []
 
 
 @pytest.mark.parametrize("variable", ["AGENT", "VARIANT", "FORMAT", "PLACES"])
 @pytest.mark.parametrize("value", ["x'; touch hacked; '", "a b", "../x", "$(touch hacked)", '"', ";"])
-def test_names_given_to_make_are_never_executed(house, variable, value):
+def test_names_passed_to_make_are_never_executed(small_checkout, variable, value):
     for target in ("help", "export", "annotate"):
-        made = house.make("-n", target, f"{variable}={value.replace('$', '$$')}")
+        made = small_checkout.make("-n", target, f"{variable}={value.replace('$', '$$')}")
         assert made.returncode == 2
         assert f"REC-004 {variable} is no plain name" in made.stderr
-    assert not (house.folder / "hacked").exists()
+    assert not (small_checkout.folder / "hacked").exists()
 
 
-def test_a_session_without_depth_is_read_through_what_stands_in_for_its_frames(house):
+def test_session_without_depth_is_read_with_estimated_depth(small_checkout):
     for name in ("walkthrough.r3d", "turnaround.mp4", "a.mp4", "b.r3d"):
-        house.write(f"captures/toy/{name}", name)
-    house.python("pipeline.workflow.plan", "plan", "toy")
-    jobs = {job["id"]: job for job in json.loads((house.folder / "build/toy/plan/dag.json").read_text())}
+        small_checkout.write(f"captures/toy/{name}", name)
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    jobs = {
+        job["id"]: job for job in json.loads((small_checkout.folder / "build/toy/plan/dag.json").read_text())
+    }
     made = {name for name in jobs if name.split(".")[0] in ("frames", "pictures", "estimated_frames")}
     assert made == {
         "frames.v000", "frames.v003", "pictures.v001", "pictures.v002",

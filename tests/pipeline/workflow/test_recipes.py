@@ -1,4 +1,4 @@
-"""Where a flow begins and which trials the tables want, as recipes say it."""
+"""Recipes: start of the flow and trials of the tables."""
 
 import json
 
@@ -9,7 +9,7 @@ from pipeline.workflow import recipes
 from tests.pipeline.workflow import checkout
 
 
-def test_overlays_go_into_tables_and_leave_the_rest():
+def test_overlays_are_merged_into_tables():
     table = {"seed": 1, "training": {"steps": 5, "augmentation": {"turn": 0.5}}}
     assert recipes.merged(table, {"training": {"augmentation": {"turn": 0.0}}}) == {
         "seed": 1,
@@ -21,7 +21,7 @@ def test_overlays_go_into_tables_and_leave_the_rest():
 @pytest.mark.parametrize(
     "table", [{"begins_at": "pictures"}, {"begin": "recordings"}, {"begins_at": ["x"]}, {"begins_at": {}}]
 )
-def test_unknown_beginnings_are_refused(table):
+def test_unknown_start_of_the_flow_is_refused(table):
     with pytest.raises(InputError, match="REC-00"):
         recipes.flow(table, "agents/cat.toml")
 
@@ -40,12 +40,12 @@ def test_trials_of_the_wrong_type_are_refused(table):
 
 
 @pytest.mark.parametrize("table", [{"seeds": 0}, {"methods": ["world"]}, {"methods": []}])
-def test_tables_of_nothing_or_without_ours_are_refused(table):
+def test_empty_tables_and_tables_without_ours_are_refused(table):
     with pytest.raises(InputError, match="REC-002.*tabulate_behavior(.|\n)*'ats' among the methods"):
         list(recipes.trials(table))
 
 
-def test_a_count_of_recordings_of_the_wrong_type_is_refused():
+def test_recording_count_of_the_wrong_type_is_refused():
     with pytest.raises(InputError, match="REC-002.*session_count"):
         recipes.builtin_remarks(
             "recordings", {"synthesize_capture": {"session_count": "two"}}, "agents/toy.toml"
@@ -69,13 +69,13 @@ def test_a_count_of_recordings_of_the_wrong_type_is_refused():
         (f"[videos.'a.r3d']\noffset_s = {'9' * 400}", "offset_s: 99999"),
     ],
 )
-def test_inner_tables_are_checked_before_anything_is_built(tmp_path, text, where):
+def test_nested_tables_are_checked_by_the_planner(tmp_path, text, where):
     (tmp_path / "cat.toml").write_text(text)
     with pytest.raises(InputError, match=f"REC-00[12] .*{where}"):
         recipes.read(tmp_path / "cat.toml")
 
 
-def test_a_variant_starts_from_its_base(tmp_path):
+def test_variant_extends_its_base(tmp_path):
     variants = tmp_path / "variants"
     variants.mkdir()
     (variants / "a.toml").write_text("[reconstruct.steps]\nscene = 9\njoint = 8\n")
@@ -90,14 +90,14 @@ def test_a_variant_starts_from_its_base(tmp_path):
         recipes.read(tmp_path / "cat.toml")
 
 
-def test_tables_of_motion_need_no_recordings(tmp_path):
-    house = checkout.create(tmp_path)
-    house.write("agents/dog.toml", '[flow]\nbegins_at = "trajectories"\n')
+def test_motion_tables_need_no_recordings(tmp_path):
+    small_checkout = checkout.create(tmp_path)
+    small_checkout.write("agents/dog.toml", '[flow]\nbegins_at = "trajectories"\n')
     for name in ("a.csv", "b.npz", "ignored.txt"):
-        house.write(f"captures/dog/{name}", name)
-    told = house.python("pipeline.workflow.plan", "plan", "dog")
-    assert told.returncode == 0, told.stderr
-    assert "'ignored.txt'" in told.stdout
+        small_checkout.write(f"captures/dog/{name}", name)
+    completed = small_checkout.python("pipeline.workflow.plan", "plan", "dog")
+    assert completed.returncode == 0, completed.stderr
+    assert "'ignored.txt'" in completed.stdout
     jobs = json.loads((tmp_path / "build/dog/plan/dag.json").read_text())
     assert [job["id"] for job in jobs] == [
         "trajectories.v000",

@@ -1,4 +1,4 @@
-"""A report's crate is enough to build again; what differs is named in flow order."""
+"""The crate of a report suffices to rebuild; differences are named in flow order."""
 
 import json
 import shutil
@@ -26,7 +26,7 @@ SETTINGS = {
 
 
 def build(folder: Path, words: dict[str, str], videos: tuple[Video, ...] = ()) -> Path:
-    """Write small artifacts, with the crate that a report would hold of them; returns the crate."""
+    """Write small artifacts and the crate of their report; return the crate."""
     found: dict[str, dict[str | None, Path]] = {}
     for name, settings in SETTINGS.items():
         ids = ["v000", "v001"] if name == "masks" else [None]
@@ -43,7 +43,7 @@ def build(folder: Path, words: dict[str, str], videos: tuple[Video, ...] = ()) -
     return folder / crate.FILE
 
 
-def test_the_first_artifact_that_differs_is_named(tmp_path: Path):
+def test_first_different_artifact_is_named(tmp_path: Path):
     known = reproduce.read(build(tmp_path / "a", {}))
     build(tmp_path / "same", {})
     assert list(reproduce.compare(known, tmp_path / "same")) == []
@@ -55,7 +55,7 @@ def test_the_first_artifact_that_differs_is_named(tmp_path: Path):
     assert "the first one is masks/v001" in lines[0] and "0.8 in the crate, 0.7 here" in lines[-1]
 
 
-def test_a_changed_byte_and_a_changed_setting_are_named(tmp_path: Path):
+def test_changed_bytes_and_settings_are_named(tmp_path: Path):
     known = reproduce.read(build(tmp_path / "a", {}))
     (tmp_path / "a/flow/result.txt").write_text("sane")
     lines = list(reproduce.compare(known, tmp_path / "a"))
@@ -68,12 +68,12 @@ def test_a_changed_byte_and_a_changed_setting_are_named(tmp_path: Path):
     assert "  backend: search in the crate, raft here" in lines
 
 
-def test_an_artifact_that_was_not_built_differs(tmp_path: Path):
+def test_missing_artifact_differs(tmp_path: Path):
     known = reproduce.read(build(tmp_path / "a", {}))
     assert reproduce.differing(known, tmp_path / "nowhere")[0] == "frames"
 
 
-def test_the_recipe_holds_the_settings(tmp_path: Path):
+def test_recipe_contains_the_settings(tmp_path: Path):
     (tmp_path / "recipe.toml").write_text(reproduce.recipe(reproduce.read(build(tmp_path / "a", {}))))
     table = config.read_table(tmp_path / "recipe.toml")
     assert table["gather_registration"] == SETTINGS["registration"]
@@ -87,7 +87,7 @@ def test_the_recipe_holds_the_settings(tmp_path: Path):
     assert config.from_table(Flow, table["estimate_flow"], where="recipe") == Flow(**SETTINGS["flow"])
 
 
-def test_recordings_are_found_by_their_hash_and_planned_as_they_were(tmp_path: Path):
+def test_recordings_are_found_by_hash_and_planned_identically(tmp_path: Path):
     captures, agents, builds = (tmp_path / name for name in ("captures", "agents", "build"))
     (captures / "luna").mkdir(parents=True)
     agents.mkdir()
@@ -127,13 +127,13 @@ def test_one_of_several_animals_is_refused(tmp_path: Path):
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"@graph": [{"@id": "./"}]}', '{"@graph": 3}'])
-def test_what_is_no_crate_is_refused(tmp_path: Path, text: str):
+def test_invalid_crate_is_refused(tmp_path: Path, text: str):
     (tmp_path / "x.json").write_text(text)
     with pytest.raises(InputError, match="CRT-001"):
         reproduce.read(tmp_path / "x.json")
 
 
-def test_times_are_kept_and_methods_cite_what_was_used(tmp_path: Path):
+def test_crate_keeps_times_and_cites_used_methods(tmp_path: Path):
     described = json.loads(build(tmp_path / "a", {}).read_text())
     masks = next(entity for entity in described["@graph"] if entity["@id"] == "#artifact/masks/v000")
     assert {"@type": "PropertyValue", "name": "seconds", "value": 4.5} in masks["additionalProperty"]

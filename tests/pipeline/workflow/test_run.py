@@ -1,4 +1,4 @@
-"""The runner and its engines: cut-off, redo, variants, failure, kills; Make and Snakemake agree."""
+"""The runner and its engines: cut-off, redo, variants, failures, kills; Make and Snakemake agree."""
 
 import os
 import random
@@ -17,232 +17,242 @@ from tests.pipeline.workflow import checkout
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    house = checkout.create(tmp_path_factory.mktemp("house"))
-    made = house.make("-j2", "toy")
+    small_checkout = checkout.create(tmp_path_factory.mktemp("checkout"))
+    made = small_checkout.make("-j2", "toy")
     assert made.returncode == 0, made.stderr
-    return house
+    return small_checkout
 
 
 @pytest.fixture
-def house(built, tmp_path):
-    """A copy of the built house, ages and all."""
-    shutil.copytree(built.folder, tmp_path / "house", symlinks=True)
-    return checkout.Checkout(tmp_path / "house")
+def small_checkout(built, tmp_path):
+    """A copy of the built checkout with its modification times."""
+    shutil.copytree(built.folder, tmp_path / "checkout", symlinks=True)
+    return checkout.Checkout(tmp_path / "checkout")
 
 
-def begun(made):
+def started_jobs(made):
     assert made.returncode == 0, made.stderr
     return {line.split("]")[0][1:] for line in made.stderr.splitlines() if "] begins (" in line}
 
 
-def contents(house):
+def contents(small_checkout):
     """Return the content hash of every artifact, each checked against its files."""
     found = {}
-    for path in (house.folder / "build").rglob(artifact.MANIFEST):
-        if path.parent.name.startswith("."):  # of one that died just before the rename: it does not count
+    for path in (small_checkout.folder / "build").rglob(artifact.MANIFEST):
+        if path.parent.name.startswith("."):  # of a writer that was killed before the rename: ignored
             continue
         manifest = artifact.read_manifest(path.parent)
         assert manifest is not None, path
         assert manifest.files == artifact.digests(path.parent), path
-        found[path.parent.relative_to(house.folder).as_posix()] = (manifest.content, manifest.key)
+        found[path.parent.relative_to(small_checkout.folder).as_posix()] = (manifest.content, manifest.key)
     return found
 
 
-def leftovers(house):
-    return [p for pattern in (".*.tmp*", ".*.old*") for p in (house.folder / "build").rglob(pattern)]
+def leftovers(small_checkout):
+    return [p for pattern in (".*.tmp*", ".*.old*") for p in (small_checkout.folder / "build").rglob(pattern)]
 
 
 @pytest.mark.slow
-def test_a_second_build_does_nothing(house):
-    assert begun(house.make("toy")) == set()
+def test_second_build_runs_no_job(small_checkout):
+    assert started_jobs(small_checkout.make("toy")) == set()
 
 
-def test_touching_reruns_nothing(house):
-    for path in (house.folder / "build/toy/plan/keys").iterdir():
+def test_touched_files_rerun_no_job(small_checkout):
+    for path in (small_checkout.folder / "build/toy/plan/keys").iterdir():
         path.touch()
-    assert begun(house.make("toy")) == set()
+    assert started_jobs(small_checkout.make("toy")) == set()
 
 
 FUTURE_NS = time.time_ns() + 10**9 * 3600 * 24 * 365
 
 
 @pytest.mark.slow
-def test_stamps_from_the_future_hide_nothing(house):
-    """The clock was a year ahead when it was built, or the stamps were copied from where it was."""
-    for stamp in (house.folder / "build/toy").rglob(artifact.STAMP):
+def test_changes_are_detected_with_future_stamps(small_checkout):
+    """The clock was a year ahead during the build, or stamps were copied from another machine."""
+    for stamp in (small_checkout.folder / "build/toy").rglob(artifact.STAMP):
         os.utime(stamp, ns=(FUTURE_NS, FUTURE_NS))
-    house.write("agents/toy.toml", "[train_behavior]\nseed = 5\n")
-    assert begun(house.make("toy")) == {"behavior", "simulator", "evaluation", "report"}
-    assert begun(house.make("toy")) == set()
+    small_checkout.write("agents/toy.toml", "[train_behavior]\nseed = 5\n")
+    assert started_jobs(small_checkout.make("toy")) == {"behavior", "simulator", "evaluation", "report"}
+    assert started_jobs(small_checkout.make("toy")) == set()
 
 
 @pytest.mark.slow
-def test_a_clock_that_goes_back_hides_nothing(house):
-    """All was stamped by a clock that was a year ahead; it is put right while a build runs."""
-    os.utime(house.folder / "build/toy/clock", ns=(FUTURE_NS, FUTURE_NS))
-    for stamp in (house.folder / "build/toy").rglob(artifact.STAMP):
+def test_changes_are_detected_when_the_clock_is_set_back(small_checkout):
+    """All stamps were written with a clock a year ahead, which is corrected during a build."""
+    os.utime(small_checkout.folder / "build/toy/clock", ns=(FUTURE_NS, FUTURE_NS))
+    for stamp in (small_checkout.folder / "build/toy").rglob(artifact.STAMP):
         os.utime(stamp, ns=(FUTURE_NS - 1000, FUTURE_NS - 1000))
-    assert begun(house.make("toy")) == set()
-    front = house.folder / "stages/estimate_flow/__main__.py"
+    assert started_jobs(small_checkout.make("toy")) == set()
+    front = small_checkout.folder / "stages/estimate_flow/__main__.py"
     front.write_text(front.read_text().replace("* 64", "* 65"))
-    assert {"flow.v001", "registration", "behavior", "report"} <= begun(house.make("-j2", "toy"))
-    assert begun(house.make("toy")) == set()
+    assert {"flow.v001", "registration", "behavior", "report"} <= started_jobs(
+        small_checkout.make("-j2", "toy")
+    )
+    assert started_jobs(small_checkout.make("toy")) == set()
 
 
-def test_a_key_that_changes_while_its_job_runs_is_not_stamped(house):
-    house.write("agents/toy.toml", "[train_behavior]\npause_s = 1.0\n")
-    house.python("pipeline.workflow.plan", "plan", "toy")
+def test_key_that_changes_during_its_job_is_not_stamped(small_checkout):
+    small_checkout.write("agents/toy.toml", "[train_behavior]\npause_s = 1.0\n")
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
     command = [sys.executable, "-SE", "-m", "pipeline.workflow.run", "toy", "behavior"]
-    running = subprocess.Popen(command, cwd=house.folder, stderr=subprocess.PIPE, text=True)
-    while not leftovers(house) and running.poll() is None:
+    running = subprocess.Popen(command, cwd=small_checkout.folder, stderr=subprocess.PIPE, text=True)
+    while not leftovers(small_checkout) and running.poll() is None:
         time.sleep(0.02)
-    house.write("agents/toy.toml", "[train_behavior]\nseed = 5\n")
-    house.python("pipeline.workflow.plan", "plan", "toy")
+    small_checkout.write("agents/toy.toml", "[train_behavior]\nseed = 5\n")
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
     assert running.communicate(timeout=60)[1].count("] begins (") == 2
     assert running.returncode == 0
-    assert begun(house.make("toy")) == {"simulator", "evaluation", "report"}
+    assert started_jobs(small_checkout.make("toy")) == {"simulator", "evaluation", "report"}
 
 
-def test_a_changed_table_reruns_that_stage_and_what_depends_on_it(house):
-    house.write("agents/toy.toml", "[train_behavior]\nseed = 5\n")
-    assert begun(house.make("toy")) == {"behavior", "simulator", "evaluation", "report"}
+def test_changed_recipe_table_reruns_its_stage_and_dependents(small_checkout):
+    small_checkout.write("agents/toy.toml", "[train_behavior]\nseed = 5\n")
+    assert started_jobs(small_checkout.make("toy")) == {"behavior", "simulator", "evaluation", "report"}
 
 
 @pytest.mark.slow
-def test_equal_results_cut_the_work_off(house):
+def test_equal_results_do_not_rerun_dependents(small_checkout):
     """`pause_s` changes the key of the flow but not its content."""
-    front = house.folder / "stages/estimate_flow/__main__.py"
+    front = small_checkout.folder / "stages/estimate_flow/__main__.py"
     front.write_text(front.read_text() + "\nNOTHING = 0\n")
-    assert begun(house.make("toy")) == {"flow.v001", "flow.v002", "flow.v003"}
+    assert started_jobs(small_checkout.make("toy")) == {"flow.v001", "flow.v002", "flow.v003"}
 
 
 @pytest.mark.slow
-def test_redo(house):
-    assert begun(house.make("toy.masks.redo")) == {"masks.v001", "masks.v002", "masks.v003"}
-    assert begun(house.make("toy")) == set()
+def test_redo_reruns_the_job(small_checkout):
+    assert started_jobs(small_checkout.make("toy.masks.redo")) == {"masks.v001", "masks.v002", "masks.v003"}
+    assert started_jobs(small_checkout.make("toy")) == set()
 
 
 @pytest.mark.slow
-def test_a_record_cut_off_is_cleaned_up(house):
-    """The writer died when its artifact was published and not yet stamped: nothing is made again."""
-    (house.folder / "build/toy/records/.flow.v001.json.tmp").touch()
-    (house.folder / "build/toy/flow/v001" / artifact.STAMP).unlink()
-    assert begun(house.make("toy")) == set()
-    assert not leftovers(house)
+def test_job_killed_before_its_stamp_is_not_rerun(small_checkout):
+    """The writer was killed after publishing and before stamping: nothing is rebuilt."""
+    (small_checkout.folder / "build/toy/records/.flow.v001.json.tmp").touch()
+    (small_checkout.folder / "build/toy/flow/v001" / artifact.STAMP).unlink()
+    assert started_jobs(small_checkout.make("toy")) == set()
+    assert not leftovers(small_checkout)
 
 
 @pytest.mark.slow
-def test_up_to_one_artifact(house):
-    shutil.rmtree(house.folder / "build")
-    assert begun(house.make("toy.flow")) == {
+def test_build_up_to_one_artifact(small_checkout):
+    shutil.rmtree(small_checkout.folder / "build")
+    assert started_jobs(small_checkout.make("toy.flow")) == {
         "synthetic_capture",
         *(f"frames.v00{i}" for i in (1, 2, 3)),
         *(f"flow.v00{i}" for i in (1, 2, 3)),
     }
 
 
-def test_a_variant_shares_what_it_does_not_touch(house):
-    before = contents(house)
-    assert begun(house.make("toy", "VARIANT=other")) == {"behavior", "simulator", "evaluation", "report"}
-    assert contents(house).items() >= before.items()
-    assert begun(house.make("toy")) == set()
+def test_variant_shares_unaffected_artifacts(small_checkout):
+    before = contents(small_checkout)
+    assert started_jobs(small_checkout.make("toy", "VARIANT=other")) == {
+        "behavior",
+        "simulator",
+        "evaluation",
+        "report",
+    }
+    assert contents(small_checkout).items() >= before.items()
+    assert started_jobs(small_checkout.make("toy")) == set()
 
 
-def test_a_failing_stage_keeps_the_old_result_and_its_code(house):
-    before = contents(house)
-    house.write("agents/toy.toml", "[train_behavior]\nfail = true\n")
-    house.python("pipeline.workflow.plan", "plan", "toy")
-    failed = house.python("pipeline.workflow.run", "toy", "behavior")
+def test_failing_stage_keeps_the_old_artifact_and_its_exit_code(small_checkout):
+    before = contents(small_checkout)
+    small_checkout.write("agents/toy.toml", "[train_behavior]\nfail = true\n")
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    failed = small_checkout.python("pipeline.workflow.run", "toy", "behavior")
     assert failed.returncode == 2
     assert "TST-001" in failed.stderr
-    assert contents(house) == before
-    assert not leftovers(house)
+    assert contents(small_checkout) == before
+    assert not leftovers(small_checkout)
 
 
-def test_a_damaged_input_is_named_when_a_stage_fails(house):
-    house.write("agents/toy.toml", "[train_behavior]\nfail = true\n")
-    data = house.folder / "build/toy/behavior_data"
+def test_damaged_input_of_a_failed_stage_is_named(small_checkout):
+    small_checkout.write("agents/toy.toml", "[train_behavior]\nfail = true\n")
+    data = small_checkout.folder / "build/toy/behavior_data"
     (data / "1.bin").write_bytes(b"cut")
-    failed = house.make("toy.behavior")
+    failed = small_checkout.make("toy.behavior")
     assert failed.returncode == 2
     assert "error: ART-005 build/toy/behavior_data/1.bin" in failed.stderr
     assert "rm -r build/toy/behavior_data" in failed.stderr
 
 
 @pytest.mark.slow
-def test_what_changed_behind_a_builds_back_is_found(house):
-    assert house.make("verify", "AGENT=toy").returncode == 0
-    changed = house.folder / "build/toy/flow/v001/1.bin"
+def test_verify_finds_modified_files(small_checkout):
+    assert small_checkout.make("verify", "AGENT=toy").returncode == 0
+    changed = small_checkout.folder / "build/toy/flow/v001/1.bin"
     before = changed.stat()
     changed.write_bytes(changed.read_bytes()[::-1])
     os.utime(changed, ns=(before.st_atime_ns, before.st_mtime_ns))
-    found = house.make("verify", "AGENT=toy")
+    found = small_checkout.make("verify", "AGENT=toy")
     assert found.returncode == 2
     assert [line for line in found.stderr.splitlines() if line.startswith("error: ")] == [
         "error: ART-005 build/toy/flow/v001/1.bin: has been damaged, changed or deleted since it was made"
     ]
-    shutil.rmtree(house.folder / "build/toy/flow/v001")
-    assert begun(house.make("toy")) == {"flow.v001"}
-    assert house.make("verify", "AGENT=toy").returncode == 0
+    shutil.rmtree(small_checkout.folder / "build/toy/flow/v001")
+    assert started_jobs(small_checkout.make("toy")) == {"flow.v001"}
+    assert small_checkout.make("verify", "AGENT=toy").returncode == 0
 
 
-def test_an_unfinished_input_is_named(house):
-    (house.folder / "build/toy/reconstruction/manifest.json").unlink()
-    refused = house.python("pipeline.workflow.run", "toy", "splats")
+def test_incomplete_input_is_named(small_checkout):
+    (small_checkout.folder / "build/toy/reconstruction/manifest.json").unlink()
+    refused = small_checkout.python("pipeline.workflow.run", "toy", "splats")
     assert refused.returncode == 2
     assert refused.stderr.startswith("error: ART-001 build/toy/reconstruction")
 
 
-def test_an_unknown_job_is_named(house):
-    assert house.python("pipeline.workflow.run", "toy", "nothing").stderr.startswith("error: RUN-001 toy")
+def test_unknown_job_is_named(small_checkout):
+    assert small_checkout.python("pipeline.workflow.run", "toy", "nothing").stderr.startswith(
+        "error: RUN-001 toy"
+    )
 
 
 @pytest.mark.slow
-def test_a_removed_recording_reruns_the_merge(tmp_path):
-    house = checkout.create(tmp_path)
+def test_removed_recording_reruns_the_merge(tmp_path):
+    small_checkout = checkout.create(tmp_path)
     for name in ("walkthrough", "turnaround", "a", "b", "c"):
-        house.write(f"captures/toy/{name}.r3d", name)
-    begun(house.make("-j2", "toy.registration"))
-    (house.folder / "captures/toy/a.r3d").unlink()
-    again = begun(house.make("-j2", "toy.registration"))
+        small_checkout.write(f"captures/toy/{name}.r3d", name)
+    started_jobs(small_checkout.make("-j2", "toy.registration"))
+    (small_checkout.folder / "captures/toy/a.r3d").unlink()
+    again = started_jobs(small_checkout.make("-j2", "toy.registration"))
     assert {"registration", "feature_basis"} <= again
     assert not again & {"frames.v003", "flow.v003", "masks.v003"}
 
 
 @pytest.mark.slow
-def test_two_builds_at_once_are_both_right(house):
-    reference = contents(house)
-    shutil.rmtree(house.folder / "build")
+def test_concurrent_builds_are_correct(small_checkout):
+    reference = contents(small_checkout)
+    shutil.rmtree(small_checkout.folder / "build")
     command = ["make", f"PYTHON={sys.executable}", "-j2", "toy"]
     both = [
-        subprocess.Popen(command, cwd=house.folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        subprocess.Popen(
+            command, cwd=small_checkout.folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         for _ in range(2)
     ]
     assert [each.wait() for each in both] == [0, 0]
-    assert contents(house) == reference
+    assert contents(small_checkout) == reference
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("victim", ["group", "anyone"])
-def test_kills_leave_nothing_wrong(house, victim):
-    """SIGKILL at random points; whatever counts as complete is, and the next build ends as if nothing had
-    been.
-    """
-    reference = contents(house)
+def test_builds_recover_from_kills(small_checkout, victim):
+    """SIGKILL at random points: complete artifacts are correct, and the next build succeeds."""
+    reference = contents(small_checkout)
     choice = random.Random(victim)
-    shutil.rmtree(house.folder / "build")
+    shutil.rmtree(small_checkout.folder / "build")
     for complete in sorted(choice.sample(range(len(reference) - 5), 2)):
         command = ["make", f"PYTHON={sys.executable}", "-j2", "toy"]
         build = subprocess.Popen(
             command,
-            cwd=house.folder,
+            cwd=small_checkout.folder,
             start_new_session=True,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
         while (
             build.poll() is None
-            and sum(artifact.MANIFEST in files for *_, files in os.walk(house.folder / "build")) < complete
+            and sum(artifact.MANIFEST in files for *_, files in os.walk(small_checkout.folder / "build"))
+            < complete
         ):
             time.sleep(choice.uniform(0.0, 0.1))
         match victim:
@@ -253,78 +263,80 @@ def test_kills_leave_nothing_wrong(house, victim):
                 os.kill(choice.choice(alive), signal.SIGKILL)
         build.wait()
         checkout.wait_for_group(build.pid)
-        done = contents(house)
+        done = contents(small_checkout)
         assert done.items() <= reference.items()
-    assert house.make("-j2", "toy").returncode == 0
-    assert contents(house) == reference
-    assert not leftovers(house)
+    assert small_checkout.make("-j2", "toy").returncode == 0
+    assert contents(small_checkout) == reference
+    assert not leftovers(small_checkout)
 
 
-def test_a_job_that_is_told_to_stop_ends_with_its_stage(house):
-    house.write("agents/toy.toml", "[synthesize_capture]\npause_s = 60.0\n")
-    assert house.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
+def test_terminated_job_ends_its_stage(small_checkout):
+    small_checkout.write("agents/toy.toml", "[synthesize_capture]\npause_s = 60.0\n")
+    assert small_checkout.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
     command = [sys.executable, "-SE", "-m", "pipeline.workflow.run", "toy", "synthetic_capture"]
-    running = subprocess.Popen(command, cwd=house.folder, stderr=subprocess.PIPE, text=True)
-    while not leftovers(house) and running.poll() is None:
+    running = subprocess.Popen(command, cwd=small_checkout.folder, stderr=subprocess.PIPE, text=True)
+    while not leftovers(small_checkout) and running.poll() is None:
         time.sleep(0.02)
     running.send_signal(signal.SIGTERM)
-    told = running.communicate(timeout=run.GRACE_S - 5)[1]
-    assert (running.returncode, told.count("run the same again to go on")) == (128 + signal.SIGTERM, 1)
+    completed = running.communicate(timeout=run.GRACE_S - 5)[1]
+    assert (running.returncode, completed.count("run the same again to go on")) == (128 + signal.SIGTERM, 1)
 
 
-def test_snakemake_finds_makes_results_up_to_date(house):
+def test_snakemake_accepts_results_of_make(small_checkout):
     command = [sys.executable, "-m", "snakemake", "--cores", "2", "--config", "agent=toy"]
-    told = subprocess.run(command, cwd=house.folder, capture_output=True, text=True)
-    assert told.returncode == 0, told.stderr
-    assert "Nothing to be done" in told.stdout + told.stderr
+    completed = subprocess.run(command, cwd=small_checkout.folder, capture_output=True, text=True)
+    assert completed.returncode == 0, completed.stderr
+    assert "Nothing to be done" in completed.stdout + completed.stderr
 
 
 @pytest.mark.slow
-def test_snakemake_builds_the_same(house):
-    reference = contents(house)
-    shutil.rmtree(house.folder / "build")
+def test_snakemake_and_make_give_the_same_artifacts(small_checkout):
+    reference = contents(small_checkout)
+    shutil.rmtree(small_checkout.folder / "build")
     command = [sys.executable, "-m", "snakemake", "--cores", "2", "--config", "agent=toy"]
-    told = subprocess.run(command, cwd=house.folder, capture_output=True, text=True)
-    assert told.returncode == 0, told.stderr
-    assert contents(house) == reference
-    assert begun(house.make("toy")) == set()
+    completed = subprocess.run(command, cwd=small_checkout.folder, capture_output=True, text=True)
+    assert completed.returncode == 0, completed.stderr
+    assert contents(small_checkout) == reference
+    assert started_jobs(small_checkout.make("toy")) == set()
 
 
-def test_another_attempt_does_not_repeat_what_cannot_end_otherwise(house):
-    house.write("agents/toy.toml", "[train_behavior]\nfail = true\n")
-    house.python("pipeline.workflow.plan", "plan", "toy")
+def test_deterministic_failures_are_not_retried(small_checkout):
+    small_checkout.write("agents/toy.toml", "[train_behavior]\nfail = true\n")
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
     again = ("pipeline.workflow.run", "--attempt", "2", "toy", "behavior")
-    assert "TST-001" in house.python(*again).stderr  # nothing is known of an earlier attempt
-    refused = house.python(*again)
+    assert "TST-001" in small_checkout.python(*again).stderr  # no record of an earlier attempt
+    refused = small_checkout.python(*again)
     assert refused.returncode == 2
     assert "not tried again: it ended with exit code 2" in refused.stderr
     assert (
-        "TST-001" in house.python("pipeline.workflow.run", "toy", "behavior").stderr
-    )  # the user tries again
-    house.write("agents/toy.toml", "")
-    house.python("pipeline.workflow.plan", "plan", "toy")
-    assert house.python(*again).returncode == 0
-    house.write("agents/toy.toml", "[train_behavior]\nfail = true\n")
-    house.python("pipeline.workflow.plan", "plan", "toy")
-    assert "TST-001" in house.python(*again).stderr, "what failed before was forgotten by the success"
+        "TST-001" in small_checkout.python("pipeline.workflow.run", "toy", "behavior").stderr
+    )  # the user retries
+    small_checkout.write("agents/toy.toml", "")
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    assert small_checkout.python(*again).returncode == 0
+    small_checkout.write("agents/toy.toml", "[train_behavior]\nfail = true\n")
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    assert "TST-001" in small_checkout.python(*again).stderr, (
+        "what failed before was forgotten by the success"
+    )
 
 
-def test_every_run_of_a_job_has_its_log(house):
-    logs = house.folder / "build/toy/logs"
+def test_every_run_of_a_job_has_a_log(small_checkout):
+    logs = small_checkout.folder / "build/toy/logs"
     assert "done in" in (logs / "flow.v001.1.log").read_text()
-    house.write("agents/toy.toml", "[train_behavior]\nfail = true\n")
-    assert house.make("toy.behavior").returncode
+    small_checkout.write("agents/toy.toml", "[train_behavior]\nfail = true\n")
+    assert small_checkout.make("toy.behavior").returncode
     assert "TST-001" in (logs / "behavior.2.log").read_text()
     for i in range(3, 3 + run.LOGS_KEPT):
-        house.python("pipeline.workflow.run", "toy", "behavior")
+        small_checkout.python("pipeline.workflow.run", "toy", "behavior")
         assert (logs / f"behavior.{i}.log").is_file()
     assert len(list(logs.glob("behavior.*.log"))) == run.LOGS_KEPT
 
 
 @pytest.mark.parametrize("text", ["", "{", '[\n{"id": "behavior", "x": ' + "[" * 5000])
-def test_a_broken_plan_is_refused(house, text):
-    (house.folder / "build/toy/plan/dag.json").write_text(text)
-    failed = house.python("pipeline.workflow.run", "toy", "behavior")
+def test_damaged_plan_is_refused(small_checkout, text):
+    (small_checkout.folder / "build/toy/plan/dag.json").write_text(text)
+    failed = small_checkout.python("pipeline.workflow.run", "toy", "behavior")
     assert failed.returncode == 2
     assert failed.stderr.startswith("error: RUN-001")
 
@@ -351,15 +363,17 @@ if __name__ == "__main__":
 
 @pytest.mark.slow
 @pytest.mark.parametrize("machines", [1, 2])
-def test_processes_of_one_and_two_machines_meet(house, monkeypatch, machines):
-    front = house.folder / "stages/reconstruct/__main__.py"
+def test_processes_of_one_and_two_machines_connect(small_checkout, monkeypatch, machines):
+    front = small_checkout.folder / "stages/reconstruct/__main__.py"
     head, _, _ = front.read_text().partition("def run(")
     front.write_text(head + PROCESSES_MEET)
-    house.python("pipeline.workflow.plan", "plan", "toy")
+    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
     options = ["--processes", "2"]
     if machines == 2:  # the launcher starts torchrun twice on this machine, as srun does on two
-        house.write("launch", '#!/bin/sh\nPET_NODE_RANK=0 "$@" & PET_NODE_RANK=1 "$@" & wait %1 && wait %2\n')
-        (house.folder / "launch").chmod(0o755)
+        small_checkout.write(
+            "launch", '#!/bin/sh\nPET_NODE_RANK=0 "$@" & PET_NODE_RANK=1 "$@" & wait %1 && wait %2\n'
+        )
+        (small_checkout.folder / "launch").chmod(0o755)
         with socket.create_server(("127.0.0.1", 0)) as server:
             port = server.getsockname()[1]
         monkeypatch.setenv("PET_NNODES", "2")
@@ -367,7 +381,7 @@ def test_processes_of_one_and_two_machines_meet(house, monkeypatch, machines):
         monkeypatch.setenv("PET_MASTER_ADDR", "127.0.0.1")
         monkeypatch.setenv("PET_MASTER_PORT", str(port))
         options += ["--launcher", "./launch"]
-    made = house.python("pipeline.workflow.run", *options, "toy", "reconstruction")
+    made = small_checkout.python("pipeline.workflow.run", *options, "toy", "reconstruction")
     assert made.returncode == 0, made.stderr
-    text = (house.folder / "build/toy/reconstruction/0.bin").read_text()
+    text = (small_checkout.folder / "build/toy/reconstruction/0.bin").read_text()
     assert text == f"{2 * machines} processes, {machines} machines"

@@ -20,7 +20,7 @@ PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "srun")
 PLUGIN = "snakemake_executor_plugin_slurm"
 FOUND = all(map(shutil.which, PROGRAMS)) and importlib.util.find_spec(PLUGIN) and os.geteuid() == 0
 LIMIT_S = 60
-"""For Slurm to begin."""
+"""Time limit for the start of Slurm."""
 CONFIG = """
 ClusterName=test
 SlurmctldHost={host}(127.0.0.1)
@@ -58,7 +58,7 @@ def _free_port() -> int:
 
 @pytest.fixture
 def slurm(tmp_path, monkeypatch):
-    """Start munged, slurmctld and slurmd in the foreground of this test; they end with it."""
+    """Start munged, slurmctld and slurmd as foreground processes that end with the test."""
     folder = tmp_path / "slurm"
     for name in ("state", "spool", "bin"):
         (folder / name).mkdir(parents=True)
@@ -67,7 +67,7 @@ def slurm(tmp_path, monkeypatch):
     config, host = folder / "slurm.conf", socket.gethostname().partition(".")[0]
     ports = {"port": _free_port(), "node_port": _free_port()}
     config.write_text(CONFIG.format(folder=folder, host=host, cores=os.cpu_count(), **ports))
-    wrapper = folder / "bin/srun"  # the plugin's jobs lose what begins with SLURM_
+    wrapper = folder / "bin/srun"  # the plugin removes variables that start with SLURM_
     wrapper.write_text(f'#!/bin/sh\nSLURM_CONF={config} exec {shutil.which("srun")} "$@"\n')
     wrapper.chmod(0o755)
     monkeypatch.setenv("SLURM_CONF", str(config))
@@ -100,8 +100,8 @@ def _wait(ready) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not FOUND, reason="needs root, Slurm, munge and Snakemake's plugin for Slurm")
-def test_a_flow_runs_on_slurm(slurm, tmp_path):
-    house = checkout.create(tmp_path / "house")
+def test_flow_runs_on_slurm(slurm, tmp_path):
+    small_checkout = checkout.create(tmp_path / "checkout")
     command = [
         sys.executable,
         "-m",
@@ -121,10 +121,10 @@ def test_a_flow_runs_on_slurm(slurm, tmp_path):
     ]
     target = Path("build/toy/frames/v001/.ok")
     made = subprocess.run(
-        [*command, *options, "--", str(target)], cwd=house.folder, capture_output=True, text=True
+        [*command, *options, "--", str(target)], cwd=small_checkout.folder, capture_output=True, text=True
     )
     assert made.returncode == 0, made.stderr
-    assert (house.folder / target).is_file()
+    assert (small_checkout.folder / target).is_file()
     assert made.stderr.count("has been submitted with SLURM jobid") == 2, (
         "the built-in capture and its frames"
     )

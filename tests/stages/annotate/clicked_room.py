@@ -1,6 +1,5 @@
-"""A build of a textured room, as far as clicking needs it.
-
-Frames of a walk-through and a session, and a template.
+"""The parts of a build of a textured room that annotation needs: frames of a walk-through and a session, a
+template.
 """
 
 import json
@@ -22,14 +21,14 @@ WALKTHROUGH, SESSION = "walkthrough.r3d", "session.r3d"
 
 @dataclass(frozen=True)
 class Room:
-    """Where the build stands, and the truth that clicks are made from."""
+    """The folder of the build and its ground truth."""
 
     build: Path
     walkthrough: MemoryClip
     session: MemoryClip
 
     def pairs(self, frame: int, count: int, rng: np.random.Generator) -> list[ClickedPair]:
-        """Return what a perfect clicker would click in one session frame."""
+        """Return exact clicks in one session frame."""
         found = []
         while len(found) < count:
             pixel = rng.uniform(0.15, 0.85, 2) * SIZE[::-1]

@@ -1,4 +1,4 @@
-"""A person clicks seven pairs on the page; they are kept, fitted and measure registration."""
+"""Clicked pairs are saved by the page, fitted to cameras, and used to evaluate registration."""
 
 import http.client
 import json
@@ -99,7 +99,7 @@ def test_seven_clicks_in_a_browser_measure_registration(room, tmp_path):
 
 
 def _measures(room, path, tmp_path) -> None:
-    """Registration that is off by 3 degrees and 20 cm is measured so."""
+    """A registration error of 3 degrees and 20 cm is measured as such."""
     off = rigid.make(rigid.rotation_from_vector(np.radians([0, 3.0, 0])), np.zeros(3))
     ours = room.session.truth @ off
     ours[:, :3, 3] += [0.2, 0, 0]
@@ -128,7 +128,7 @@ def test_exact_clicks_give_the_camera(room):
     assert clicks.fit(room.pairs(2, 3, np.random.default_rng(1)), *parts, room.walkthrough.truth) is None
 
 
-def test_clicks_that_disagree_are_left_out(room, tmp_path):
+def test_inconsistent_clicks_are_rejected(room, tmp_path):
     pairs = room.pairs(0, 7, np.random.default_rng(2))
     spots = [pair.reference for pair in pairs]
     mixed = [clicks.ClickedPair(pair.seen, spots[(i + 3) % 7]) for i, pair in enumerate(pairs)]
@@ -139,7 +139,7 @@ def test_clicks_that_disagree_are_left_out(room, tmp_path):
     assert "disagree" in metrics.reasons["registration/rotation_deg_median"]
 
 
-def test_clicked_cameras_reach_all_frames_by_odometry(room):
+def test_clicked_cameras_are_propagated_by_odometry(room):
     truth, drifted = room.session.truth, room.session.truth @ rigid.make(np.eye(3), np.array([0.0, 0, 0]))
     odometry = rigid.exp(np.array([0.1, 2.0, -0.1, 3, 0, 1])) @ drifted
     some = clicked.Clicked(np.array([0, 2]), truth[[0, 2]], np.array([0.01, 0.02]))
@@ -165,7 +165,7 @@ def ask(port: int, method: str, path: str, body: bytes = b"", **headers) -> int:
     return code
 
 
-def test_the_server_serves_its_own_page_only(room, tmp_path):
+def test_server_refuses_other_hosts_and_origins(room, tmp_path):
     spot = {"recording": SESSION, "source_index": 0, "pixel": [0.5, 0.5]}
     pair = {"seen": spot, "reference": spot | {"recording": WALKTHROUGH}}
     good = json.dumps({"pairs": [pair]}).encode()
@@ -173,7 +173,11 @@ def test_the_server_serves_its_own_page_only(room, tmp_path):
         assert (
             ask(port, "GET", "/") == ask(port, "GET", "/state") == ask(port, "GET", "/picture/0/0.jpg") == 200
         )
-        for host in ("evil.example", f"evil.example:{port}", "127.0.0.1"):  # a name that points here
+        for host in (
+            "evil.example",
+            f"evil.example:{port}",
+            "127.0.0.1",
+        ):  # a host name that resolves to this machine
             assert ask(port, "GET", "/state", Host=host) == 403
         assert (
             ask(port, "GET", "/picture/0/99.jpg")
@@ -199,7 +203,7 @@ def test_the_server_serves_its_own_page_only(room, tmp_path):
     assert len(clicks.read(tmp_path / "clicks.json")) == 1
 
 
-def test_a_file_of_clicks_that_breaks_or_cannot_be_written_is_told(room, tmp_path):
+def test_damaged_and_unwritable_click_files_are_reported(room, tmp_path):
     path = tmp_path / "clicks.json"
     spot = {"recording": SESSION, "source_index": 0, "pixel": [0.5, 0.5]}
     good = json.dumps({"pairs": [{"seen": spot, "reference": spot | {"recording": WALKTHROUGH}}]}).encode()
@@ -211,14 +215,14 @@ def test_a_file_of_clicks_that_breaks_or_cannot_be_written_is_told(room, tmp_pat
         assert ask(port, "POST", "/clicks", good) == 400
 
 
-def test_what_is_no_file_of_clicks_is_refused(tmp_path):
+def test_invalid_click_files_are_refused(tmp_path):
     (tmp_path / "clicks.json").write_text("{")
     with pytest.raises(InputError, match="EVA-001"):
         clicks.read(tmp_path / "clicks.json")
     assert front.main([str(tmp_path), "--clicks", str(tmp_path / "clicks.json")]) == 2
 
 
-def test_the_sharpest_of_each_stretch_is_shown():
+def test_sharpest_frame_of_each_segment_is_shown():
     assert frame_choice.sharpest_per_stretch(np.array([0, 3, 1, 5, 4, 2.0]), 2) == [1, 3]
     assert frame_choice.sharpest_per_stretch(
         np.array([0, 3, 1, 5, 4, 2.0]), 2, np.array([1, 0, 1, 0, 0, 0], bool)

@@ -1,4 +1,4 @@
-"""The template of a rendered blocky animal: its surface, its axes, its bones, and where the cameras were."""
+"""The template of a rendered blocky animal: surface, axes, bones and cameras."""
 
 import importlib.util
 from dataclasses import replace
@@ -28,7 +28,7 @@ _spec.loader.exec_module(scenery)
 
 
 class TrueMasks:
-    """The recording's true masks, as `pipeline.data.clips.Masks` gives them."""
+    """True masks with the interface of `pipeline.data.clips.Masks`."""
 
     def __init__(self, masks, folder):
         self.masks, self.folder, self.visible = masks, folder, masks.any((1, 2))
@@ -56,14 +56,14 @@ def template(turnaround):
 
 
 def true_from_ours(template, turnaround):
-    """Agent frame of the truth from ours, by the cameras."""
+    """Transform from our agent frame to the true one, aligned by the cameras."""
     return rigid.make(
         rigid.mean_rotation((turnaround[3] @ rigid.inverse(template.agent_from_camera))[:, :3, :3]),
         np.median((turnaround[3] @ rigid.inverse(template.agent_from_camera))[:, :3, 3], axis=0),
     )
 
 
-def test_the_surface_is_closed_and_near_the_truth(template, turnaround):
+def test_surface_is_closed_and_accurate(template, turnaround):
     mesh = trimesh.Trimesh(template.mesh.vertices, template.mesh.faces, process=False)
     assert mesh.is_watertight
     assert mesh.volume > 0, "faces look outward"
@@ -75,7 +75,7 @@ def test_the_surface_is_closed_and_near_the_truth(template, turnaround):
     )
 
 
-def test_the_axes_point_up_and_to_the_head(template, turnaround):
+def test_axes_point_up_and_to_the_head(template, turnaround):
     turn = true_from_ours(template, turnaround)[:3, :3]
     assert np.degrees(rigid.rotation_angle(turn, np.eye(3))) < 6
     assert template.head_share > 0.6
@@ -83,22 +83,22 @@ def test_the_axes_point_up_and_to_the_head(template, turnaround):
 
 
 @pytest.mark.parametrize(("turn_deg", "head"), [(180, [0, 0, -1]), (90, [1, 0, 0])])
-def test_the_animal_can_be_turned(turnaround, template, turn_deg, head):
+def test_template_heading_can_be_rotated(turnaround, template, turn_deg, head):
     clip, masks, features, _ = turnaround
     turned = build(clip, masks, features, replace(Config(), turn_deg=turn_deg), np.random.default_rng(0))
     former_from_new = template.agent_from_camera[0, :3, :3] @ turned.agent_from_camera[0, :3, :3].T
     assert np.allclose(former_from_new @ [0, 0, 1], head, atol=1e-6)
 
 
-def test_cameras_stand_where_they_stood(template, turnaround):
+def test_cameras_are_accurate(template, turnaround):
     placed = true_from_ours(template, turnaround) @ template.agent_from_camera
     error = np.linalg.norm(placed[:, :3, 3] - turnaround[3][:, :3, 3], axis=1)
     assert np.median(error) < 0.015, "metres; odometry drifts by some centimetres on the circle"
     assert template.coverage_deg > 340
 
 
-def test_an_animal_that_turns_in_the_middle_does_not_fit_its_masks(turnaround, template):
-    """Seen from cameras that do not know of the turn, half of its silhouettes are those of another pose."""
+def test_animal_that_turns_during_the_turnaround_is_rejected(turnaround, template):
+    """Half of the silhouettes show another pose than the cameras imply."""
     assert np.nanquantile(template.silhouette_iou, 0.1) > 0.7
     clip, masks, *_ = turnaround
     turned = template.agent_from_camera.copy()
@@ -117,8 +117,8 @@ def test_skin_and_features_are_normalised(template):
     assert np.allclose(np.linalg.det(template.bones.agent_from_bone_rest[:, :3, :3]), 1)
 
 
-def test_limbs_have_bones_of_their_own():
-    """Cells of the true animal: every paw, the head and the tail's tip belong to different bones."""
+def test_each_limb_has_its_own_bone():
+    """Every paw, the head and the tip of the tail belong to different bones."""
     grid = np.stack(np.meshgrid(*[np.arange(-0.4, 0.4, 0.012)] * 3, indexing="ij"), -1).reshape(-1, 3)
     parts = scenery.animal().split()
     inside = grid[
@@ -134,20 +134,20 @@ def test_limbs_have_bones_of_their_own():
     assert (bones.bone_scale_m > 0.01).all()
 
 
-def test_the_same_seed_gives_the_same_template(turnaround, template):
+def test_template_is_deterministic(turnaround, template):
     clip, masks, features, _ = turnaround
     again = build(clip, masks, features, Config(), np.random.default_rng(0))
     assert np.array_equal(again.mesh.vertices, template.mesh.vertices)
     assert np.array_equal(again.weights, template.weights)
 
 
-def test_silhouettes_count_only_what_a_ray_passes():
+def test_silhouettes_ignore_cells_behind_the_observed_surface():
     grid = Silhouettes(np.array([0.0, 0.0, 1.0]), (1, 1, 3), 0.5)
     intrinsics = np.array([[10.0, 0, 2], [0, 10.0, 2], [0, 0, 1]])
     grid.add(np.zeros((4, 4), np.uint8), np.full((4, 4), 1.7, np.float32), intrinsics, np.eye(4))
     grid.add(np.full((4, 4), 255, np.uint8), np.full((4, 4), 1.2, np.float32), intrinsics, np.eye(4))
     assert grid.share_off_mask().reshape(-1).tolist() == [0.5, 0.5, 0.0], (
-        "the third cell lies behind what the ray met"
+        "the third cell is behind the surface"
     )
 
 
@@ -158,12 +158,12 @@ def test_too_few_frames_are_refused(turnaround):
         build(clip, few, features, Config(), np.random.default_rng(0))
 
 
-def test_an_animal_without_depth_is_refused(turnaround):
+def test_turnaround_without_depth_is_refused(turnaround):
     clip, masks, _, _ = turnaround
 
-    class Blind(Clip):
+    class WithoutDepth(Clip):
         def depth(self, frame):
             return np.where(depth_labels(masks[frame], self.depth_size) == 255, 0, super().depth(frame))
 
     with pytest.raises(InputError, match="AGT-001.*only 0 depth points"):
-        register_turnaround(Blind(**vars(clip)), masks)
+        register_turnaround(WithoutDepth(**vars(clip)), masks)

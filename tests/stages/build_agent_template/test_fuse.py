@@ -1,4 +1,4 @@
-"""What is extracted from a fused volume: as large as what was fused, without the scraps beside it."""
+"""Surfaces extracted from a fused volume keep their size and have no fragments."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ RADIUS_M, SIDE_M = 0.03, 0.2
 
 
 def ball(options: Config, middle: np.ndarray, scrap: bool) -> Volume:
-    """A ball as thick as a leg, and on its side a sheet one cell thin."""
+    """A ball as thick as a leg with an attached sheet one cell thin."""
     cells = int(SIDE_M / options.voxel_m)
     volume = Volume(np.full(3, -SIDE_M / 2), (cells, cells, cells), options.voxel_m, TRUNCATION_M)
     place = volume.origin + np.stack(np.indices(volume.weight.shape), axis=-1) * options.voxel_m
@@ -24,7 +24,7 @@ def ball(options: Config, middle: np.ndarray, scrap: bool) -> Volume:
 
 
 @pytest.mark.parametrize("scrap", [False, True])
-def test_smoothing_takes_nothing_from_what_is_round(scrap):
+def test_smoothing_preserves_round_shapes(scrap):
     options, found_m = Config(), []
     for middle in np.random.default_rng(0).uniform(-0.5, 0.5, (4, 3)) * options.voxel_m:
         volume = ball(options, middle, scrap)

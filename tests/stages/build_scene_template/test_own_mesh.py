@@ -1,5 +1,5 @@
-"""A mesh that the recording brings along is taken where depth confirms it: metric, upright, coloured, holes
-where nothing was seen.
+"""A mesh supplied by the recording is used if depth confirms it: metric, upright, coloured, with holes where
+unobserved.
 """
 
 from dataclasses import replace
@@ -23,7 +23,7 @@ def clip() -> MemoryClip:
 
 
 def _own(clip: MemoryClip, scale: float = 1.0) -> Mesh:
-    """The room in the odometry's world, without colours, and a block outside that nobody saw."""
+    """The room in the odometry frame without colours, and a block outside that was never observed."""
     room = clip.caster.mesh
     block = textured_room(edge_m=0.5)
     vertices = np.concatenate([room.vertices, block.vertices + np.array([9.0, 0, 0], np.float32)]).astype(
@@ -40,7 +40,7 @@ def _built(clip: MemoryClip, mesh: Mesh):
     return own_mesh.build(clip, features, mesh, CONFIG)
 
 
-def test_the_own_mesh_is_metric_upright_and_cut_where_nothing_was_seen(clip):
+def test_own_mesh_is_metric_upright_and_cropped_to_observed_space(clip):
     made = _built(clip, _own(clip))
     assert made.own_mesh
     rotation, distance = aligned_errors(made.world_from_camera, clip.truth)
@@ -56,7 +56,7 @@ def test_the_own_mesh_is_metric_upright_and_cut_where_nothing_was_seen(clip):
 
 
 @pytest.mark.slow
-def test_a_mesh_of_another_scale_or_place_is_refused(clip):
+def test_mesh_of_wrong_scale_or_position_is_refused(clip):
     assert _built(clip, _own(clip, scale=1.1)) is None
     away = _own(clip)
     assert _built(clip, Mesh(away.vertices + np.float32(0.5), away.faces, away.color)) is None

@@ -1,4 +1,4 @@
-"""The pictures of the scene template show the room, not its outside."""
+"""Pictures of the scene template show the interior of the room."""
 
 import numpy as np
 import trimesh
@@ -9,8 +9,8 @@ from stages.build_scene_template.pictures import turntable
 RED = (200, 30, 30)
 
 
-def test_a_closed_room_is_seen_from_above():
-    """The walls and the ceiling between the eye and the red floor are left out in all four views."""
+def test_closed_room_is_visible_from_above():
+    """Walls and ceiling in front of the red floor are culled in all four views."""
     box = trimesh.creation.box((4.0, 2.5, 3.0)).subdivide().subdivide()
     floor = box.vertices[:, 1] < -1.2
     color = np.where(floor[:, None], RED, (90, 90, 90)).astype(np.uint8)

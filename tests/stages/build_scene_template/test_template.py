@@ -1,4 +1,4 @@
-"""The walk-through becomes a metric, upright template: structure from motion, its refutation, refinement,
+"""From walk-through to metric, upright template: structure from motion and its validation, refinement,
 fusion, cleaning.
 """
 
@@ -31,7 +31,7 @@ def clip(tmp_path_factory) -> MemoryClip:
 
 
 @pytest.mark.slow
-def test_template_is_metric_upright_and_follows_the_truth(clip, tmp_path):
+def test_template_is_metric_upright_and_accurate(clip, tmp_path):
     fusion = FusionConfig(voxel_m=0.05, truncation_m=0.15, island_faces=30, feature_frames=6)
     config = Config(sfm=SFM, refinement=RefinementConfig(rounds=6), fusion=fusion)
     features = np.random.default_rng(0).normal(size=(len(clip), 20, 15, 16))
@@ -52,7 +52,7 @@ def test_template_is_metric_upright_and_follows_the_truth(clip, tmp_path):
     assert (tmp_path / "colmap" / "images.txt").exists()
 
 
-def test_frames_are_aligned_with_as_many_points_as_memory_may_hold(clip, monkeypatch):
+def test_points_per_frame_are_limited_by_memory(clip, monkeypatch):
     taken, correspondences = [], fuse.depth_scans.SurfaceMap.correspondences
 
     def counted(surface, frames, scans, poses, reach_m, inflation):
@@ -67,7 +67,7 @@ def test_frames_are_aligned_with_as_many_points_as_memory_may_hold(clip, monkeyp
     assert np.nanmedian(gap) < 0.006, "metres; the depth noise is 4 mm, the cameras began 1.6 cm off"
 
 
-def test_wrong_structure_is_refuted_by_depth(clip):
+def test_wrong_structure_is_rejected_by_depth(clip):
     frames = np.arange(0, 48, 4)
     keyframes = [refine.load_keyframe(clip, int(frame)) for frame in frames]
     bent = clip.truth[frames].copy()
@@ -84,7 +84,7 @@ def test_wrong_structure_is_refuted_by_depth(clip):
     assert "depth" in start.reason
 
 
-def test_depth_and_odometry_alone_straighten_keyframes(clip):
+def test_keyframes_are_refined_by_depth_and_odometry_alone(clip):
     frames = np.arange(0, 48, 4)
     keyframes = [refine.load_keyframe(clip, int(frame)) for frame in frames]
     start = clip.odometry_from_camera[frames]
@@ -104,8 +104,8 @@ def matched(clip, tmp_path_factory):
     return workspace
 
 
-def test_depth_that_errs_together_bends_no_keyframes(clip, matched):
-    """A sensor whose depth grows towards the rim: points of several keyframes contradict it."""
+def test_systematic_depth_errors_do_not_bend_keyframes(clip, matched):
+    """The depth error grows towards the image border; tracked points contradict it."""
     bent = MemoryClip(clip.caster, clip.truth, clip.odometry_from_camera, folder=clip.folder)
     row, column = np.mgrid[: clip.depth_size[0], : clip.depth_size[1]]
     rim = np.hypot(row - 80, column - 60) / 100
@@ -128,7 +128,7 @@ def test_depth_that_errs_together_bends_no_keyframes(clip, matched):
     assert np.array_equal(poses[frames], clip.truth[frames]), "keyframes that depth contradicts stay"
 
 
-def test_points_are_chained_and_lie_where_the_room_is(clip, matched):
+def test_tracked_points_lie_on_the_room(clip, matched):
     frames = sfm.choose_keyframes(clip, SFM)
     tracked = sfm.tracked_points(clip, matched / sfm.DATABASE, frames)
     assert tracked.points > 100
@@ -139,8 +139,8 @@ def test_points_are_chained_and_lie_where_the_room_is(clip, matched):
     assert np.quantile(gap, 0.95) < 0.05, "metres below the floor"
 
 
-def test_the_other_side_of_a_thin_wall_is_another_surface():
-    """Two cameras face each other through a wall of 8 cm: their depth lies closer than the reach."""
+def test_both_sides_of_a_thin_wall_are_kept_apart():
+    """Two cameras face each other through a wall of 8 cm, which is less than the search radius."""
     depth = np.full((60, 80), 1.0)
     lens = np.array([[70.0, 0, 40], [0, 70.0, 30], [0, 0, 1]])
     scan = depth_scans.scan(depth, lens, stride=4)
@@ -172,7 +172,7 @@ def test_floor_direction_is_found_from_normals():
     assert np.rad2deg(np.arccos(up @ turn[:, 1])) < 1.0, "degrees"
 
 
-def test_cleaning_drops_islands_and_keeps_colours(tmp_path):
+def test_cleaning_removes_islands_and_keeps_colours(tmp_path):
     volume = tsdf.Volume(np.zeros(3), (40, 40, 40), 0.05, 0.15)
     grid = np.stack(np.meshgrid(*[np.arange(40) * 0.05] * 3, indexing="ij"), -1)
     big, small = np.linalg.norm(grid - 0.9, axis=-1) - 0.5, np.linalg.norm(grid - 1.7, axis=-1) - 0.1
@@ -187,15 +187,15 @@ def test_cleaning_drops_islands_and_keeps_colours(tmp_path):
     mesh_files.write_ply(tmp_path / "again.ply", Mesh(cleaned.vertices, cleaned.faces, cleaned.color))
 
 
-def test_a_cleaner_that_fails_is_told(tmp_path, monkeypatch):
+def test_failure_of_the_cleaner_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(fuse.sys, "executable", "/bin/false")
     with pytest.raises(InputError, match="MAP-003"):
         fuse.clean(textured_room(edge_m=0.5), tmp_path, island_faces=2)
 
 
 @pytest.mark.parametrize("code", ["MAP-001", "MAP-002"])
-def test_a_walk_that_shows_nothing_is_refused(code, tmp_path, monkeypatch):
-    """Nothing but darkness and no odometry; or odometry, and depth beyond reach."""
+def test_walkthrough_without_content_is_refused(code, tmp_path, monkeypatch):
+    """Darkness without odometry; or odometry with depth out of range."""
     truth = walk(10)
     dark = MemoryClip(
         RayCaster(textured_room(edge_m=0.5)),
@@ -212,12 +212,12 @@ def test_a_walk_that_shows_nothing_is_refused(code, tmp_path, monkeypatch):
         template.build(dark, np.zeros((len(dark), 4, 4, 2)), config, tmp_path)
 
 
-def test_nothing_is_marked_seen_by_an_empty_volume():
+def test_empty_volume_marks_nothing_as_observed():
     empty = tsdf.Volume(np.zeros(3), (8, 8, 8), 0.1, 0.3).surface(0.0)
     assert len(empty.faces) == 0
 
 
-def test_false_matches_are_dropped_by_depth(clip, tmp_path):
+def test_false_matches_are_rejected_by_depth(clip, tmp_path):
     sfm.reconstruct(clip, SFM, tmp_path, 0)
     with pycolmap.Database.open(tmp_path / "database.db") as table:
         pairs = sorted(pycolmap.pair_id_to_image_pair(pair) for pair in table.read_two_view_geometries()[0])
@@ -232,7 +232,7 @@ def test_false_matches_are_dropped_by_depth(clip, tmp_path):
     assert confirmed == len(pairs) - 1, "the scrambled pair goes, the others stay"
 
 
-def test_more_than_a_home_is_refused(clip, monkeypatch):
+def test_huge_scene_is_refused(clip, monkeypatch):
     monkeypatch.setattr(fuse, "MAX_VOXELS", 1000)
     with pytest.raises(InputError, match="MAP-005.*the walk-through spans"):
         fuse.fuse(clip, np.arange(0, 48, 4), clip.truth, FusionConfig(voxel_m=0.05))

@@ -1,4 +1,4 @@
-"""A walk-through whose tracking jumps is repaired before anything relies on its odometry."""
+"""Tracking jumps of a walk-through are repaired before its odometry is used."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from stages.build_scene_template import template
 from tests.stages.textured_room import MemoryClip, aligned_errors, drifting, textured_room, walk
 
 
-def test_a_jump_is_taken_out():
+def test_jump_is_repaired():
     truth = walk(60)
     odometry = drifting(truth, 4, deg=0.03, m=0.001)
     clip = MemoryClip(RayCaster(textured_room(edge_m=0.5)), truth, odometry)
@@ -22,6 +22,6 @@ def test_a_jump_is_taken_out():
     assert aligned_errors(repaired.odometry_from_camera, truth)[1].max() < 0.04, "metres"
 
 
-def test_without_odometry_there_is_nothing_to_repair():
+def test_recording_without_odometry_is_unchanged():
     clip = MemoryClip(RayCaster(textured_room(edge_m=0.5)), walk(3), None)
     assert template.without_jumps(clip) is clip

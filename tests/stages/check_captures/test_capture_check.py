@@ -1,4 +1,4 @@
-"""Every problem that a recording may have is found by its code, and a good recording has none."""
+"""Every problem of a recording is detected with its code; a good recording has none."""
 
 import dataclasses
 
@@ -36,7 +36,7 @@ class Textured(Made):
 
 
 def _made(seconds: float = 10.0, turns: int = 0, rate_hz: float = 6.0) -> Textured:
-    """A phone that goes back and forth, so that it sees every place again."""
+    """A camera that moves back and forth, so that it revisits every place."""
     plain = walk(round(seconds * rate_hz), rate_hz)
     there_and_back = 1.5 - np.abs(plain.timestamp_s % 3.0 - 1.5)
     source = walk(200, 100.0).world_from_camera[np.rint(100 * there_and_back).astype(int)]
@@ -54,7 +54,7 @@ def _codes(path, role: Role = "heldout") -> set[str]:
 
 
 @pytest.mark.parametrize("turns", [0, 1])
-def test_a_good_recording_has_no_problem_sideways_or_not(tmp_path, turns):
+def test_good_recording_has_no_problems_in_any_orientation(tmp_path, turns):
     assert _codes(_made(turns=turns).write(tmp_path / "a.r3d")) == set()
 
 
@@ -104,7 +104,7 @@ def _near(made):
 
 
 def _turning(made):
-    """Poses that turn away from the true ones by 4 deg a second."""
+    """Poses with a heading error that grows by 4 degrees per second."""
     angle = 0.07 * made.timestamp_s
     turned = rigid.make(rigid.rotation_from_yaw(angle), np.zeros((len(angle), 3)))
     made.metadata["poses"] = (
@@ -119,20 +119,20 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("code", FAULTS)
-def test_a_fault_is_told_by_its_code(tmp_path, code):
+def test_problem_is_reported_with_its_code(tmp_path, code):
     made = _made()
     FAULTS[code](made)
     assert code in _codes(made.write(tmp_path / "a.r3d"))
 
 
-def test_a_short_or_sparse_one_is_told(tmp_path):
+def test_short_or_sparse_recording_is_reported(tmp_path):
     assert "CAP-031" in _codes(_made(3.0).write(tmp_path / "a.r3d"))
     sparse = _made(12.0, rate_hz=1.0)
     assert "CAP-035" in _codes(made_formats.polycam(tmp_path / "b", sparse), "session")
     assert "CAP-035" not in _codes(tmp_path / "b", "walkthrough")
 
 
-def test_damaged_pictures_and_missing_depth_are_told(tmp_path):
+def test_damaged_pictures_and_missing_depth_are_reported(tmp_path):
     made = _made()
     made_formats.write_movie(tmp_path / "a.mp4", [made.color(i) for i in range(60)])
     assert "CAP-036" in _codes(tmp_path / "a.mp4")
@@ -183,7 +183,7 @@ def _ball(camera, intrinsics, size, center, radius):
     return np.where(inside > 0, (along - np.sqrt(np.maximum(inside, 0))) / square, np.inf)
 
 
-def test_the_same_room_is_found_and_another_is_not():
+def test_room_is_recognized_and_another_is_not():
     rng = np.random.default_rng(0)
     offset = rigid.make(rigid.rotation_from_vector(np.array([0, 1.0, 0])), np.array([3.0, 0, 1]))
     room, again, other = (
@@ -224,7 +224,7 @@ def test_movers_are_counted():
     assert codes == [{"CAP-054"}, set(), {"CAP-055"}]
 
 
-def test_someone_who_walks_through_the_walk_through_is_told():
+def test_a_person_in_the_walk_through_is_reported():
     """A cat is too small to be told from the drift of poses, which must not warn."""
 
     def person(frame):
@@ -254,7 +254,7 @@ def test_someone_who_walks_through_the_walk_through_is_told():
     assert codes(still) == codes(_shots(0, 16, balls=cat)) == set()
 
 
-def test_without_poses_nothing_is_claimed():
+def test_no_statement_without_poses():
     shots = [dataclasses.replace(shot, odometry_from_camera=None) for shot in _shots(0, 4)]
     assert moving_objects.find_motion(shots) is None
     assert np.isnan(pose_drift.drift_m(shots))
@@ -284,7 +284,7 @@ def test_subsampled_depth_keeps_its_geometry():
     np.testing.assert_allclose(cameras.back_project(shot.depth, shot.depth_intrinsics), whole, atol=1e-9)
 
 
-def test_the_program_tells_all_and_fails_where_a_build_would(tmp_path, capsys):
+def test_program_reports_all_problems_and_fails_like_a_build(tmp_path, capsys):
     assert front.main([str(tmp_path)]) == 2
     assert "CAP-042" in capsys.readouterr().err
     _made().write(tmp_path / "walkthrough.r3d")
@@ -312,7 +312,7 @@ def test_the_program_tells_all_and_fails_where_a_build_would(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("text", ["videos = 3", "[videos]\n'walkthrough.r3d' = 3"])
-def test_a_recipe_that_is_wrong_is_refused(tmp_path, capsys, text):
+def test_invalid_recipe_is_refused(tmp_path, capsys, text):
     _made().write(tmp_path / "walkthrough.r3d")
     (tmp_path / "luna.toml").write_text(text)
     assert front.main([str(tmp_path), "--recipe", str(tmp_path / "luna.toml")]) == 2
@@ -320,9 +320,8 @@ def test_a_recipe_that_is_wrong_is_refused(tmp_path, capsys, text):
 
 
 def _layers(near_step_px: int) -> list[SampledFrame]:
-    """Pictures of a far and a near layer of blobs.
-
-    Per picture the far one moves by 4 pixels, the near one by its own step.
+    """Pictures of a far and a near layer of blobs; per picture the far one moves by 4 pixels, the near one by
+    its own step.
     """
     rng = np.random.default_rng(0)
     far, near = (
@@ -337,7 +336,7 @@ def _layers(near_step_px: int) -> list[SampledFrame]:
     return shots
 
 
-def test_a_video_that_turns_on_the_spot_tells_no_depth():
+def test_pure_rotation_has_no_parallax():
     walked, turned = parallax.parallax(_layers(16)), parallax.parallax(_layers(4))
     assert min(walked.linked, turned.linked) > 0.8
     assert walked.with_parallax > 0.8

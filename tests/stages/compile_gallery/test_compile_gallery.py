@@ -1,4 +1,4 @@
-"""The gallery shows every finished simulator, links to files that are there, and asks nothing of the network."""
+"""The gallery shows every finished simulator with valid links and works offline."""
 
 import json
 import re
@@ -14,7 +14,7 @@ from stages.compile_gallery import stage
 
 
 def write_build(folder: Path, name: str, goal_m: float | None, megabytes: float) -> None:
-    """Write what the gallery reads of a finished build."""
+    """Write the files of a finished build that the gallery reads."""
     simulator = folder / "simulator"
     simulator.mkdir(parents=True)
     (simulator / "index.html").write_text("page")
@@ -40,7 +40,7 @@ def write_build(folder: Path, name: str, goal_m: float | None, megabytes: float)
     (folder / "evaluation/metrics.json").write_text(json.dumps(metrics))
 
 
-def test_a_card_for_every_finished_simulator(tmp_path: Path) -> None:
+def test_every_finished_simulator_has_a_card(tmp_path: Path) -> None:
     write_build(tmp_path / "luna", "luna & <co>", 0.4321, 30.0)
     write_build(tmp_path / "cat", "cat", None, 12.3)
     write_build(tmp_path / "cat/variants/no_scene", "cat without a scene", 0.5, 12.0)
@@ -59,7 +59,7 @@ def test_a_card_for_every_finished_simulator(tmp_path: Path) -> None:
     assert len(page) < 20_000, "thumbnails are small"
 
 
-def test_the_program_writes_beside_the_builds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_gallery_is_written_to_the_build_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert program.main([str(tmp_path)]) == 2
     assert "ART-003" in capsys.readouterr().err
     with pytest.raises(InputError, match="ART-003"):

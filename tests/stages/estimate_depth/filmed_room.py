@@ -1,4 +1,4 @@
-"""A textured room with its map, and plain videos of an animal in it, rendered with their truth."""
+"""A textured room with its map, and plain videos of an animal in it, rendered with ground truth."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ ANIMAL_COLOR = np.array([235, 120, 30])
 
 
 def render(room: Mesh, camera: np.ndarray, world_from_agent: np.ndarray | None, rng: np.random.Generator):
-    """Return colour, z-depth and where the animal is."""
+    """Return colour, z-depth and the mask of the animal."""
     meshes, faces = [trimesh.Trimesh(room.vertices, room.faces, process=False)], len(room.faces)
     if world_from_agent is not None:
         meshes.append(animal().apply_transform(world_from_agent))
@@ -62,7 +62,7 @@ def write_walk(folder: Path, room: Mesh, path: np.ndarray) -> None:
 
 
 def write_map(folder: Path, room: Mesh, path: np.ndarray) -> None:
-    """Write what a `scene_template` holds of a room and a walk-through."""
+    """Write the `scene_template` of a room and a walk-through."""
     folder.mkdir(parents=True)
     ply.write_ply(folder / "mesh.ply", room)
     intrinsics = np.repeat(INTRINSICS[None], len(path), axis=0)
@@ -103,7 +103,7 @@ def session(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def circle(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Cameras that go around an animal at rest."""
+    """Cameras on a circle around a resting animal."""
     angles = np.linspace(0, 1.2 * np.pi, count)
     middle = np.array([0.05, 0.25, 0.05])
     eyes = middle + np.stack([0.85 * np.cos(angles), 0.7 + 0 * angles, 0.85 * np.sin(angles)], axis=1)

@@ -1,4 +1,4 @@
-"""Plain videos get cameras and depth from the map: of the room, of an animal that walks, of one at rest."""
+"""Plain videos get cameras and depth from the map: of the room, a walking animal, and a resting animal."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def check_cameras(clip, true):
 
 
 @pytest.mark.slow
-def test_a_session_is_placed_in_the_map_and_its_animal_on_the_floor(mapped, tmp_path):
+def test_session_is_registered_and_its_animal_is_on_the_floor(mapped, tmp_path):
     path, agent = filmed_room.session(24)
     clip, kept, depth, masks = estimate(mapped, tmp_path, path, agent, "session")
     assert clip.mapped and clip.gravity_known and len(clip) >= 20
@@ -61,7 +61,7 @@ def test_a_session_is_placed_in_the_map_and_its_animal_on_the_floor(mapped, tmp_
 
 
 @pytest.mark.slow
-def test_a_turnaround_is_measured_by_several_views(mapped, tmp_path):
+def test_turnaround_has_multi_view_depth(mapped, tmp_path):
     path, agent = filmed_room.circle(40)
     clip, kept, depth, masks = estimate(mapped, tmp_path, path, agent, "turnaround")
     check_cameras(clip, path[kept])
@@ -76,7 +76,7 @@ def test_a_turnaround_is_measured_by_several_views(mapped, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_video_of_another_room_is_refused(mapped, tmp_path):
+def test_video_of_another_room_is_refused(mapped, tmp_path):
     path, agent = filmed_room.session(12)
     elsewhere = textured_room.textured_room(seed=7, edge_m=0.03)
     with pytest.raises(InputError, match="MAP-007"):

@@ -3,7 +3,7 @@ import numpy as np
 from stages.estimate_depth import monocular
 
 
-def test_the_map_gives_scale_and_shift_in_spite_of_moved_things():
+def test_scale_and_shift_are_robust_to_moved_objects():
     rng = np.random.default_rng(0)
     true = rng.uniform(0.8, 4.0, (60, 80))
     inverse = (1 / true - 0.05) / 0.7
@@ -14,7 +14,7 @@ def test_the_map_gives_scale_and_shift_in_spite_of_moved_things():
     assert np.median(np.abs(found[30:40, 30:50] - true[30:40, 30:50])) < 0.02
 
 
-def test_nothing_is_told_where_little_of_the_map_is_seen_or_the_network_is_inside_out():
+def test_small_overlap_and_inverted_predictions_are_refused():
     true = np.linspace(1, 3, 400).reshape(20, 20)
     few = np.zeros(true.shape, bool)
     few[0] = True

@@ -1,4 +1,4 @@
-"""Flow of shifted and rotated textures is found on the stored grid, and uncertainty is told."""
+"""Optical flow of shifted and rotated textures on the stored grid, with confidences."""
 
 import cv2
 import numpy as np
@@ -28,7 +28,7 @@ def texture(height, width, seed=0):
 
 
 def moved(image, matrix):
-    """Warp so that a point at p (pixel centres at +0.5) goes to matrix @ (p, 1)."""
+    """Warp so that the point p (pixel centres at +0.5) moves to matrix @ (p, 1)."""
     shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
     indexed = np.linalg.inv(shift) @ np.vstack([matrix, [0, 0, 1]]) @ shift
     return cv2.warpAffine(
@@ -44,7 +44,7 @@ def both_ways(estimator, pair):
 
 @pytest.mark.parametrize("size", [(160, 120), (120, 160), (400, 300), (162, 121)])
 @pytest.mark.parametrize("matrix", [[[1, 0, 5.0], [0, 1, -3.0]], [[0.999, -0.04, 4.0], [0.04, 0.999, -2.0]]])
-def test_known_motion_is_found_in_colour_pixels(size, matrix):
+def test_known_motion_is_estimated_in_colour_pixels(size, matrix):
     matrix = np.array(matrix)
     estimator = Estimator(size, WORKING_SIDE_PX)
     pair = [estimator.reduce(picture) for picture in (texture(*size), moved(texture(*size), matrix))]
@@ -52,12 +52,12 @@ def test_known_motion_is_found_in_colour_pixels(size, matrix):
     grid_px = grid_centers(size)
     true_px = grid_px @ matrix[:, :2].T + matrix[:, 2] - grid_px
     error_px = np.linalg.norm(forward.flow - true_px, axis=-1)[4:-4, 4:-4]
-    assert np.median(error_px) < 0.3  # a quarter of a pixel is what the search reaches on smooth texture
+    assert np.median(error_px) < 0.3  # the search is accurate to a quarter of a pixel on smooth texture
     assert np.median(forward.confidence[4:-4, 4:-4]) > 180
     np.testing.assert_allclose(np.median(backward.flow + forward.flow, axis=(0, 1)), 0, atol=0.3)
 
 
-def test_what_leaves_or_changes_is_uncertain():
+def test_occluded_and_changed_regions_have_low_confidence():
     size = (160, 120)
     estimator = Estimator(size, WORKING_SIDE_PX)
     first, second = texture(*size), moved(texture(*size), np.array([[1, 0, 30.0], [0, 1, 0]]))
@@ -69,7 +69,7 @@ def test_what_leaves_or_changes_is_uncertain():
     assert np.median(confidence[16:24, 4:11]) < 100
 
 
-def test_pairs_come_in_order_and_only_few_frames_are_asked_for_again():
+def test_pairs_are_ordered_and_few_frames_are_read_twice():
     estimator = Estimator((64, 48), WORKING_SIDE_PX)
     gray, asked = estimator.reduce(texture(64, 48)), []
 
@@ -83,7 +83,7 @@ def test_pairs_come_in_order_and_only_few_frames_are_asked_for_again():
     assert [gap for gap, _, _ in flows(lambda _: gray, 3, (1, 2, 4, 8), estimator)] == [1, 1, 2]
 
 
-def test_the_stage_writes_all_gaps_both_ways(tmp_path):
+def test_stage_writes_all_gaps_in_both_directions(tmp_path):
     frames = tmp_path / "frames"
     frames.mkdir()
     for folder in [frames]:
@@ -115,7 +115,7 @@ def test_the_stage_writes_all_gaps_both_ways(tmp_path):
             np.testing.assert_allclose(median_px, [sign * gap, 0], atol=0.5)
 
 
-def test_long_gaps_follow_motion_that_search_alone_loses():
+def test_long_gaps_are_initialized_by_chained_flow():
     world = texture(200, 460)
     estimator = Estimator((160, 120), WORKING_SIDE_PX)
     gray = [estimator.reduce(world[20:180, 12 * i : 12 * i + 120]) for i in range(9)]
@@ -124,7 +124,7 @@ def test_long_gaps_follow_motion_that_search_alone_loses():
     assert np.median(error_px) < 1.5
 
 
-def test_a_small_thing_that_moves_against_the_camera_is_seen():
+def test_small_object_with_opposite_motion_is_detected():
     room, thing = texture(240, 200, 1), texture(40, 30, 2)
     pictures = [room[:200, 8 * i : 8 * i + 160].copy() for i in range(2)]
     for i, picture in enumerate(pictures):
@@ -136,7 +136,7 @@ def test_a_small_thing_that_moves_against_the_camera_is_seen():
     )
 
 
-def test_a_network_fills_the_same_gaps_and_grid():
+def test_network_writes_the_same_gaps_and_grid():
     torch.manual_seed(0)
     network = raft.Raft().eval()
     estimator = RaftEstimator(network, (64, 80), 80)

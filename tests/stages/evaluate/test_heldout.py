@@ -1,4 +1,4 @@
-"""The held-out phone is judged while its session is filmed, and a session that was refused shows nothing."""
+"""Evaluation against the held-out phone during its session; a rejected session counts as wrong everywhere."""
 
 from dataclasses import fields
 from pathlib import Path
@@ -18,7 +18,7 @@ PHONE = Video("v002", "heldout.r3d", "heldout", "none", None, "v001", 0.35)
 
 @pytest.fixture
 def folders(tmp_path: Path) -> BuildFolders:
-    """A session of 1 s and a phone that films 0.35 s longer; nothing is reconstructed."""
+    """A session of 1 s and a phone that records 0.35 s longer, without a reconstruction."""
     for id in ("v001", "v002"):
         frames, lens = tmp_path / "frames" / id, np.tile(np.eye(3), (11, 1, 1))
         for kind in ("color", "depth", "confidence"):
@@ -37,7 +37,7 @@ def folders(tmp_path: Path) -> BuildFolders:
     return BuildFolders(**nowhere | {"frames": {id: tmp_path / "frames" / id for id in ("v001", "v002")}})
 
 
-def test_only_what_is_filmed_while_the_session_is_counts(folders: BuildFolders):
+def test_only_frames_during_the_session_count(folders: BuildFolders):
     assert reading.filmed_together(folders, PHONE).tolist() == [0, 1, 2, 3, 4, 5, 6]
     known = np.tile(np.eye(4), (11, 1, 1))
     known[0] = np.nan
@@ -47,7 +47,7 @@ def test_only_what_is_filmed_while_the_session_is_counts(folders: BuildFolders):
     assert len(real_phone.shots(folders, before, known, 3)) == 0
 
 
-def test_a_refused_session_is_wrong_everywhere(folders: BuildFolders):
+def test_rejected_session_is_wrong_everywhere(folders: BuildFolders):
     agent = np.arange(63).reshape(9, 7) < 12
     shot = HeldoutShot(
         np.eye(4), np.eye(3), 0.0, np.full((9, 7, 3), 99, np.uint8), np.full((9, 7), 2.0, np.float32), agent
@@ -61,7 +61,7 @@ def test_a_refused_session_is_wrong_everywhere(folders: BuildFolders):
     ] == [0, 2, 2]
 
 
-def test_what_the_session_films_is_judged_apart():
+def test_regions_seen_by_the_session_are_evaluated_separately():
     agent = np.arange(63).reshape(9, 7) < 12
     depth, color = np.full((9, 7), 2.0, np.float32), np.zeros((9, 7, 3), np.uint8)
     views = [
@@ -75,7 +75,7 @@ def test_what_the_session_films_is_judged_apart():
     assert set(heldout.filmed_metrics(unknown).values.values()) == {None}
 
 
-def test_thinned_shots_look_along_the_same_rays():
+def test_subsampled_views_keep_their_rays():
     rng, lens = np.random.default_rng(0), np.array([[50.0, 0, 31.0], [0, 52.0, 19.0], [0, 0, 1]])
     depth = rng.uniform(1, 3, (40, 61)).astype(np.float32)
     color = rng.integers(0, 255, (40, 61, 3), dtype=np.uint8)
@@ -88,7 +88,7 @@ def test_thinned_shots_look_along_the_same_rays():
     assert (heldout.thinned([shot], 10_000)[0].depth == depth).all()
 
 
-def test_without_a_phone_nothing_is_claimed(folders: BuildFolders):
+def test_no_metrics_without_a_held_out_phone(folders: BuildFolders):
     metrics = reconstruction.held_out_metrics(folders, [], "cpu")
     assert (
         metrics.values["reconstruction/depth_acc_all"] is None

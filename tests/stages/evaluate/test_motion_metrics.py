@@ -1,4 +1,4 @@
-"""How physical motion is: exact on constructed cases."""
+"""Metrics of physical plausibility on constructed cases."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from tests.stages.export_simulator import small_world
 
 @dataclass(frozen=True)
 class Sunk:
-    """Predicts what was recorded, a little lower."""
+    """Predicts the recorded motion with an offset downwards."""
 
     future: Future
     depth_m: float
@@ -26,7 +26,7 @@ class Sunk:
         )
 
 
-def test_a_body_in_the_floor_penetrates(tmp_path: Path) -> None:
+def test_body_below_the_floor_penetrates(tmp_path: Path) -> None:
     small_world.write_surfaces(tmp_path)
     tracks = {f"v{2 + k:03d}": small_world.trajectory(120, k) for k in range(2)}
     starts, videos = np.array([0, 20, 0, 20], np.int32), np.array([0, 0, 1, 1], np.int32)

@@ -1,4 +1,4 @@
-"""Table 3: pictures are compared in pairs, holes count as wrong, and without truth nothing is claimed."""
+"""Table 3: paired comparison of pictures; holes count as wrong; no table without ground truth."""
 
 from pathlib import Path
 
@@ -12,8 +12,8 @@ from stages.evaluate.reconstruction_tables import table
 
 
 def view(wrong: int) -> HeldoutView:
-    """Return a picture of 100 pixels, 20 of them the agent's; so many of the scene's are drawn half a metre
-    too far or not at all.
+    """Return a picture of 100 pixels, 20 of them of the agent, with some scene pixels half a metre too far or
+    missing.
     """
     color, agent = np.zeros((10, 10, 3), np.uint8), np.zeros((10, 10), bool)
     agent[:2] = True
@@ -23,7 +23,7 @@ def view(wrong: int) -> HeldoutView:
     return HeldoutView(color, ours, HeldoutShot(np.eye(4), np.eye(3), 0.0, color, true, agent))
 
 
-def test_what_a_baseline_lacks_is_told_with_an_interval():
+def test_difference_to_a_baseline_has_an_interval():
     right = {
         name: np.array(
             [list(depth_metrics(name, [view(wrong + k % 2)]).values.values()) for k in range(12)], float
@@ -36,11 +36,11 @@ def test_what_a_baseline_lacks_is_told_with_an_interval():
     assert found.values["totalrecon/depth_acc_scene_less_than_reference"] == pytest.approx(0.25)
     assert found.values["totalrecon/depth_acc_agent_less_than_reference"] == 0
     assert found.values["totalrecon/depth_acc_all_less_than_reference_ci95_low"] > 0.19
-    told = table.text({"ours/depth_acc_all": 0.9, **found.values}, ("ours", "totalrecon"))
-    assert "0.708 / 0.695 / 0.703" in told and "0.200 [0.200 0.200]" in told
+    text = table.text({"ours/depth_acc_all": 0.9, **found.values}, ("ours", "totalrecon"))
+    assert "0.708 / 0.695 / 0.703" in text and "0.200 [0.200 0.200]" in text
 
 
-def test_without_truth_nothing_is_claimed():
+def test_no_table_without_ground_truth():
     places = Reconstructed(
         frames={},
         scene_template=Path("scene"),

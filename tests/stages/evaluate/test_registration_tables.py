@@ -1,4 +1,4 @@
-"""Table 1: every frame counts, a refused recording is a failure, what an ablation costs is told in pairs."""
+"""Table 1: every frame counts, rejected recordings are failures, ablations are compared in pairs."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ VIDEOS = [
 
 @pytest.fixture
 def capture(tmp_path):
-    """Write truth in a world of its own, and registrations that err by 1 degree (ours) and by 3 (an
+    """Write ground truth in its own world, and registrations with errors of 1 degree (ours) and 3 degrees (an
     ablation).
     """
     world, count = rigid.exp(np.array([0, 0.7, 0, 1.0, 0, 2.0])), 40
@@ -79,12 +79,12 @@ def test_ablations_are_compared_frame_by_frame(capture):
     assert values["worse/v001/rotation_deg_more_than_ours"] == pytest.approx(2.0, abs=1e-6)
     assert values["worse/v001/rotation_deg_median"] == pytest.approx(3.0, abs=1e-6)
     assert values["worse/v002/rotation_deg_median"] is None
-    told = table.text(values, ("ours", "worse"))
-    assert "6.35 / 0.41" in told
-    assert "1/2" in told
+    text = table.text(values, ("ours", "worse"))
+    assert "6.35 / 0.41" in text
+    assert "1/2" in text
 
 
-def test_without_truth_nothing_is_claimed(capture):
+def test_no_table_without_ground_truth(capture):
     folder, frames = capture
     rng = np.random.default_rng(0)
     found = table.metrics({"ours": folder / "ours"}, frames, VIDEOS, folder / "template", None, rng)

@@ -1,4 +1,4 @@
-"""Reliability: honest probabilities have no calibration error, boasting has as much as it exceeds."""
+"""Reliability diagrams: calibrated probabilities have no calibration error, overconfident ones their excess."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from stages.evaluate.registration import GOOD_ROOT, is_right
 from stages.evaluate.reliability import reliability_metrics
 
 
-def test_honest_and_boasting_probabilities():
+def test_calibrated_and_overconfident_probabilities():
     rng = np.random.default_rng(0)
     probability = rng.uniform(0, 1, 20000)
     honest = reliability_metrics("x", probability, rng.random(20000) < probability).values
@@ -21,7 +21,7 @@ def test_honest_and_boasting_probabilities():
     assert (picture.min(-1) < 200).any()
 
 
-def test_a_dot_at_the_edge_is_drawn_whole_and_captions_hold_no_keys():
+def test_points_are_not_clipped_and_captions_have_no_raw_keys():
     sure = reliability_metrics("x/agent", np.ones(100), np.ones(100, bool))
     unsure = reliability_metrics("x/agent", np.full(100, 0.5), np.arange(100) % 4 == 0)
     (caption,), area = sure.charts, []
@@ -31,14 +31,14 @@ def test_a_dot_at_the_edge_is_drawn_whole_and_captions_hold_no_keys():
     assert caption.startswith("x of the animal: ")
 
 
-def test_nothing_measured():
+def test_empty_measurements_have_no_error():
     assert reliability_metrics("x", np.zeros(0), np.zeros(0, bool)).values == {
         "x/confidence_mean": None,
         "x/calibration_error": None,
     }
 
 
-def test_the_confidence_of_masks_is_compared_with_their_overlap():
+def test_mask_confidence_is_compared_with_iou():
     iou = np.array([0.9, 0.8, 0.2, 0.1])
     overlaps = Overlaps(iou, np.zeros(4, bool), np.array([1.0, 1.0, 0.0, 0.0]))
     honest = mask_metrics([overlaps], None)
@@ -48,7 +48,7 @@ def test_the_confidence_of_masks_is_compared_with_their_overlap():
     assert len(boasting.charts) == 1
 
 
-def test_a_root_is_right_within_its_own_limits():
+def test_roots_are_correct_within_their_limits():
     errors = PoseErrors(np.array([10.0, 30.0, np.inf]), np.array([0.05, 0.01, np.inf]))
     assert is_right(errors, GOOD_ROOT).tolist() == [True, False, False]
     assert not is_right(errors).any()

@@ -1,4 +1,4 @@
-"""Scores: exact on constructed cases, blind to what they must be blind to, and honest about failures."""
+"""Scores on constructed cases, their invariances, and the treatment of failures."""
 
 import tracemalloc
 from dataclasses import replace
@@ -29,7 +29,7 @@ def poses(count, seed=0, size_m=2.0):
     )
 
 
-def test_a_constant_motion_is_found_and_then_nothing_is_left():
+def test_constant_transform_is_removed():
     truth, constant = poses(30), poses(1, seed=5)[0]
     ours = constant @ truth
     ours[3] = np.nan
@@ -42,7 +42,7 @@ def test_a_constant_motion_is_found_and_then_nothing_is_left():
     assert np.median(errors.degrees) < 0.05
 
 
-def test_no_scale_is_hidden_by_the_fit():
+def test_alignment_does_not_absorb_scale():
     truth = poses(50)
     ours = truth.copy()
     ours[:, :3, 3] *= 1.1
@@ -50,7 +50,7 @@ def test_no_scale_is_hidden_by_the_fit():
     assert median(errors.meters) > 0.1
 
 
-def test_refused_recordings_count_as_failures():
+def test_rejected_recordings_count_as_failures():
     truth = poses(10)
     good = pose_errors(truth, truth)
     refused = pose_errors(np.full_like(truth, np.nan), truth)
@@ -63,7 +63,7 @@ def test_refused_recordings_count_as_failures():
     assert metrics.values["registration/within_2deg_5cm_share"] == 0.5
 
 
-def test_rotation_error_has_no_floor():
+def test_small_rotation_errors_are_exact():
     truth = poses(5)
     turned = truth @ rigid.exp(np.array([1e-4, 0, 0, 0, 0, 0]))
     np.testing.assert_allclose(pose_errors(turned, truth).degrees, np.degrees(1e-4), rtol=1e-6)
@@ -84,7 +84,7 @@ def view(color, depth, true_color, true_depth, agent):
     return HeldoutView(color, depth.astype(np.float32), true)
 
 
-def test_held_out_views_count_holes_as_wrong_and_forgive_exposure():
+def test_held_out_views_count_holes_as_wrong_and_ignore_exposure():
     rng = np.random.default_rng(0)
     true_color = rng.integers(40, 200, (32, 24, 3), dtype=np.uint8)
     true_depth, agent = np.full((32, 24), 2.0), np.zeros((32, 24), bool)
@@ -101,7 +101,7 @@ def test_held_out_views_count_holes_as_wrong_and_forgive_exposure():
     assert values["reconstruction/lpips_all"] is None
 
 
-def test_phones_may_be_held_upright_and_across():
+def test_portrait_and_landscape_views_are_scored():
     views = []
     for shape, off_m in (((32, 24), 0.0), ((24, 32), 1.0)):
         color, depth = np.full((*shape, 3), 128, np.uint8), np.full(shape, 2.0)
@@ -125,7 +125,7 @@ def test_worse_pictures_score_worse():
     assert np.all(np.diff(ssim) < 0)
 
 
-def test_only_what_cameras_see_is_seen():
+def test_only_observed_surfaces_are_visible():
     corner = np.array(
         [[-1, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2], [-1, -1, 3], [1, -1, 3], [1, 1, 3], [-1, 1, 3.0]]
     )
@@ -138,7 +138,7 @@ def test_only_what_cameras_see_is_seen():
     assert not seen[points[:, 2] > 2.5].any()
 
 
-def test_tracks_follow_the_skin():
+def test_point_tracks_follow_the_skin():
     rng = np.random.default_rng(0)
     rest = poses(2, 1).astype(np.float32)
     skin = SkinnedShape(rng.normal(size=(50, 3)), np.eye(2)[rng.integers(0, 2, 50)], rest)
@@ -179,7 +179,7 @@ def data():
 
 
 class Oracle:
-    """Knows the future up to a little noise."""
+    """Predicts the future with a little noise."""
 
     def __init__(self, data):
         context, self.future = data.windows(data.indices(TEST))
@@ -201,7 +201,7 @@ class Oracle:
 PROTOCOL = Config(samples=8, trials=2, plan_windows=7, seed=0)
 
 
-def test_who_knows_the_future_beats_blind_baselines_and_the_interval_says_so(data):
+def test_oracle_is_significantly_better_than_baselines(data):
     values = behavior.behavior_metrics(data, Oracle(data), PROTOCOL).values
     assert values["behavior/ats/goal_minde_m"] < 0.02
     assert values["behavior/ats/orientation_minade_rad"] == pytest.approx(0, abs=1e-6)
@@ -212,25 +212,25 @@ def test_who_knows_the_future_beats_blind_baselines_and_the_interval_says_so(dat
     assert values["behavior/location_prior/path_minade_m"] is None
 
 
-def test_constant_velocity_is_right_about_straight_walks(data):
+def test_constant_velocity_is_exact_on_straight_walks(data):
     values = behavior.behavior_metrics(data, Oracle(data), PROTOCOL).values
     assert (
         values["behavior/constant_velocity/goal_minde_m"] < 0.01 < values["behavior/stand_still/goal_minde_m"]
     )
 
 
-def test_plans_are_judged_on_windows_of_the_whole_test_and_their_number_is_told(data):
-    for asked, told in ((7, 7), (120, 97)):
+def test_windows_of_the_whole_test_are_evaluated_and_counted(data):
+    for asked, counted in ((7, 7), (120, 97)):
         values = behavior.behavior_metrics(data, Oracle(data), replace(PROTOCOL, plan_windows=asked)).values
         assert (
-            values["behavior/plan_windows"] == told
+            values["behavior/plan_windows"] == counted
             and values["behavior/plan_trials"] == 1
             and values["behavior/test_windows"] == 97
         )
         assert values["behavior/ats_minus_stand_still/path_minade_m_ci95_high"] < 0
 
 
-def test_chunks_bound_the_memory_and_change_nothing(data, monkeypatch):
+def test_chunked_evaluation_gives_the_same_scores(data, monkeypatch):
     few = behavior.behavior_metrics(data, Oracle(data), PROTOCOL).values
     monkeypatch.setattr(behavior, "WINDOWS_AT_ONCE", 1000)
     assert behavior.behavior_metrics(data, Oracle(data), PROTOCOL).values == few
@@ -242,7 +242,7 @@ def test_chunks_bound_the_memory_and_change_nothing(data, monkeypatch):
     assert peak < 60e6, "bytes; 512 paths in each of 97 windows take 67 MB, and their noise as much"
 
 
-def test_without_a_test_video_behaviour_is_skipped_and_says_so(data):
+def test_behavior_without_test_video_is_skipped(data):
     alone = BehaviorData(
         data.trajectories,
         data.agent_from_bone_rest,
@@ -256,7 +256,7 @@ def test_without_a_test_video_behaviour_is_skipped_and_says_so(data):
     assert "test video" in metrics.reasons["behavior/ats/goal_minde_m"]
 
 
-def test_the_energy_score_is_smallest_for_the_right_distribution():
+def test_energy_score_is_minimal_for_the_true_distribution():
     rng = np.random.default_rng(0)
     truth = rng.normal(0, 1, (4000, 3))
     future = Future(np.tile(np.eye(4), (4000, 1, 1, 1)), np.zeros((4000, 1, 1, 4, 4)))
@@ -268,7 +268,7 @@ def test_the_energy_score_is_smallest_for_the_right_distribution():
     assert energy[1] == min(energy)
 
 
-def test_intervals_widen_when_windows_repeat_each_other():
+def test_intervals_widen_for_correlated_windows():
     rng = np.random.default_rng(0)
     start = np.arange(600)
     values = np.repeat(rng.normal(size=10), 60)

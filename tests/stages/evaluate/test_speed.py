@@ -1,4 +1,4 @@
-"""A plan is timed on one core, wherever all else is computed."""
+"""Plans are timed on one CPU thread, independently of the device of the evaluation."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +21,7 @@ DATA = SimpleNamespace(start=np.zeros(1), windows=lambda index: (None, None), vi
 
 @dataclass(frozen=True)
 class Watched:
-    """Remembers with how many threads it was asked."""
+    """Records the number of threads of each call."""
 
     device: str = "cpu"
     sampling: PlanSamplingConfig = PlanSamplingConfig()

@@ -1,5 +1,5 @@
-"""Distances are those of surfaces, exact; the animal is compared where its pose is known, and in what share
-of the frames is told.
+"""Exact distances between surfaces; the animal is compared in frames with a known pose, whose fraction is
+reported.
 """
 
 from pathlib import Path
@@ -30,7 +30,7 @@ def plane(height_m: float) -> TriangleSurface:
 
 
 def soup(count: int) -> np.ndarray:
-    """Return triangles of a centimetre to a metre, some of them flat as a line or a point."""
+    """Return triangles between a centimetre and a metre, some of them degenerate."""
     corner = RNG.normal(0, 1, (count, 1, 3)) + RNG.normal(0, 1, (count, 3, 3)) * 10 ** RNG.uniform(
         -2, 0, (count, 1, 1)
     )
@@ -53,7 +53,7 @@ def test_distances_are_exact():
     )
 
 
-def test_cutting_keeps_the_surface():
+def test_subdivision_keeps_the_surface():
     corner = soup(60)
     pieces = split(corner, 0.1)
     assert np.linalg.norm(np.roll(pieces, -1, axis=1) - pieces, axis=-1).max() <= 0.1
@@ -66,23 +66,23 @@ def test_cutting_keeps_the_surface():
 
 
 @pytest.mark.parametrize("apart_m", [0.0, 0.01, 2.0])
-def test_planes_are_as_far_apart_as_they_are(apart_m: float):
+def test_distance_of_parallel_planes(apart_m: float):
     assert chamfer(plane(0.0), plane(apart_m), 2000, RNG) == pytest.approx(apart_m, abs=1e-9)
 
 
-def test_a_surface_is_no_way_from_itself():
+def test_distance_of_a_surface_to_itself_is_zero():
     ball = TriangleSurface(BALL.triangles)
     assert chamfer(ball, ball, 2000, RNG) < 1e-12, "metres"
     assert chamfer(ball, TriangleSurface(1.05 * BALL.triangles), 2000, RNG) == pytest.approx(0.01, abs=3e-4)
 
 
 def motion_of(confidence: np.ndarray) -> Motion:
-    """Return an animal that stays where it is."""
+    """Return a resting animal."""
     rest = np.tile(np.eye(4), (FRAMES, 1, 1))
     return Motion(0.1 * np.arange(FRAMES), rest, rest, rest[:, None], confidence, confidence > INTERPOLATED)
 
 
-def test_the_share_of_frames_in_which_the_animal_is_compared_is_told(tmp_path: Path):
+def test_fraction_of_compared_frames_is_reported(tmp_path: Path):
     ball = Mesh(BALL.vertices.astype(np.float32), BALL.faces.astype(np.int32))
     for path in (tmp_path / "agent.ply", tmp_path / "truth" / "agent.ply"):
         path.parent.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""Truth is brought to the extracted frames, and masks and flow are compared where both are known."""
+"""Ground truth of the extracted frames; masks and flow are compared where both are known."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ FRAMES = 9
 
 @pytest.fixture
 def folder(tmp_path):
-    """A recording of 9 frames with an animal that moves one pixel a frame."""
+    """A recording of 9 frames with an animal that moves one pixel per frame."""
     masks = np.zeros((FRAMES, 16, 12), bool)
     for i in range(FRAMES):
         masks[i, 4:10, i % 4 : i % 4 + 5] = True
@@ -49,7 +49,7 @@ def test_truth_follows_the_extracted_frames(folder):
     np.testing.assert_allclose(truth.vertices_world(3)[:, 0], 6)
 
 
-def test_only_flow_between_neighbours_counts(folder):
+def test_only_flow_between_adjacent_frames_counts(folder):
     true = read_flow(folder, "s", SOURCE)
     assert true.first.tolist() == [0]
     ours = np.zeros((4, 4, 3, 2))
@@ -61,7 +61,7 @@ def test_only_flow_between_neighbours_counts(folder):
     assert read_flow(folder, "other", SOURCE) is None
 
 
-def test_masks_are_compared_where_they_know(folder):
+def test_masks_are_compared_where_known(folder):
     truth, out = RecordingTruth.open(folder, "s", SOURCE), folder / "masks"
     out.mkdir()
     for i, true in enumerate(truth.masks):

@@ -1,6 +1,4 @@
-"""A skinned, animated tube as glTF, and where its corners are at one moment, for tests that open it
-elsewhere.
-"""
+"""A skinned, animated tube as glTF, with its vertices at one time, for tests of other programs."""
 
 import numpy as np
 from jaxtyping import Float
@@ -11,11 +9,11 @@ from pipeline.geometry import rigid
 from tests.stages.export_simulator import small_world
 
 SECONDS = 1.2
-"""A key of the animation."""
+"""A key frame of the animation."""
 
 
 def model() -> tuple[bytes, Float[np.ndarray, "corner 3"]]:
-    """Return the file with the action `walk`, and its corners in the world at `SECONDS`, metres."""
+    """Return the file with the action `walk`, and its vertices in the world at `SECONDS`, metres."""
     mesh, weights = small_world.tube()
     joints = np.argsort(-weights, 1)[:, :4]
     kept = np.take_along_axis(weights, joints, 1)

@@ -29,14 +29,14 @@ print("RESULT", json.dumps({"names": [action.name for action in bpy.data.actions
 
 
 @pytest.mark.skipif(BLENDER is None, reason="set ATS_BLENDER to a Python that has bpy")
-def test_blender_opens_the_animal_and_moves_it_alike(tmp_path) -> None:
+def test_blender_animates_the_animal_like_python(tmp_path) -> None:
     model, places = moving_tube.model()
     (tmp_path / "agent.glb").write_bytes(model)
     command = [BLENDER, "-c", SCRIPT, str(tmp_path / "agent.glb"), str(moving_tube.SECONDS)]
-    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     found = json.loads(
-        next(line for line in told.splitlines() if line.startswith("RESULT")).removeprefix("RESULT")
+        next(line for line in output.splitlines() if line.startswith("RESULT")).removeprefix("RESULT")
     )
     assert any(name.startswith("walk") for name in found["names"])
-    x, y, z = np.array(found["places"]).T  # Blender's +z is up
+    x, y, z = np.array(found["places"]).T  # +z is up in Blender
     np.testing.assert_allclose(np.stack([x, z, -y], 1), places, atol=2e-5)  # metres

@@ -1,4 +1,4 @@
-"""Exports keep what they promise: motion, places and units survive in every format."""
+"""Exports preserve motion, positions and units in every format."""
 
 import importlib
 import json
@@ -24,7 +24,7 @@ WEB = Path(__file__).parents[3] / "stages/export_simulator/web"
 
 @pytest.fixture(scope="module")
 def agent() -> reading.Agent:
-    """A tube of five bones with two motions, four influences a vertex."""
+    """A tube of five bones with two motions and four influences per vertex."""
     mesh, weights = small_world.tube()
     joints = np.argsort(-weights, 1)[:, :4]
     heaviest = np.take_along_axis(weights, joints, 1)
@@ -56,7 +56,7 @@ def session() -> Motion:
     )
 
 
-def test_a_motion_on_another_body_is_exported_with_its_loss(agent: reading.Agent, tmp_path: Path) -> None:
+def test_retargeted_motion_is_exported_with_its_residual(agent: reading.Agent, tmp_path: Path) -> None:
     """A body 1.5 times as long has its own surface and skin, and the motions of the first."""
     stretch = np.array([1, 1, 1.5])
     rest = agent.skin.agent_from_bone_rest.copy()
@@ -76,7 +76,7 @@ def test_a_motion_on_another_body_is_exported_with_its_loss(agent: reading.Agent
         assert np.corrcoef(bent, own)[0, 1] > 0.9, "the second bone swings in the same rhythm"
 
 
-def test_glb_comes_back_as_it_was(agent: reading.Agent) -> None:
+def test_glb_round_trips(agent: reading.Agent) -> None:
     mesh, skin, actions = glb.read_skinned(glb.skinned(agent.mesh, agent.skin, agent.actions))
     np.testing.assert_array_equal(mesh.faces, agent.mesh.faces)
     np.testing.assert_array_equal(mesh.color, agent.mesh.color)
@@ -91,8 +91,8 @@ def test_glb_comes_back_as_it_was(agent: reading.Agent) -> None:
 
 
 def test_glb_is_valid(agent: reading.Agent, tmp_path: Path) -> None:
-    told = glb_export.write(tmp_path, agent, glb.static(small_world.room(), "scene"))
-    assert told.loss_mm == {"skinning_mean": 0.1, "skinning_max": 0.5}
+    written = glb_export.write(tmp_path, agent, glb.static(small_world.room(), "scene"))
+    assert written.loss_mm == {"skinning_mean": 0.1, "skinning_max": 0.5}
     if shutil.which("node") is None or not (WEB / "node_modules/gltf-validator").is_dir():
         pytest.skip("needs node, and `npm ci` in stages/export_simulator/web")
     script = (
@@ -113,12 +113,12 @@ def test_glb_is_valid(agent: reading.Agent, tmp_path: Path) -> None:
 
 
 def test_bvh_is_exact(agent: reading.Agent, tmp_path: Path) -> None:
-    told = bvh.write(tmp_path, agent)
-    assert told.loss_mm["flat_max"] < 0.01, "mm: six decimals"
+    written = bvh.write(tmp_path, agent)
+    assert written.loss_mm["flat_max"] < 0.01, "mm: six decimals"
     assert {path.name for path in tmp_path.iterdir()} == {"walk.flat.bvh", "turn.flat.bvh"}
 
 
-def test_boxes_cover_what_is_solid_and_nothing_else() -> None:
+def test_boxes_cover_exactly_the_solid_space() -> None:
     solid = RNG.random((9, 7, 8)) < 0.4
     solid[2:6, 1:4, 2:7] = True
     found = mjcf.boxes(solid)
@@ -129,16 +129,16 @@ def test_boxes_cover_what_is_solid_and_nothing_else() -> None:
     assert len(found) < solid.sum()
 
 
-def test_splats_are_248_bytes_and_sound(tmp_path: Path) -> None:
+def test_splats_have_248_bytes_and_valid_values(tmp_path: Path) -> None:
     rows = np.zeros((4, 62), np.float32)
     rows[:, 58], rows[1, 0], rows[2, 54] = 2.0, np.nan, -9
-    told = splats.write(tmp_path, {"scene": rows, "agent": rows})
+    written = splats.write(tmp_path, {"scene": rows, "agent": rows})
     head, _, body = (tmp_path / "scene.ply").read_bytes().partition(b"end_header\n")
-    assert len(body) == 2 * 248 and b"element vertex 2" in head and told.loss_mm == {}
+    assert len(body) == 2 * 248 and b"element vertex 2" in head and written.loss_mm == {}
     np.testing.assert_array_equal(np.frombuffer(body, "<f4").reshape(-1, 62)[:, 58], 1)
 
 
-def test_rows_of_a_session(session: Motion) -> None:
+def test_session_table_has_one_row_per_frame(session: Motion) -> None:
     table = dict(zip(tables.COLUMNS, tables.rows(session).T, strict=True))
     assert table["in_view"].sum() == 14 and np.isnan(table["x"][4]) and np.isnan(table["qw"][4])
     np.testing.assert_allclose(table["speed_m_s"][7:], 0.6, atol=0.01, err_msg="1.2 m radius at 0.5 rad/s")
@@ -182,8 +182,8 @@ def test_pictures_keep_their_cameras(shots: list[reading.CameraFrame], tmp_path:
     )
     for name in ("colmap", "nerfstudio"):
         (tmp_path / name).mkdir()
-    told = cameras.write_colmap(tmp_path / "colmap", shots, small_world.room())
-    assert told.loss_mm["camera_places"] < 0.01, "mm"
+    written = cameras.write_colmap(tmp_path / "colmap", shots, small_world.room())
+    assert written.loss_mm["camera_places"] < 0.01, "mm"
     cameras.write_nerfstudio(tmp_path / "nerfstudio", shots)
     frame = json.loads((tmp_path / "nerfstudio/transforms.json").read_bytes())["frames"][1]
     seen = (
@@ -196,17 +196,17 @@ def test_pictures_keep_their_cameras(shots: list[reading.CameraFrame], tmp_path:
     assert mask[0, 0] == 0 and mask[-1, -1] == 255
 
 
-def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(name: str) -> None:
         raise ImportError(name)
 
     monkeypatch.setattr(importlib, "import_module", refuse)
-    with pytest.raises(InputError, match="make extras") as told:
+    with pytest.raises(InputError, match="make extras") as raised:
         writing.extra("pxr.Usd", "usd-core")
-    assert told.value.code == "EXP-010"
+    assert raised.value.code == "EXP-010"
 
 
-def test_usd_opens_where_joints_belong(agent: reading.Agent, tmp_path: Path) -> None:
+def test_usd_joints_have_their_poses(agent: reading.Agent, tmp_path: Path) -> None:
     pytest.importorskip("pxr")
     assert usd.write(tmp_path, agent, small_world.room()).loss_mm["joints"] < 0.01, "mm"
 
@@ -219,7 +219,7 @@ def test_mjcf_compiles_and_moves(agent: reading.Agent, tmp_path: Path) -> None:
     assert mjcf.write(tmp_path, agent, occupancy).loss_mm["bodies"] < 0.01, "mm"
 
 
-def test_science_reads_the_sessions_back(session: Motion, tmp_path: Path) -> None:
+def test_scientific_formats_round_trip(session: Motion, tmp_path: Path) -> None:
     pytest.importorskip("h5netcdf")
     pytest.importorskip("pynwb")
     pytest.importorskip("pyarrow")
@@ -229,7 +229,7 @@ def test_science_reads_the_sessions_back(session: Motion, tmp_path: Path) -> Non
     assert len((tmp_path / "frames.csv").read_text().splitlines()) == 16
 
 
-def test_extras_agree_with_the_locks_and_hold_no_torch() -> None:
+def test_extras_agree_with_the_locks_and_exclude_torch() -> None:
     envs = Path(__file__).parents[3] / "envs"
 
     def pinned(name: str) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""The exported animal in three.js: its own loader opens it, and its skin moves as Python's does."""
+"""three.js loads the exported animal and skins it like Python."""
 
 import base64
 import shutil
@@ -37,16 +37,16 @@ window.moved = async (text, seconds) => {
     shutil.which("node") is None or not (WEB / "node_modules/three").is_dir(),
     reason="needs node, and `npm ci` in stages/export_simulator/web",
 )
-def test_three_opens_the_animal_and_moves_it_alike() -> None:
+def test_three_animates_the_animal_like_python() -> None:
     model, places = moving_tube.model()
     bundler = ["node_modules/.bin/esbuild", "--bundle", "--format=iife", "--log-level=error"]
     script = subprocess.run(bundler, cwd=WEB, input=ENTRY, capture_output=True, text=True, check=True).stdout
     with browser.chromium() as opened:
         page = opened.new_page()
         page.add_script_tag(content=script)
-        told = page.evaluate(
+        loaded = page.evaluate(
             "([text, seconds]) => moved(text, seconds)",
             [base64.b64encode(model).decode(), moving_tube.SECONDS],
         )
-    assert told["names"] == ["walk"]
-    np.testing.assert_allclose(told["places"], places, atol=2e-5)  # metres
+    assert loaded["names"] == ["walk"]
+    np.testing.assert_allclose(loaded["places"], places, atol=2e-5)  # metres

@@ -1,4 +1,4 @@
-"""Open pages in headless Chromium with software WebGL and watch them: console, errors, requests."""
+"""Pages in headless Chromium with software WebGL; console messages, errors and requests are recorded."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -50,9 +50,8 @@ def shown(
     timeout_s: float = 60,
     **more: Any,
 ) -> Iterator[tuple[Page, list[str]]]:
-    """Yield the page at an address, once it is ready or sorry, and a growing list of everything it did wrong.
-
-    `script` runs before the page's own; `more` are settings of the browser's context.
+    """Yield the page at an address once it is ready or has failed, and a list of its errors. `script` runs
+    before the page; `more` are options of the browser context.
     """
     home = address.rsplit("/", 1)[0]
     context = browser.new_context(viewport={"width": size[0], "height": size[1]}, **more)
@@ -84,7 +83,7 @@ def shown(
 def opened(
     file: Path, query: str = "", size: tuple[int, int] = (480, 320), timeout_s: float = 60
 ) -> Iterator[tuple[Page, list[str]]]:
-    """Yield a page from the disk in a browser of its own."""
+    """Yield a page from disk in a new browser."""
     with (
         chromium() as browser,
         shown(browser, file.resolve().as_uri() + query, size=size, timeout_s=timeout_s) as page_and_wrong,

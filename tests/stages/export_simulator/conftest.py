@@ -1,4 +1,4 @@
-"""A page of the small world and a browser, for all tests here."""
+"""Shared fixtures: a page of the small world and a browser."""
 
 import shutil
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from tests.stages.export_simulator import browser, small_world
 
 @pytest.fixture(scope="session")
 def simulator(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Export a small world, as one file and as a folder beside it."""
+    """Export a small world, as one file and as a folder."""
     raw, build = tmp_path_factory.mktemp("raw"), tmp_path_factory.mktemp("build")
     small_world.write(raw)
     shutil.copytree(raw, build, dirs_exist_ok=True)

@@ -1,5 +1,5 @@
-"""A small true world for the page: a box room, a tube of five bones that walks in it, networks that learned
-to flee.
+"""A small synthetic world for the page: a box-shaped room, a walking tube of five bones, networks trained to
+flee.
 """
 
 import json
@@ -68,7 +68,7 @@ def tube(rings: int = 24, sides: int = 12) -> tuple[Mesh, np.ndarray]:
 
 
 def room() -> Mesh:
-    """Floor and four walls, seen from inside, chequered."""
+    """Floor and four walls, visible from inside, with a checkerboard texture."""
     parts = [_sheet([0, 0, 0], [0, 0, 1], [1, 0, 0], (205, 180, 150), (188, 160, 130))]
     for normal, along in (
         ([1, 0, 0], [0, 0, -1]),
@@ -106,11 +106,11 @@ def _sheet(center, along, up, first, second, cells: int = 16) -> Mesh:
 
 
 def trajectory(frames: int, seed: int) -> Trajectory:
-    """Walk on a wobbling circle, wag the body; the observer stands aside."""
+    """Walk on a perturbed circle with a swinging body; the observer stands aside."""
     time_s = np.arange(frames) / 10
     angle = 0.5 * time_s + seed
     position = np.stack([1.2 * np.cos(angle), np.full(frames, 0.1), 1.2 * np.sin(angle)], -1)
-    heading = np.stack([0 * angle, -angle, 0 * angle], -1)  # z towards the direction of travel
+    heading = np.stack([0 * angle, -angle, 0 * angle], -1)  # z in the direction of travel
     world_from_agent = rigid.make(rigid.rotation_from_vector(heading), position)
     phase = 2 * np.pi * time_s[:, None] + np.arange(BONES)
     wag = np.stack(
@@ -125,8 +125,8 @@ def trajectory(frames: int, seed: int) -> Trajectory:
 
 
 def networks_that_flee(architecture: Architecture, steps: int = 250) -> tuple[BehaviorNets, Scaling]:
-    """Train perception and goal network, briefly, to run from whoever is near; path network to go straight;
-    the body only at random.
+    """Train perception and goal network briefly to flee from a near observer, and the path network to go
+    straight; the body is random.
     """
     torch.manual_seed(0)
     nets, schedule = BehaviorNets(architecture), Schedule()
@@ -139,14 +139,14 @@ def networks_that_flee(architecture: Architecture, steps: int = 250) -> tuple[Be
         )
         level = place[:, 0] * torch.tensor([1.0, 0.0, 1.0])
         distance = level.norm(dim=-1, keepdim=True)
-        pace_m_s = torch.rand(128, 1, 1) * 1.2  # that of walking up; it does not matter either
+        pace_m_s = torch.rand(128, 1, 1) * 1.2  # that of approaching; irrelevant too
         observer = (
             place + level[:, None] / distance[:, None] * pace_m_s * torch.arange(0.7, -0.05, -0.1)[:, None]
         )
         person = torch.nn.functional.pad(observer, (0, 7))
         goal = -level / (distance + 0.05) * (2.0 - distance).clamp_min(0)
         goal = goal + 0.3 * torch.randn(128, 3) * torch.tensor([1.0, 0.1, 1.0])
-        elsewhere = torch.randn(2, 128, architecture.code)  # whatever room and past say does not matter
+        elsewhere = torch.randn(2, 128, architecture.code)  # independent of room and past
         chart = torch.randn(128, architecture.condition_length - architecture.code_length)
         condition = torch.cat(
             [chart, elsewhere[0], mind.others(person[:, None], torch.ones(128)), elsewhere[1]], dim=-1
@@ -173,7 +173,7 @@ def networks_that_flee(architecture: Architecture, steps: int = 250) -> tuple[Be
 def _teach_paths(
     nets: BehaviorNets, architecture: Architecture, schedule: Schedule, steps: int = 100
 ) -> None:
-    """Train the path network, briefly, to go straight to its goal."""
+    """Train the path network briefly to go straight to its goal."""
     optimizer = torch.optim.Adam(nets.path.parameters(), 3e-3)
     alpha_bar = torch.from_numpy(schedule.alpha_bar).float()
     for _ in range(steps):
@@ -197,8 +197,8 @@ def _teach_paths(
 
 
 def write(build: Path, *, accompanied: bool = False) -> None:
-    """Write the four artifacts that `export_simulator` reads (without manifests); networks of an
-    ``accompanied`` animal perceive others, from whom it flees as from a person.
+    """Write the four artifacts that `export_simulator` reads (without manifests); an ``accompanied`` animal
+    also perceives and flees other animals.
     """
     for name in ("reconstruction", "splats", "behavior_data", "behavior"):
         (build / name).mkdir(parents=True)
@@ -245,7 +245,7 @@ def write(build: Path, *, accompanied: bool = False) -> None:
 
 
 def write_home(animals: Path) -> None:
-    """Write a cat, and a dog with the same networks that walks where the cat is not."""
+    """Write a cat, and a dog with the same networks that walks elsewhere."""
     write(animals / "cat", accompanied=True)
     shutil.copytree(animals / "cat", animals / "dog")
     data = BehaviorData.load(animals / "dog/behavior_data")
@@ -272,7 +272,7 @@ def exported(raw: Path, out: Path, config: Config = NAMED) -> Path:
 
 
 def allowed(shape: tuple[int, int, int]) -> np.ndarray:
-    """The animal may be everywhere but in a cupboard, where x > `CUPBOARD_M` and z < -`CUPBOARD_M`."""
+    """The animal may be anywhere except in a cupboard, where x > `CUPBOARD_M` and z < -`CUPBOARD_M`."""
     space = np.ones(shape, np.uint8)
     edge = round((CUPBOARD_M + 2.2) / 0.1)
     space[edge:, :, : shape[2] - edge] = 0
@@ -280,7 +280,7 @@ def allowed(shape: tuple[int, int, int]) -> np.ndarray:
 
 
 def furnish(build: Path) -> None:
-    """Put a box of `BOX_M` onto the middle of the floor, and floor and walls into the volume."""
+    """Add a box of `BOX_M` at the centre of the floor, and floor and walls to the volume."""
     scene, half = ply.read_ply(build / "reconstruction/scene.ply"), np.array(BOX_M) / 2
     box = trimesh.creation.box(BOX_M, rigid.make(np.eye(3), [0, half[1], 0])).subdivide().subdivide()
     vertices = np.concatenate([scene.vertices, box.vertices]).astype(np.float32)
@@ -313,7 +313,7 @@ def write_surfaces(reconstruction: Path) -> None:
 
 
 def write_gaussians(path: Path, mesh: Mesh) -> None:
-    """Write one flat Gaussian per vertex, 62 floats a row."""
+    """Write one flat Gaussian per vertex, 62 floats per row."""
     rows = np.zeros((len(mesh.vertices), 62), "<f4")
     rows[:, :3] = mesh.vertices
     rows[:, 6:9] = (mesh.color / 255 - 0.5) / 0.28209479177387814

@@ -1,7 +1,7 @@
-"""The page is put together as it is meant, whatever the animal is called and the address says."""
+"""Assembly of the page is robust to special characters in names and addresses."""
 
 from stages.export_simulator import page
-from tests.stages.export_simulator.test_support_twins import SOURCES, asked_of_node, needs_node
+from tests.stages.export_simulator.test_support_twins import SOURCES, needs_node, run_node
 
 READ = f"""
 import {{ readState }} from '{SOURCES}/state.js';
@@ -24,7 +24,7 @@ console.log(JSON.stringify(keys.map(asked)));
 )
 
 
-def test_a_name_that_is_a_mark_stays_a_name():
+def test_markup_in_names_is_escaped():
     marks = "@@ASSETS@@ @@SCRIPT@@ @@NAME@@"
     text = page.page(contract={"name": marks}, assets={"room": page.Asset(b"room")})
     assert f"<h1>{marks}</h1>" in text
@@ -32,14 +32,14 @@ def test_a_name_that_is_a_mark_stays_a_name():
 
 
 @needs_node
-def test_an_address_sets_only_what_is_a_setting():
-    """What every object of JavaScript has by birth is no setting."""
+def test_address_changes_only_known_settings():
+    """Inherited properties of JavaScript objects are no settings."""
     keys = ["constructor", "toString", "valueOf", "__proto__", "hasOwnProperty", "nothing"]
-    assert asked_of_node(READ, keys=keys).tolist() == [1] * len(keys)
+    assert run_node(READ, keys=keys).tolist() == [1] * len(keys)
 
 
 @needs_node
-def test_places_outside_the_room_mean_nothing():
+def test_positions_outside_the_room_are_ignored():
     places = [
         "aim=1,0.5",
         "aim=1,0.5,0.4;-2,-1",
@@ -48,4 +48,4 @@ def test_places_outside_the_room_mean_nothing():
         "aim=1,0.5;0,-7",
         "route=0,0;3,0",
     ]
-    assert asked_of_node(ASKED, keys=places).tolist() == [0, 0, 0, 1, 1, 1]
+    assert run_node(ASKED, keys=places).tolist() == [0, 0, 0, 1, 1, 1]

@@ -1,10 +1,10 @@
-"""The page and Python lead paths around the person alike, and none through the body."""
+"""The page and Python warp paths around the person in the same way, without collisions."""
 
 import numpy as np
 import pytest
 
 from pipeline.behavior.avoidance import PERSON_M, around_person, clearance_of
-from tests.stages.export_simulator.test_support_twins import SOURCES, asked_of_node, needs_node
+from tests.stages.export_simulator.test_support_twins import SOURCES, needs_node, run_node
 
 ASK = (
     f"import {{ aroundPerson, clearanceOf }} from '{SOURCES}/avoidance.js';"
@@ -18,7 +18,7 @@ REST[:, 2, 3] = (-0.38, 0.0, 0.28)
 CLEARANCE_M = clearance_of(REST)
 
 
-def test_the_clearance_grows_with_the_animal():
+def test_clearance_scales_with_the_animal():
     assert clearance_of(REST) == pytest.approx(0.4), "metres, of a cat"
     dog = REST * np.array([1.0, 1.0, 1.0, 1.3])
     assert clearance_of(dog) == pytest.approx(PERSON_M + 1.3 * 0.28)
@@ -29,7 +29,7 @@ def test_the_clearance_grows_with_the_animal():
 
 @pytest.fixture(scope="module")
 def paths() -> np.ndarray:
-    """Straight walks at 0.5 m/s through the origin, each from another side, not all through its middle."""
+    """Straight walks at 0.5 m/s past or through the origin from different sides."""
     rng = np.random.default_rng(0)
     along, aside = np.linspace(-1.4, 1.4, 57), rng.uniform(-0.5, 0.5, 40)
     angle = rng.uniform(0, 2 * np.pi, 40)[:, None]
@@ -39,14 +39,14 @@ def paths() -> np.ndarray:
 
 
 def nearest_m(paths: np.ndarray) -> np.ndarray:
-    """Return how near each path, sampled finely, comes to the origin."""
+    """Return the distance of each path, finely sampled, from the origin."""
     share = np.linspace(0, 1, 20)[:, None, None, None]
     return np.linalg.norm((paths[:, :-1] * (1 - share) + paths[:, 1:] * share)[..., [0, 2]], axis=-1).min(
         (0, 2)
     )
 
 
-def test_no_path_leads_through_the_body(paths):
+def test_paths_do_not_intersect_the_person(paths):
     led = around_person(paths[:, 1:], paths[:, 0], np.zeros((len(paths), 3)), CLEARANCE_M)
     whole = np.concatenate([paths[:, :1], led], axis=1)
     assert nearest_m(paths).min() < 0.05 and nearest_m(whole).min() > CLEARANCE_M - 0.01, "metres"
@@ -56,20 +56,20 @@ def test_no_path_leads_through_the_body(paths):
     assert np.median(past) < 0.02, "metres: those that can arrive arrive"
 
 
-def test_who_stands_too_near_does_not_come_nearer(paths):
+def test_animal_within_the_clearance_does_not_come_closer(paths):
     start = 0.2 * paths[:, 0] / np.linalg.norm(paths[:, 0][:, [0, 2]], axis=1, keepdims=True)
     led = around_person(paths[:, 1:], start, np.zeros((len(paths), 3)), CLEARANCE_M)
     assert np.linalg.norm(led[..., [0, 2]], axis=-1).min() > 0.19, "metres"
 
 
-def test_nobody_near_changes_nothing(paths):
+def test_distant_persons_do_not_change_paths(paths):
     led = around_person(paths[:, 1:], paths[:, 0], np.full((len(paths), 3), 9.0), CLEARANCE_M)
     np.testing.assert_allclose(led, paths[:, 1:], atol=1e-12)
 
 
 @needs_node
-def test_page_and_python_lead_alike(paths):
-    theirs = asked_of_node(
+def test_page_and_python_give_the_same_paths(paths):
+    theirs = run_node(
         ASK, paths=paths.tolist(), people=np.zeros((len(paths), 2)).tolist(), rest=REST.tolist()
     )
     ours = around_person(paths[:, 1:], paths[:, 0], np.zeros((len(paths), 3)), CLEARANCE_M)

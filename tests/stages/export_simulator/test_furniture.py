@@ -1,11 +1,11 @@
-"""Furniture that is moved on the page: what moves, what does not, and that no path leads through it."""
+"""Movable furniture of the page: what can be moved, and that paths avoid it."""
 
 from typing import Any
 
 import numpy as np
 
 from pipeline.behavior.support import mark_supported
-from tests.stages.export_simulator.test_support_twins import SOURCES, asked_of_node, needs_node
+from tests.stages.export_simulator.test_support_twins import SOURCES, needs_node, run_node
 
 pytestmark = needs_node
 SHAPE, VOXEL_M = (40, 24, 40), 0.1
@@ -49,7 +49,7 @@ console.log(JSON.stringify({{ answer: answers[asked.question]() }}));
 
 
 def home() -> np.ndarray:
-    """Floor, four walls, a box in the middle, a table on four legs, a bench at a wall, a shelf on a wall, and a
+    """Floor, four walls, a box in the middle, a table on four legs, a bench at a wall, a shelf on a wall, a
     counter of 3.2 m.
     """
     solid = np.zeros(SHAPE, np.uint8)
@@ -77,14 +77,14 @@ BOX, TABLE, BENCH, WALL, SHELF, COUNTER, FLOOR = (
 
 
 def asked(question: str, **more: Any) -> Any:
-    """Return the page's answer about the home."""
+    """Return the answer of the page about the home."""
     solid = home()
     marks = mark_supported(solid == 0, solid)
-    told = {"volume": VOLUME, "occupancy": solid.ravel().tolist(), "allowed": marks.ravel().tolist()} | more
-    return asked_of_node(ASK, question=question, **told).item()["answer"]
+    grids = {"volume": VOLUME, "occupancy": solid.ravel().tolist(), "allowed": marks.ravel().tolist()} | more
+    return run_node(ASK, question=question, **grids).item()["answer"]
 
 
-def test_what_stands_on_the_floor_can_be_taken_up_and_nothing_else() -> None:
+def test_only_free_standing_furniture_is_movable() -> None:
     found = asked("found", points=[BOX, TABLE, BENCH, WALL, SHELF, COUNTER, FLOOR])
     solid = home()
     for points, cells in (
@@ -100,7 +100,7 @@ def test_what_stands_on_the_floor_can_be_taken_up_and_nothing_else() -> None:
     assert "Nothing stands here" in found[6]
 
 
-def test_occupancy_and_marks_move_with_it() -> None:
+def test_occupancy_and_support_move_with_the_furniture() -> None:
     solid = home()
     box = solid.copy()
     box[17:22, LEVEL:9, 18:23] = 0
@@ -116,15 +116,15 @@ def test_occupancy_and_marks_move_with_it() -> None:
         assert state["kept"] == [back["occupancy"], back["allowed"]]
 
 
-def test_what_nobody_saw_beneath_moves_along_and_floor_goes_on() -> None:
-    """Under a table that hid its floor there is nothing; where it stood the animal may walk."""
+def test_unobserved_space_moves_with_the_furniture() -> None:
+    """The unobserved space below a table becomes free floor when the table is moved."""
     solid = home()
     solid[29:34, :7, 29:34] = 2
     marks = mark_supported(solid == 0, solid)
-    told = {"occupancy": solid.ravel().tolist(), "allowed": marks.ravel().tolist()}
+    grids = {"occupancy": solid.ravel().tolist(), "allowed": marks.ravel().tolist()}
     after = {
         key: np.reshape(value, SHAPE)
-        for key, value in asked("arranged", moves=[(TABLE, [-3, -12])], **told).items()
+        for key, value in asked("arranged", moves=[(TABLE, [-3, -12])], **grids).items()
         if key in ("occupancy", "allowed")
     }
     assert (after["occupancy"][26:31, LEVEL:7, 17:22] == 2).all()
@@ -133,7 +133,7 @@ def test_what_nobody_saw_beneath_moves_along_and_floor_goes_on() -> None:
     assert (after["allowed"][29:34, LEVEL, 29:34] == 3).all(), "as floor that was filled"
 
 
-def test_features_move_with_the_voxels() -> None:
+def test_features_move_with_the_furniture() -> None:
     values = np.random.default_rng(0).normal(size=(2, *SHAPE)).astype(np.float32)
     moved = np.reshape(
         asked("features", moves=[(BOX, [7, -4])], values=values.ravel().tolist()), values.shape
@@ -144,7 +144,7 @@ def test_features_move_with_the_voxels() -> None:
     np.testing.assert_array_equal(moved.astype(np.float32), expected)
 
 
-def test_it_is_set_down_on_free_floor_only() -> None:
+def test_furniture_is_placed_only_on_free_floor() -> None:
     nobody: list[dict[str, Any]] = []
     cat = [{"name": "cat is", "place": [0.8, 0.0]}]
     tries = [
@@ -164,8 +164,8 @@ def test_it_is_set_down_on_free_floor_only() -> None:
     assert onto_bench == ["Something else stands there."], "where that has been moved to"
 
 
-def test_no_path_leads_through_it_however_it_was_meant() -> None:
-    """Straight walks through where the box is put, at 0.4 m/s, from all sides: free before, around it after."""
+def test_paths_avoid_moved_furniture() -> None:
+    """Straight paths at 0.4 m/s through the new position, from all sides."""
     rng = np.random.default_rng(0)
     middle = np.array([0.65, -0.35])
     angle, aside = rng.uniform(0, 2 * np.pi, 40), rng.uniform(-0.2, 0.2, 40)
@@ -189,21 +189,21 @@ def test_no_path_leads_through_it_however_it_was_meant() -> None:
 
 
 def mask_of_box(da: int, dc: int) -> np.ndarray:
-    """Return the columns that the box stands in after a move."""
+    """Return the columns that the box occupies after a move."""
     mask = np.zeros((SHAPE[0], SHAPE[2]), bool)
     mask[17 + da : 22 + da, 18 + dc : 23 + dc] = True
     return mask
 
 
 def entered(paths: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return which paths, sampled every half centimetre, are in one of the columns at some time."""
+    """Return which paths, sampled every half centimetre, enter one of the columns."""
     share = np.linspace(0, 1, 10, endpoint=False)[:, None, None, None]
     dense = paths[:, :-1] * (1 - share) + paths[:, 1:] * share
     at = np.floor((dense[..., [0, 2]] + 2.0) / VOXEL_M + 1e-6).astype(int)
     return columns[at[..., 0], at[..., 1]].any((0, 2))
 
 
-def test_another_grid_has_the_same_space_under_other_numbers() -> None:
+def test_grid_resampling_preserves_space() -> None:
     other = {"shape": [2, 30, 24, 40], "origin": [-1.0, -0.2, -2.0], "voxel_m": VOXEL_M}
     cells = asked("elsewhere", moves=[(BOX, [0, 0])], other=other)
     part = np.zeros((30, 24, 40), bool)

@@ -1,4 +1,4 @@
-"""The page of several animals: each lives, perceives the others as Python does, and obeys hands alone."""
+"""The page of several animals: all are simulated, perceive each other as in Python, and react to input."""
 
 import json
 from pathlib import Path
@@ -34,13 +34,13 @@ def home(animals: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return small_world.exported_home(animals, tmp_path_factory.mktemp("home") / "page")
 
 
-def test_contract_has_every_animal_and_the_room_once(home: Path, animals: Path) -> None:
-    told = json.loads((home / "simulator.json").read_bytes())
+def test_contract_has_each_animal_and_one_room(home: Path, animals: Path) -> None:
+    document = json.loads((home / "simulator.json").read_bytes())
     own = json.loads(
         (small_world.exported(animals / "cat", home.parent / "cat") / "simulator.json").read_bytes()
     )
-    assert [animal["name"] for animal in told["animals"]] == ["cat", "dog"]
-    cat = told["animals"][0]
+    assert [animal["name"] for animal in document["animals"]] == ["cat", "dog"]
+    cat = document["animals"][0]
     assert (
         cat["behavior"] == own["behavior"] and cat["agent"] == own["agent"] and cat["volume"] == own["volume"]
     )
@@ -63,7 +63,7 @@ def test_animals_perceive_each_other_as_in_python(home: Path, animals: Path, chr
 
 
 def _check_goals(page: Page, home: Path, cat: Path) -> None:
-    """Goals beside a companion, with the same noise: the page's are Python's, and shift away from it."""
+    """Goals beside a companion with the same noise equal those of Python, and shift away from it."""
     met = twins.approaches(BehaviorData.load(cat / "behavior_data"), 20, np.random.default_rng(0))
     contract = json.loads((home / "simulator.json").read_bytes())
     height = np.full((*met.near.shape[:2], 1), 0.1)
@@ -85,8 +85,10 @@ def _check_goals(page: Page, home: Path, cat: Path) -> None:
             [q | changes | {"K": 1, "steps": twins.STEPS, "interactivity": 1} for q in questions]
         )
         found[name] = np.array(page.evaluate(twins.ASK, text))[:, [0, 2]]
-    told = contract["animals"][0]["behavior"]["sampling"]
-    sampling = PlanSamplingConfig(told["method"], max(twins.STEPS, told["goal_steps"]), twins.STEPS, 1.0)
+    settings = contract["animals"][0]["behavior"]["sampling"]
+    sampling = PlanSamplingConfig(
+        settings["method"], max(twins.STEPS, settings["goal_steps"]), twins.STEPS, 1.0
+    )
     ats = Ats.load(cat / "behavior", Scenes.load(cat / "behavior_data", ("any",)), sampling)
     eyes_m = contract["scene"]["floor_m"] + contract["observer"]["eye_height_m"]
     eyes = np.stack([met.far[..., 0], np.full(met.far.shape[:2], eyes_m), met.far[..., 1]], -1)
@@ -98,7 +100,7 @@ def _check_goals(page: Page, home: Path, cat: Path) -> None:
     assert (away_m > 0.1).mean() > 0.4, "it flees from whom it perceives"
 
 
-def test_one_is_selected_switched_off_or_replayed(home: Path, animals: Path, chromium: Browser) -> None:
+def test_animals_are_selected_removed_and_replayed(home: Path, animals: Path, chromium: Browser) -> None:
     with browser.shown(chromium, (home / "index.html").as_uri(), size=(1100, 760)) as (page, wrong):
         page.wait_for_function(ALL_PLAN, timeout=60_000)
         gaps = []

@@ -1,4 +1,4 @@
-"""Furniture is dragged on the page: it stands elsewhere, and nobody walks through it."""
+"""Furniture is dragged on the page, and animal and person avoid its new position."""
 
 import shutil
 from pathlib import Path
@@ -30,7 +30,7 @@ def furnished(simulator: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     return small_world.exported(build, build / "simulator") / "index.html"
 
 
-def test_it_is_dragged_undone_and_refused(furnished: Path, chromium: Browser) -> None:
+def test_furniture_is_dragged_undone_and_refused(furnished: Path, chromium: Browser) -> None:
     with browser.shown(chromium, furnished.as_uri(), size=(900, 760)) as (page, wrong):
         page.evaluate("ats.pause(); ats.moveObserver([-1.7, -1.7])")
         before = page.evaluate("ats.furniture()")
@@ -69,7 +69,7 @@ def _dragged(page: Page, by: list[int]) -> None:
 
 
 def _check_it_has_moved(before: Any, after: Any, by: list[int]) -> None:
-    """The occupancy is the old one with the box's voxels shifted; triangles were parted, none lost."""
+    """The occupancy is shifted with the voxels of the box; triangles are split without loss."""
     old, new = (np.reshape(state["occupancy"], SHAPE) == 1 for state in (before, after))
     box = np.zeros(SHAPE, bool)
     box[19:25, 2:10, 20:24] = True
@@ -92,7 +92,7 @@ def _check_the_link(page: Page, after: Any) -> None:
 
 
 def _check_refusals(page: Page, before: Any) -> None:
-    """A wall is not taken up; onto a wall, or onto the animal, nothing is set down."""
+    """Walls cannot be picked up; nothing can be placed on a wall or the animal."""
     page.keyboard.press("m")
     page.mouse.click(*page.evaluate("ats.screen([-1.99, 1.2, -0.8])"))
     assert "wall" in page.inner_text("#help")
@@ -111,7 +111,7 @@ def _check_refusals(page: Page, before: Any) -> None:
     assert page.evaluate("ats.furniture()") == before
 
 
-def test_the_animal_and_the_person_go_around_it(furnished: Path, chromium: Browser) -> None:
+def test_animal_and_person_walk_around_moved_furniture(furnished: Path, chromium: Browser) -> None:
     with browser.shown(chromium, furnished.as_uri(), size=(900, 760)) as (page, wrong):
         page.evaluate("ats.pause(); ats.moveObserver([-1.7, -1.7])")
         here = np.array(page.evaluate("ats.state().animal"))[[0, 2]]
@@ -134,7 +134,7 @@ def test_the_animal_and_the_person_go_around_it(furnished: Path, chromium: Brows
 
 
 def _towards_the_free_side(here: np.ndarray) -> np.ndarray:
-    """Return a step of 1.1 m along the room's wall, for an animal that walks 1.2 m from the middle."""
+    """Return a step of 1.1 m along the wall, for an animal that walks 1.2 m from the centre."""
     aside = np.array([-here[1], here[0]]) - 0.55 * here
     return 1.1 * aside / np.linalg.norm(aside)
 
@@ -171,7 +171,7 @@ def _check_it_walks_around(page: Page, stands: np.ndarray, goal: np.ndarray) -> 
 
 
 def _check_the_person_does(page: Page, by: list[int]) -> None:
-    """Pulled towards the other side of the box, the person stays on this one, or passes beside it."""
+    """Pulled to the other side of the box, the person stays on this side or walks around."""
     middle = VOXEL_M * np.array(by)
     from_here = middle - np.array([0.8, 0])
     page.keyboard.press("m")
@@ -189,7 +189,7 @@ def _check_the_person_does(page: Page, by: list[int]) -> None:
     assert np.linalg.norm(place - from_here) > 0.2, "metres: it came as far as the box"
 
 
-def test_a_finger_drags_it(furnished: Path, chromium: Browser) -> None:
+def test_furniture_is_dragged_by_touch(furnished: Path, chromium: Browser) -> None:
     size = (390, 844)
     with browser.shown(chromium, furnished.as_uri(), size=size, has_touch=True, is_mobile=True) as (
         page,
@@ -208,7 +208,7 @@ def test_a_finger_drags_it(furnished: Path, chromium: Browser) -> None:
         assert wrong == []
 
 
-def test_all_animals_of_a_home_have_it(tmp_path: Path, chromium: Browser) -> None:
+def test_moved_furniture_applies_to_all_animals(tmp_path: Path, chromium: Browser) -> None:
     small_world.write_home(tmp_path)
     for name in ("cat", "dog"):
         small_world.furnish(tmp_path / name)

@@ -1,6 +1,4 @@
-"""The page in headless Chromium, from a file: it lives, asks nobody, samples as Python does, and
-obeys hands.
-"""
+"""The page in headless Chromium from a file: it runs offline, samples like Python, and reacts to input."""
 
 import base64
 import functools
@@ -62,7 +60,7 @@ SEES_ALL = (
 )
 
 
-def test_page_lives_and_minds_the_observer(simulator: Path, chromium: Browser) -> None:
+def test_page_runs_and_animal_reacts_to_the_observer(simulator: Path, chromium: Browser) -> None:
     golden = json.loads((simulator.parent / "golden.json").read_bytes())
     with browser.shown(chromium, (simulator / "index.html").as_uri()) as (page, wrong):
         before = page.evaluate("ats.state()")
@@ -83,7 +81,7 @@ def test_page_lives_and_minds_the_observer(simulator: Path, chromium: Browser) -
         assert wrong == []
 
 
-def test_goals_and_paths_are_obeyed_and_takes_are_kept(
+def test_goals_and_paths_are_followed_and_takes_are_saved(
     simulator: Path, chromium: Browser, tmp_path: Path
 ) -> None:
     with browser.shown(
@@ -99,10 +97,8 @@ def test_goals_and_paths_are_obeyed_and_takes_are_kept(
         assert wrong == []
 
 
-def test_the_animal_walks_around_a_person_in_its_way(simulator: Path, chromium: Browser) -> None:
-    """Goals to and fro beyond a person who stands still: it may have to wait, but it arrives at each, and
-    never comes nearer than bodies allow.
-    """
+def test_animal_walks_around_a_standing_person(simulator: Path, chromium: Browser) -> None:
+    """Goals alternate on both sides of a standing person; each is reached without violating the clearance."""
     person, goals = [0.1, 0.1], [[-0.5, -0.4], [0.6, 0.5], [-0.4, 0.6], [0.6, -0.4]]
     with browser.shown(chromium, (simulator / "index.html").as_uri()) as (page, wrong):
         page.evaluate("place => ats.moveObserver(place)", person)
@@ -139,7 +135,7 @@ def _check_reaction(page: Page) -> None:
     page.click("#panel-toggle")
     page.locator("#interactivity").press("Home")
     assert page.inner_text("#interactivity-value") == "0.00"
-    assert np.abs(reaction.goals(page, near) - far).max() < 1e-5, "nor does one it is told to ignore"
+    assert np.abs(reaction.goals(page, near) - far).max() < 1e-5, "nor does one it is instructed to ignore"
     page.locator("#interactivity").press("End")
     page.locator("[data-sense=observer]").locator("xpath=..").click()
     assert "observer=0" in page.evaluate("location.hash")
@@ -150,13 +146,11 @@ def _check_reaction(page: Page) -> None:
 
 
 def _check_it_reacts_as_python_does(page: Page, build: Path) -> None:
-    """Of 200 approaches as many drive goals away as in Python, with the same noise; the goals themselves
-    agree as well.
-    """
+    """The same fraction of 200 approaches shifts goals away as in Python, and goals agree."""
     met = twins.approaches(BehaviorData.load(build / "behavior_data"), 200, np.random.default_rng(0))
     here, there = (
-        twins.asked_of_the_page(page, met, 5),
-        twins.asked_of_python(build, build / "simulator", met, 5),
+        twins.goals_of_page(page, met, 5),
+        twins.goals_of_python(build, build / "simulator", met, 5),
     )
     assert 0.6 < there.rate(met.side) < 0.85, (
         "goals shift away from whoever is nearer than 1.8 m, which are 70 %"
@@ -167,7 +161,9 @@ def _check_it_reacts_as_python_does(page: Page, build: Path) -> None:
     assert np.median(np.abs(here.near - there.near)) < 1e-3, "metres"
     for answers in (here, there):
         assert np.abs(answers.opposite - answers.far[:5]).max() < 1e-5, "a far observer does not matter"
-        assert np.abs(answers.ignored - answers.far[:5]).max() < 1e-5, "nor does one it is told to ignore"
+        assert np.abs(answers.ignored - answers.far[:5]).max() < 1e-5, (
+            "nor does one it is instructed to ignore"
+        )
 
 
 def _check_the_person_is_carried(page: Page) -> None:
@@ -188,7 +184,7 @@ def _check_the_person_is_carried(page: Page) -> None:
 
 
 def _check_a_clicked_goal(page: Page) -> None:
-    """The animal comes to where the floor is clicked, then is free again."""
+    """The animal reaches the clicked position and is then free again."""
     goal = np.array([-0.6, -0.5])
     page.mouse.click(*page.evaluate("ats.screen([-0.6, 0, -0.5])"))
     assert np.allclose(page.evaluate("ats.state().aim"), goal, atol=0.05), "metres"
@@ -200,7 +196,7 @@ def _check_a_clicked_goal(page: Page) -> None:
 
 
 def _check_goals_in_turn(page: Page, folder: Path) -> None:
-    """Goals clicked one after the other are kept in the address and as a file, and visited in this order."""
+    """Several clicked goals are saved in the address and as a file, and visited in order."""
     goals = np.array([[0.6, -0.4], [0.5, 0.6], [-0.4, 0.5]])
     page.click("#pins")
     for x, z in goals[:2]:
@@ -226,8 +222,8 @@ def _check_goals_in_turn(page: Page, folder: Path) -> None:
 
 
 def _place_when_stops_are(page: Page, left: int) -> np.ndarray:
-    """The animal's [x, z] in metres at the moment when so many stops are left: asked in one call, since a
-    loaded machine may answer a second one a metre later.
+    """Return [x, z] in metres at the moment with a given number of remaining stops, in a single call of the
+    page.
     """
     state = page.wait_for_function(
         "left => { const { stops, animal } = ats.state(); return stops.length === left && animal; }",
@@ -238,7 +234,7 @@ def _place_when_stops_are(page: Page, left: int) -> np.ndarray:
 
 
 def _check_a_goal_in_a_cupboard(page: Page) -> None:
-    """Where the animal cannot be it gets as near as it can, and goes on to the next goal."""
+    """For an unreachable goal the animal stops as near as possible and continues with the next one."""
     page.evaluate("ats.visit([[1.8, -1.8], [0.3, -0.2]])")
     place = _place_when_stops_are(page, 1)
     assert np.linalg.norm(place - [1.8, -1.8]) < 1.0, "metres: beside the cupboard, which is 0.7 m wide"
@@ -246,7 +242,7 @@ def _check_a_goal_in_a_cupboard(page: Page) -> None:
 
 
 def _check_a_drawn_path(page: Page) -> None:
-    """A stroke of the pen over the floor is walked within 0.1 m, to its end."""
+    """A drawn path is followed within 0.1 m to its end."""
     angle = np.linspace(np.pi, 0.2, 12)
     stroke = np.stack([0.1 + 0.7 * np.cos(angle), 0 * angle, 0.1 + 0.7 * np.sin(angle)], -1)
     page.click("#pen")
@@ -260,7 +256,7 @@ def _check_a_drawn_path(page: Page) -> None:
     assert np.linalg.norm(route[-1] - stroke[-1, [0, 2]]) < 0.1, (
         "metres: the route ends where the stroke does"
     )
-    page.wait_for_timeout(500)  # until the last plan has faded
+    page.wait_for_timeout(500)  # until the last plan has faded out
     aside, ends = [], []
     while page.evaluate("ats.state().route !== null"):
         place = np.array(page.evaluate("ats.state().animal"))[[0, 2]]
@@ -272,7 +268,7 @@ def _check_a_drawn_path(page: Page) -> None:
 
 
 def _check_downloads(page: Page, folder: Path) -> None:
-    """Table and model tell the same take; the model opens elsewhere."""
+    """Table and model contain the same take."""
     page.evaluate("ats.pause()")
     for kind in ("csv", "glb"):
         with page.expect_download() as download:
@@ -292,7 +288,7 @@ def _check_downloads(page: Page, folder: Path) -> None:
 
 
 def _check_a_clip_beside(page: Page) -> None:
-    """A recorded session plays beside the simulated one, which begins where it begins."""
+    """A recorded session is played beside the simulation, from the same start."""
     page.select_option("#replay", "v002")
     page.wait_for_function("ats.state().replay && ats.state().tick > 4", timeout=20_000)
     state = page.evaluate("ats.state()")
@@ -302,9 +298,7 @@ def _check_a_clip_beside(page: Page) -> None:
 
 
 def _check_an_opened_take(page: Page, folder: Path) -> None:
-    """A take of `stages.simulate` at 30 Hz, chosen or dropped, plays beside; that of another body is refused
-    in words.
-    """
+    """A 30 Hz take of `stages.simulate` is opened or dropped and played; that of another body is refused."""
     time_s = np.arange(181) / 30
     place = np.stack([0.5 * np.cos(time_s), np.full(181, 0.1), 0.5 * np.sin(time_s)], -1)
     motion = {
@@ -333,7 +327,7 @@ def _check_it_plays(page: Page, name: str, place: np.ndarray) -> None:
     np.testing.assert_allclose(replay["place"], place[3 * (replay["tick"] % 61)], atol=1e-5)  # metres
 
 
-def test_keys_stay_alive_while_the_panel_is_used(simulator: Path, chromium: Browser) -> None:
+def test_keys_work_while_the_panel_has_focus(simulator: Path, chromium: Browser) -> None:
     with browser.shown(chromium, (simulator / "index.html").as_uri(), size=(900, 760)) as (page, wrong):
         page.locator("#interactivity").press("ArrowLeft")
         assert page.input_value("#interactivity") == "1.2", "arrows are the slider's"
@@ -379,10 +373,8 @@ def _check_nobody_walks(page: Page) -> None:
     assert page.evaluate("ats.state().observer") == before["observer"]
 
 
-def test_who_walks_is_never_told_as_running(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
-    """Not before the first plan, nor in slow motion: nobody takes steps of more than 0.11 m in 0.1 s of the
-    animal's time.
-    """
+def test_walking_speed_is_limited(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
+    """Before the first plan and in slow motion too: no step exceeds 0.11 m per 0.1 s of simulated time."""
     address = (simulator / "index.html").as_uri() + "#speed=0.3&at=1.2,1.2"
     with browser.shown(chromium, address, script=WALKS_WHILE_THE_FIRST_PLAN_IS_AWAITED) as (page, wrong):
         assert np.linalg.norm(np.subtract(page.evaluate("ats.state().observer"), 1.2)) > 0.3, (
@@ -401,8 +393,8 @@ def test_who_walks_is_never_told_as_running(simulator: Path, chromium: Browser, 
         assert wrong == []
 
 
-def test_the_first_look_shows_the_animal(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
-    """A box stands between it and the corner that the room is looked into from otherwise."""
+def test_initial_view_shows_the_animal(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
+    """A box occludes the animal from the default viewpoint."""
     with browser.shown(chromium, (simulator / "index.html").as_uri()) as (page, _):
         page.evaluate("ats.pause(); ats.reset()")
         eye, animal = (np.array(page.evaluate(f"ats.state().{what}")[:3]) for what in ("eye", "animal"))
@@ -421,8 +413,8 @@ def test_the_first_look_shows_the_animal(simulator: Path, chromium: Browser, tmp
         assert wrong == []
 
 
-def test_a_hidden_animal_is_outlined(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
-    """A lid over it hides it from wherever one looks down."""
+def test_occluded_animal_is_outlined(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
+    """A lid above the animal occludes it from all views from above."""
     with browser.shown(chromium, (simulator / "index.html").as_uri()) as (page, _):
         page.evaluate("ats.pause(); ats.reset()")
         x, y, z = page.evaluate("ats.state().animal")[:3]
@@ -436,7 +428,7 @@ def test_a_hidden_animal_is_outlined(simulator: Path, chromium: Browser, tmp_pat
 
 
 def _exported_with(thing: trimesh.Trimesh, folder: Path) -> Path:
-    """Export the small world with one more thing in its mesh."""
+    """Export the small world with an additional mesh."""
     small_world.write(folder)
     scene = ply.read_ply(folder / "reconstruction/scene.ply")
     vertices, faces = (
@@ -473,7 +465,7 @@ def test_hash_keeps_a_setting_on_a_phone(simulator: Path, chromium: Browser) -> 
 
 
 def _check_a_followed_link(page: Page) -> None:
-    """A link that is followed in an open page does what it does in a new one."""
+    """A link that is followed in an open page has the same effect as in a new one."""
     page.evaluate("location.hash = '#replay=v002&view=animal&speed=0&samples=1'")
     page.wait_for_function("ats.state().replay?.name === 'v002'", timeout=10_000)
     state = page.evaluate("ats.state()")
@@ -489,13 +481,15 @@ def _check_a_followed_link(page: Page) -> None:
         ("HTMLCanvasElement.prototype.getContext = () => null", "WebGL"),
     ],
 )
-def test_a_page_that_cannot_live_says_so(simulator: Path, chromium: Browser, script: str, word: str) -> None:
+def test_missing_capabilities_are_reported(
+    simulator: Path, chromium: Browser, script: str, word: str
+) -> None:
     with browser.shown(chromium, (simulator / "index.html").as_uri(), script=script) as (page, wrong):
         assert word in page.inner_text("#splash")
         assert wrong == []
 
 
-def test_a_plan_that_fails_is_asked_for_again(simulator: Path, chromium: Browser) -> None:
+def test_failed_plan_is_retried(simulator: Path, chromium: Browser) -> None:
     with browser.shown(chromium, (simulator / "index.html").as_uri(), script=SPOILS_THE_FIRST_PLAN) as (
         page,
         wrong,
@@ -504,7 +498,7 @@ def test_a_plan_that_fails_is_asked_for_again(simulator: Path, chromium: Browser
         assert wrong == []
 
 
-def test_folder_variant_lives_on_a_static_host(simulator: Path, chromium: Browser) -> None:
+def test_folder_variant_runs_on_a_static_host(simulator: Path, chromium: Browser) -> None:
     folder = simulator.parent / "light"
     assert (folder / "index.html").stat().st_size < 5e6 < (simulator / "index.html").stat().st_size
 
@@ -513,9 +507,7 @@ def test_folder_variant_lives_on_a_static_host(simulator: Path, chromium: Browse
         assert [line for line in wrong if "favicon" not in line] == []
 
 
-def test_splats_that_cannot_be_read_leave_the_mesh(
-    simulator: Path, chromium: Browser, tmp_path: Path
-) -> None:
+def test_unreadable_splats_fall_back_to_the_mesh(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
     folder = shutil.copytree(simulator.parent / "light", tmp_path / "light")
     (folder / "assets/splats.gz").write_bytes(b"no splats")
     with served(folder) as address, browser.shown(chromium, f"{address}?splats") as (page, wrong):
@@ -526,13 +518,11 @@ def test_splats_that_cannot_be_read_leave_the_mesh(
         assert [line for line in wrong if "favicon" not in line] == []
 
 
-def test_a_hall_is_framed_as_a_room_is_and_seen_whole_from_afar(
-    simulator: Path, chromium: Browser, tmp_path: Path
-) -> None:
+def test_large_hall_is_framed_like_a_room(simulator: Path, chromium: Browser, tmp_path: Path) -> None:
     folder = shutil.copytree(simulator.parent / "light", tmp_path / "light")
-    told = json.loads(gzip.decompress((folder / "assets/simulator.gz").read_bytes()))
-    told["scene"]["bounds_m"] = (np.array(told["scene"]["bounds_m"]) * [4, 1, 4]).tolist()
-    (folder / "assets/simulator.gz").write_bytes(gzip.compress(json.dumps(told).encode()))
+    model = json.loads(gzip.decompress((folder / "assets/simulator.gz").read_bytes()))
+    model["scene"]["bounds_m"] = (np.array(model["scene"]["bounds_m"]) * [4, 1, 4]).tolist()
+    (folder / "assets/simulator.gz").write_bytes(gzip.compress(json.dumps(model).encode()))
     size, half = (390, 780), 4 * small_world.HALF_ROOM_M
     with served(folder) as address, browser.shown(chromium, address, size=size) as (page, _):
         near, far = (np.array(page.evaluate("p => ats.screen(p)", [0, 0, side * half])) for side in (1, -1))
@@ -544,7 +534,7 @@ def test_a_hall_is_framed_as_a_room_is_and_seen_whole_from_afar(
 
 @contextmanager
 def served(folder: Path) -> Iterator[str]:
-    """Yield the address of a folder's page on a static host."""
+    """Serve a folder like a static host; yield the address of its page."""
 
     class Quiet(http.server.SimpleHTTPRequestHandler):
         def log_message(self, *_: object) -> None: ...

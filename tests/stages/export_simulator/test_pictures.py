@@ -1,11 +1,11 @@
-"""Heat maps in space: what a wall hides is not drawn, what stands free is."""
+"""Heat maps in space are occluded by walls."""
 
 import numpy as np
 
 from stages.export_simulator.pictures import _splatted
 
 
-def test_surfaces_hide_what_is_behind_them():
+def test_heat_is_occluded_by_surfaces():
     lens = np.array([[100.0, 0, 32], [0, 100.0, 24], [0, 0, 1]])
     behind = np.full((48, 64), np.inf)
     behind[:, :32] = 1.5

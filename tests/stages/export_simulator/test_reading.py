@@ -1,4 +1,4 @@
-"""What the page cannot sample is refused before it is built."""
+"""Models that the page cannot sample are refused before export."""
 
 import json
 from dataclasses import asdict
@@ -13,7 +13,7 @@ from stages.export_simulator import reading
 
 
 @pytest.mark.parametrize("variant", [{"family": "gaussian"}, {"family": "one_stage"}, {"ego": "world"}])
-def test_variants_that_the_page_does_not_know_are_refused(tmp_path: Path, variant: dict[str, str]) -> None:
+def test_unsupported_model_variants_are_refused(tmp_path: Path, variant: dict[str, str]) -> None:
     (tmp_path / "behavior.json").write_text(
         json.dumps({"architecture": asdict(Architecture(bones=3, **variant))})
     )

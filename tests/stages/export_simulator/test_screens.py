@@ -1,4 +1,4 @@
-"""The page on screens and in hands of all kinds: small windows, fingers, screen readers, headsets."""
+"""The page on small windows, touch screens, screen readers and headsets."""
 
 import itertools
 from pathlib import Path
@@ -33,8 +33,8 @@ NAMELESS = """[...document.querySelectorAll('button, input, select, canvas, [rol
 HEADSET = Path(__file__).with_name("headset.js").read_text()
 
 
-def test_nothing_covers_anything(simulator: Path, chromium: Browser) -> None:
-    """In windows of many sizes, with the panel folded and open, nothing overlaps and nothing is cut off."""
+def test_controls_do_not_overlap(simulator: Path, chromium: Browser) -> None:
+    """With the panel open and closed, at many window sizes, controls neither overlap nor are cut off."""
     with browser.shown(chromium, (simulator / "index.html").as_uri(), size=(1280, 720)) as (page, _):
         page.evaluate("ats.pause(); ats.visit([[0, 0]])")
         page.evaluate("for (const id of ['undo', 'restore']) document.getElementById(id).hidden = false")
@@ -50,7 +50,7 @@ def test_nothing_covers_anything(simulator: Path, chromium: Browser) -> None:
                 assert _apart(boxes[first], boxes[second]), (width, height, folded, first, second)
 
 
-def test_a_goal_does_not_move_the_buttons_of_a_usual_window(simulator: Path, chromium: Browser) -> None:
+def test_goal_does_not_move_the_buttons(simulator: Path, chromium: Browser) -> None:
     with browser.shown(chromium, (simulator / "index.html").as_uri(), size=(1280, 720)) as (page, _):
         page.evaluate("ats.pause()")
         heights = []
@@ -72,10 +72,8 @@ def _apart(a: Any, b: Any) -> bool:
     return beside or a["y"] + a["height"] <= b["y"] or b["y"] + b["height"] <= a["y"]
 
 
-def test_small_windows_begin_with_a_folded_panel_and_fingers_move_the_view(
-    simulator: Path, chromium: Browser
-) -> None:
-    """One finger turns the view, two move it, a tap sets a goal; the help is that for fingers."""
+def test_small_windows_have_a_closed_panel_and_touch_input(simulator: Path, chromium: Browser) -> None:
+    """One finger rotates the view, two pan it, a tap sets a goal; the help describes touch input."""
     address = (simulator / "index.html").as_uri()
     with browser.shown(chromium, address, size=(390, 844), has_touch=True, is_mobile=True) as (page, wrong):
         assert not page.is_visible("#panel-body")
@@ -103,7 +101,7 @@ def test_small_windows_begin_with_a_folded_panel_and_fingers_move_the_view(
 
 
 def _dragged(touch: CDPSession, fingers: list[np.ndarray], way: list[float]) -> None:
-    """Put fingers down at places, pixels, move them together by a way and lift them."""
+    """Touch at positions (pixels), move by a displacement, and release."""
     for share in np.linspace(0, 1, 6):
         points = [
             {"x": float(x), "y": float(y), "id": i}
@@ -115,7 +113,7 @@ def _dragged(touch: CDPSession, fingers: list[np.ndarray], way: list[float]) -> 
 
 
 def _at_rest(page: Page) -> np.ndarray:
-    """Return eye and target, metres, when the view has come to rest."""
+    """Return eye and target in metres once the view has settled."""
     page.wait_for_function(
         """() => {
           const [now, before] = [ats.state().eye, window.eyeBefore];
@@ -128,8 +126,8 @@ def _at_rest(page: Page) -> np.ndarray:
     return np.array([page.evaluate("ats.state().eye"), page.evaluate("ats.target()")])
 
 
-def test_whoever_hears_the_page_is_told(simulator: Path, chromium: Browser) -> None:
-    """Everything has a name; where the animal is, and that it has arrived, is said."""
+def test_page_is_accessible_to_screen_readers(simulator: Path, chromium: Browser) -> None:
+    """Controls have names; position and arrival of the animal are announced."""
     with browser.shown(chromium, (simulator / "index.html").as_uri()) as (page, wrong):
         assert page.evaluate(NAMELESS) == []
         page.locator("#view").press("l")
@@ -145,8 +143,8 @@ def test_whoever_hears_the_page_is_told(simulator: Path, chromium: Browser) -> N
         assert wrong == []
 
 
-def test_a_visitor_with_a_headset_stands_in_the_room(simulator: Path, chromium: Browser) -> None:
-    """The head is the person, a stick walks, a hand points at goals; afterwards the view is as before."""
+def test_headset_controls_the_person(simulator: Path, chromium: Browser) -> None:
+    """The head is the person, a stick walks, a controller sets goals; the view is restored afterwards."""
     address = (simulator / "index.html").as_uri()
     with browser.shown(chromium, address, script=HEADSET) as (page, wrong):
         before = page.evaluate("ats.state()")

@@ -1,4 +1,4 @@
-"""The page puts paths on what carries the animal, and where it may be, exactly as Python does."""
+"""The page projects paths to the support and to free space exactly as Python does."""
 
 import json
 import shutil
@@ -29,20 +29,20 @@ Support(volume, allowed) }); const told = paths.map((path) => %(answer)s); conso
 needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 
 
-def asked_of_node(script: str, **asked: object) -> np.ndarray:
-    """Return what a script answers to what stands on its standard input."""
+def run_node(script: str, **asked: object) -> np.ndarray:
+    """Return the output of a script for an input on stdin."""
     node = ["node", "--no-warnings", "--input-type=module", "-e", script]
     answer = subprocess.run(node, input=json.dumps(asked), capture_output=True, text=True, check=True)
     return np.array(json.loads(answer.stdout))
 
 
-def asked_of_the_page(answer: str, **asked: object) -> np.ndarray:
-    """Return what the page's senses make of paths."""
-    return asked_of_node(ASK % {"sources": SOURCES, "answer": answer}, **asked)
+def page_answers(answer: str, **asked: object) -> np.ndarray:
+    """Return paths as projected by the page."""
+    return run_node(ASK % {"sources": SOURCES, "answer": answer}, **asked)
 
 
 @needs_node
-def test_page_and_python_tread_the_same_way():
+def test_page_and_python_place_paths_on_the_same_support():
     rng = np.random.default_rng(0)
     occupancy = (rng.random((12, 8, 12)) < 0.2).astype(np.uint8)
     occupancy[:, 0] = 1
@@ -60,7 +60,7 @@ def test_page_and_python_tread_the_same_way():
         "voxel_m": 0.1,
         "support": support_contract(range_m),
     }
-    theirs = asked_of_the_page(
+    theirs = page_answers(
         "senses.support.follow(path.slice(1), path[0], fastest)",
         volume=volume,
         marks=marks.ravel().tolist(),
@@ -73,7 +73,7 @@ def test_page_and_python_tread_the_same_way():
 
 @needs_node
 @pytest.mark.parametrize("free", [0.02, 0.5, 0.0])
-def test_page_and_python_clear_the_same_points(free):
+def test_page_and_python_project_points_to_the_same_free_space(free):
     rng = np.random.default_rng(1)
     allowed = rng.random((12, 7, 9)) < free
     scene = FeatureVolume(
@@ -85,7 +85,7 @@ def test_page_and_python_clear_the_same_points(free):
     points = scene.origin + rng.uniform(-0.2, 1.4, (30, 5, 3))
     ours = Scenes((scene,), (allowed,), np.zeros(1, int)).out_of_solid(points, None)
     volume = {"shape": [1, *allowed.shape], "origin": scene.origin.tolist(), "voxel_m": 0.1}
-    theirs = asked_of_the_page(
+    theirs = page_answers(
         "path.map((point) => senses.cleared(point))",
         volume=volume,
         marks=allowed.ravel().astype(int).tolist(),
@@ -104,7 +104,7 @@ def test_page_and_python_clear_the_same_points(free):
 
 
 @needs_node
-def test_page_and_python_turn_the_same_goals_out_of_solid():
+def test_page_and_python_rotate_the_same_goals_to_free_space():
     rng = np.random.default_rng(2)
     allowed = rng.random((30, 5, 30)) < 0.3
     occupancy, origin = (~allowed).astype(np.uint8), np.array([-1.5, 0, -1.5])
@@ -113,7 +113,7 @@ def test_page_and_python_turn_the_same_goals_out_of_solid():
     goals = rng.uniform([-1.5, 0, -1.5], [1.5, 0.5, 1.5], (60, 3))
     scenes = Scenes((scene,), (allowed,), np.zeros(1, int))
     ours = SceneConstraint(scenes, np.tile(np.eye(4), (60, 1, 1)), None).goals_on_support(goals, start)
-    theirs = asked_of_the_page(
+    theirs = page_answers(
         "senses.turnedFree(path[0], path[1])",
         volume={"shape": [1, *occupancy.shape], "origin": origin.tolist(), "voxel_m": 0.1},
         marks=allowed.ravel().astype(int).tolist(),

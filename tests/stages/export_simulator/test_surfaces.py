@@ -1,4 +1,4 @@
-"""Light surfaces keep what matters; motion resampled at its own times stays itself."""
+"""Simplified surfaces keep their shape; resampled motion passes through its frames."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from stages.export_simulator import actions, surfaces
 from tests.stages.export_simulator import small_world
 
 
-def test_thinning_keeps_the_shape() -> None:
+def test_simplification_keeps_the_shape() -> None:
     room = small_world.room()
     light, nearest = decimate(room, 200)
     assert len(light.faces) <= 220
@@ -36,7 +36,7 @@ def test_floor_is_found_under_furniture(height_m: float) -> None:
     assert abs(found - height_m) < 0.01, "metres"
 
 
-def test_walls_face_whoever_stands_inside() -> None:
+def test_walls_face_inwards() -> None:
     room = small_world.room()
     inside_out = Mesh(room.vertices, np.ascontiguousarray(room.faces[:, ::-1]), room.color)
     for mesh in (room, inside_out):
@@ -45,7 +45,7 @@ def test_walls_face_whoever_stands_inside() -> None:
         assert ((turned.face_normals() * towards).sum(-1) > 0).all()
 
 
-def test_splats_keep_the_strong_and_drop_the_broken() -> None:
+def test_strong_splats_are_kept_and_invalid_ones_dropped() -> None:
     rows = np.zeros((4, 62), np.float32)
     rows[:, 54] = [4, -20, 2, 4]
     rows[:, 55:58] = -3

@@ -1,4 +1,4 @@
-"""A page of another home shows that home, begins from the take in it, and says how strange it is."""
+"""The page for another home shows that home, starts from the take in it, and reports how unfamiliar it is."""
 
 import json
 from pathlib import Path
@@ -29,14 +29,14 @@ def take(folder: Path, frames: int = 20) -> Path:
 
 
 def home(folder: Path) -> Path:
-    """Write the files of which a home consists, without content."""
+    """Write the files of a home without content."""
     for name in ("reconstruction", "splats"):
         (folder / name).mkdir(parents=True)
         (folder / name / "scene.ply").touch()
     return folder
 
 
-def test_a_take_in_another_home_becomes_its_motion(tmp_path: Path) -> None:
+def test_take_in_another_home_is_the_motion_of_the_page(tmp_path: Path) -> None:
     place = surroundings.elsewhere(home(tmp_path / "other"), take(tmp_path / "take"), "luna")
     assert place.surface == tmp_path / "other/reconstruction/scene.ply"
     assert place.volume == tmp_path / "take/volume.npz"
@@ -48,7 +48,7 @@ def test_a_take_in_another_home_becomes_its_motion(tmp_path: Path) -> None:
     assert place.labels == {clip.name: "a take in the home of other"}
 
 
-def test_what_is_missing_is_named(tmp_path: Path) -> None:
+def test_missing_files_are_named(tmp_path: Path) -> None:
     made = take(tmp_path / "take")
     with pytest.raises(InputError, match="ART-003.*reconstruction"):
         surroundings.elsewhere(tmp_path, made, "luna")

@@ -1,8 +1,6 @@
-"""The same approaches, met by the page and by Python: twins of recorded moments, with the same noise for both
-samplers.
-
-`approaches` scripts them, `asked_of_the_page` and `asked_of_python` sample a goal for each, `Answers.away_m`
-says how far it shifts away from who comes near.
+"""The same approaches sampled by the page and by Python, with the same noise. `approaches` scripts them from
+recorded moments, `goals_of_page` and `goals_of_python` sample a goal for each, `Answers.away_m` is its shift
+away from the approaching observer.
 """
 
 import json
@@ -31,14 +29,14 @@ ASK = """async (text) => {
 
 @dataclass(frozen=True)
 class Approaches:
-    """Recorded moments, and where the observer of each has been in the last 0.8 s: near, far, or far on the
-    other side.
+    """Recorded moments with observer tracks of the last 0.8 s: near, distant, or distant on the opposite
+    side.
     """
 
     context: Context
-    """its observers are nobody's"""
+    """its own observers are not used"""
     side: Float[np.ndarray, "plan 2"]
-    """from the animal to the observer, over the floor"""
+    """from the animal to the observer, on the floor"""
     near: Float[np.ndarray, "plan 8 2"]
     far: Float[np.ndarray, "plan 8 2"]
     opposite: Float[np.ndarray, "plan 8 2"]
@@ -47,7 +45,7 @@ class Approaches:
 
 @dataclass(frozen=True)
 class Answers:
-    """Goals of the same plans, metres over the floor, by where the observer is; and with interactivity 0."""
+    """Goals of the same plans, metres on the floor, per position of the observer; and with interactivity 0."""
 
     near: Float[np.ndarray, "plan 2"]
     far: Float[np.ndarray, "plan 2"]
@@ -55,22 +53,22 @@ class Answers:
     ignored: Float[np.ndarray, "plan 2"]
 
     def away_m(self, side: Float[np.ndarray, "plan 2"]) -> Float[np.ndarray, "plan"]:
-        """Return how far each goal shifts away from the observer that comes near."""
+        """Return the shift of each goal away from the near observer."""
         return -((self.near - self.far) * side).sum(-1)
 
     def rate(self, side: Float[np.ndarray, "plan 2"], further_m: float = 0.1) -> float:
-        """Return the share of plans whose goal shifts away, further than this."""
+        """Return the fraction of plans whose goals shift away by more than this."""
         return float((self.away_m(side) > further_m).mean())
 
 
 class PageNoise:
-    """The page's generator, one stream per plan: mulberry32 and Box-Muller (`noise.js`)."""
+    """The random generator of the page, one stream per plan: mulberry32 and Box-Muller (`noise.js`)."""
 
     def __init__(self, seeds: Int[np.ndarray, "plan"]):
         self.streams = [_uniforms(int(seed)) for seed in seeds]
 
     def standard_normal(self, shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
-        """Draw for every plan, which is the first axis, what the page would draw."""
+        """Draw the samples of the page for every plan (first axis)."""
         count = 2 * int(np.prod(shape[1:]))
         draws = np.array([[next(stream) for _ in range(count)] for stream in self.streams]).reshape(
             len(self.streams), -1, 2
@@ -92,7 +90,7 @@ def _uniforms(seed: int) -> Iterator[float]:
 
 
 def approaches(data: BehaviorData, count: int, rng: np.random.Generator) -> Approaches:
-    """Let somebody walk straight at the animal in random recorded moments, ending 0.4 to 2.4 m away, at 0.3
+    """Script straight approaches to the animal from random recorded moments, ending at 0.4 to 2.4 m, at 0.3
     to 1.2 m/s.
     """
     moments = [
@@ -119,15 +117,15 @@ def approaches(data: BehaviorData, count: int, rng: np.random.Generator) -> Appr
     )
 
 
-def asked_of_the_page(page: Page, met: Approaches, checks: int) -> Answers:
-    """Sample in an open page; the last two for the first ``checks`` plans only."""
+def goals_of_page(page: Page, met: Approaches, checks: int) -> Answers:
+    """Sample goals in an open page; the last two only for the first ``checks`` plans."""
     past = np.concatenate(
         [rows(met.context.world_from_agent[:, :, None]), rows(met.context.agent_from_bone)], axis=2
     )
     past = past.reshape(*past.shape[:2], -1)
 
     def goals(observer: np.ndarray, **more: object) -> np.ndarray:
-        told = [
+        questions = [
             {
                 "past": rows.tolist(),
                 "observer": places.tolist(),
@@ -141,7 +139,7 @@ def asked_of_the_page(page: Page, met: Approaches, checks: int) -> Answers:
                 past[: len(observer)], observer, met.seed[: len(observer)], strict=True
             )
         ]
-        return np.array(page.evaluate(ASK, json.dumps(told)))[:, [0, 2]]
+        return np.array(page.evaluate(ASK, json.dumps(questions)))[:, [0, 2]]
 
     few = slice(checks)
     return Answers(
@@ -149,22 +147,22 @@ def asked_of_the_page(page: Page, met: Approaches, checks: int) -> Answers:
     )
 
 
-def asked_of_python(build: Path, simulator: Path, met: Approaches, checks: int) -> Answers:
-    """Sample with the planner of `pipeline/models`; the last two for the first ``checks`` plans only."""
+def goals_of_python(build: Path, simulator: Path, met: Approaches, checks: int) -> Answers:
+    """Sample goals in Python; the last two only for the first ``checks`` plans."""
     contract = json.loads((simulator / "simulator.json").read_bytes())
     eyes_m = contract["scene"]["floor_m"] + contract["observer"]["eye_height_m"]
-    told = contract["behavior"]["sampling"]
+    settings = contract["behavior"]["sampling"]
     scenes = Scenes.load(build / "behavior_data", ("any",))
 
     def goals(observer: np.ndarray, guidance: float = 1.0) -> np.ndarray:
         count = len(observer)
-        sampling = PlanSamplingConfig(told["method"], max(STEPS, told["goal_steps"]), STEPS, guidance)
+        sampling = PlanSamplingConfig(settings["method"], max(STEPS, settings["goal_steps"]), STEPS, guidance)
         ats = Ats.load(build / "behavior", scenes, sampling)
         eyes = np.stack([observer[..., 0], np.full(observer.shape[:2], eyes_m), observer[..., 1]], -1)
         parts = []
         for some in np.array_split(
             np.arange(count), -(-count // 32)
-        ):  # a plan a window: noise follows the plan
+        ):  # one plan per window: noise belongs to the plan
             context = Context(
                 met.context.world_from_agent[some], met.context.agent_from_bone[some], eyes[some]
             )
@@ -178,7 +176,7 @@ def asked_of_python(build: Path, simulator: Path, met: Approaches, checks: int) 
 
 
 def rows(a_from_b: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 7"]:
-    """Return rigid motions as rows of place and quaternion wxyz, as the page has them."""
+    """Return rigid transforms as rows of position and quaternion wxyz, the format of the page."""
     return np.concatenate(
         [a_from_b[..., :3, 3], rigid.quaternion_from_rotation(a_from_b[..., :3, :3])], axis=-1
     )

@@ -1,7 +1,4 @@
-"""Small recordings with known truth.
-
-A phone moves through a box-shaped room, written the way Record3D writes.
-"""
+"""Small recordings with ground truth: a phone moves through a box-shaped room, in the format of Record3D."""
 
 import io
 import json
@@ -21,7 +18,7 @@ COLOR_SIZE, DEPTH_SIZE = (64, 48), (32, 24)
 
 @dataclass
 class Made:
-    """A recording to write: change what a test is about, then `write`."""
+    """A recording to write; tests modify its fields and call `write`."""
 
     world_from_camera: np.ndarray
     """[frame 4 4] OpenCV axes of the stored picture"""
@@ -35,12 +32,12 @@ class Made:
 
     @property
     def intrinsics(self) -> np.ndarray:
-        """K of the stored colour pictures."""
+        """Intrinsics of the stored colour pictures."""
         upright = np.array([[50.0, 0, 25], [0, 52, 31], [0, 0, 1]])
         return cameras.turn_intrinsics(upright, COLOR_SIZE, self.quarter_turns)
 
     def depth(self, frame: int) -> np.ndarray:
-        """Stored z-depth, metres: distance to the nearest wall of the room along each ray."""
+        """Stored z-depth, metres: distance to the nearest wall along each ray."""
         size, color_size = self._size(DEPTH_SIZE), self._size(COLOR_SIZE)
         rays = cameras.ray_directions(cameras.scale_intrinsics(self.intrinsics, color_size, size), *size)
         return self._wall_m(rays, self.stored_from_upright(self.world_from_camera[frame])).astype("<f4")
@@ -55,13 +52,13 @@ class Made:
         return cameras.turn_camera(world_from_camera, self.quarter_turns)
 
     def color(self, frame: int) -> np.ndarray:
-        """Stored picture: brightness grows to the right of the upright picture and with the frame."""
+        """Stored picture: brightness increases to the right of the upright picture and with time."""
         ramp = np.linspace(40, 200, COLOR_SIZE[1]).astype(np.uint8)
         picture = np.broadcast_to(ramp[None, :, None], (*COLOR_SIZE, 3)) + np.uint8(frame % 40)
         return cameras.turn_image(picture, self.quarter_turns)
 
     def poses(self) -> np.ndarray:
-        """[frame 7] as the app stores them: OpenGL axes, quaternion xyzw, metres."""
+        """[frame 7] as stored by the app: OpenGL axes, quaternion xyzw, metres."""
         stored = cameras.opencv_from_opengl(self.stored_from_upright(self.world_from_camera))
         wxyz = rigid.quaternion_from_rotation(stored[:, :3, :3])
         return np.concatenate([np.roll(wxyz, -1, axis=1), stored[:, :3, 3]], axis=1)
@@ -92,7 +89,7 @@ class Made:
 
 
 def write_zip(path: Path, members: dict[str, bytes | None]) -> None:
-    """Write members in order; None leaves one out."""
+    """Write members in order; None omits one."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in members.items():

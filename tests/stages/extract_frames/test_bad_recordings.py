@@ -1,4 +1,4 @@
-"""Damaged, hostile and unsuitable recordings are refused with their code, and nothing is left on disk."""
+"""Damaged, malicious and unsuitable recordings are refused with their code and leave no files."""
 
 import struct
 import sys
@@ -19,7 +19,7 @@ from tests.stages.extract_frames.made_recordings import walk, write_zip
 
 
 def _refused(recording, folder, monkeypatch, capsys):
-    """Run the stage, expect exit 2 and an unchanged disk, return the message."""
+    """Run the stage, expect exit code 2 and an unchanged disk, return the message."""
     before = sorted(folder.rglob("*"))
     monkeypatch.setattr(
         sys, "argv", ["extract_frames", "--recording", str(recording), "--out", str(folder / "out")]
@@ -92,7 +92,7 @@ def test_faulty_recordings_are_refused(tmp_path, monkeypatch, capsys, code, chan
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.98])
-def test_a_cut_file_is_refused(tmp_path, monkeypatch, capsys, share):
+def test_truncated_file_is_refused(tmp_path, monkeypatch, capsys, share):
     path = walk(12).write(tmp_path / "a.r3d")
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
     assert "CAP-001" in _refused(path, tmp_path, monkeypatch, capsys)
@@ -108,18 +108,18 @@ def test_flipped_bytes_are_refused(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("frames", [1, 5])
-def test_a_recording_of_a_moment_is_refused(tmp_path, monkeypatch, capsys, frames):
-    told = _refused(walk(frames).write(tmp_path / "a.r3d"), tmp_path, monkeypatch, capsys)
-    assert "CAP-007" in told
-    assert "record some seconds" in told
+def test_too_short_recording_is_refused(tmp_path, monkeypatch, capsys, frames):
+    message = _refused(walk(frames).write(tmp_path / "a.r3d"), tmp_path, monkeypatch, capsys)
+    assert "CAP-007" in message
+    assert "record some seconds" in message
 
 
-def test_a_video_that_is_mostly_damaged_is_refused(tmp_path):
+def test_mostly_damaged_video_is_refused(tmp_path):
     with pytest.raises(InputError, match="CAP-001.*3 of 4 pictures"):
         writing.write_frames(tmp_path, [None] * 3, total=4, min_depth_valid=0.2, where="a.mp4")
 
 
-def test_a_linked_member_is_refused(tmp_path, monkeypatch, capsys):
+def test_symbolic_link_in_an_archive_is_refused(tmp_path, monkeypatch, capsys):
     path = walk(12).write(tmp_path / "a.r3d")
     with zipfile.ZipFile(path, "a") as archive:
         link = zipfile.ZipInfo("rgbd/99.jpg")
@@ -128,7 +128,7 @@ def test_a_linked_member_is_refused(tmp_path, monkeypatch, capsys):
     assert "CAP-002" in _refused(path, tmp_path, monkeypatch, capsys)
 
 
-def test_something_else_is_refused(tmp_path, monkeypatch, capsys):
+def test_unknown_formats_are_refused(tmp_path, monkeypatch, capsys):
     (tmp_path / "folder").mkdir()
     assert "CAP-003" in _refused(tmp_path / "folder", tmp_path, monkeypatch, capsys)
     write_zip(tmp_path / "b.r3d", {"hello": b"world"})
@@ -136,12 +136,12 @@ def test_something_else_is_refused(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("size", [0, 3, 100, 50_000, 1_000_000])
-def test_lzfse_headers_promise_what_comes_out(size):
+def test_lzfse_headers_give_the_decoded_size(size):
     rng = np.random.default_rng(size)
     for data in (bytes(size), rng.bytes(size), rng.integers(0, 4, size, dtype=np.uint8).tobytes()):
         assert record3d.unpacked_bytes(lzfse.compress(data)) == size
 
 
-def test_lzfse_blocks_that_stand_still_are_refused():
+def test_empty_lzfse_blocks_are_refused():
     with pytest.raises(record3d.BrokenBlockError):
         record3d.unpacked_bytes(b"bvx2" + struct.pack("<I3Q", 0, 0, 0, 0) + bytes(100))

@@ -1,4 +1,4 @@
-"""A recording becomes frames that agree with its truth, whichever way the phone was held."""
+"""Extracted frames agree with the ground truth for any orientation of the phone."""
 
 import sys
 
@@ -26,7 +26,7 @@ def _extract(recording, out, monkeypatch, *options):
 
 
 @pytest.mark.parametrize("turns", range(4))
-def test_frames_are_upright_and_agree_with_truth(tmp_path, monkeypatch, turns):
+def test_frames_are_upright_and_agree_with_the_truth(tmp_path, monkeypatch, turns):
     made = walk(36, quarter_turns=turns)
     clip = _extract(made.write(tmp_path / "a.r3d"), tmp_path / "out", monkeypatch)
     source = npz.load(tmp_path / "out" / "frames.npz")["source_index"]
@@ -53,7 +53,7 @@ def test_colour_bytes_are_copied_untouched_when_upright(tmp_path, monkeypatch):
     assert (clip.folder / "color" / "000000.jpg").read_bytes() == images.encode_jpeg(made.color(0))
 
 
-def test_intrinsics_of_each_frame_win_over_the_first(tmp_path, monkeypatch):
+def test_per_frame_intrinsics_are_preferred(tmp_path, monkeypatch):
     made = walk(12)
     made.metadata["perFrameIntrinsicCoeffs"] = [[50 + i, 52 + i, 25, 31] for i in range(12)]
     clip = _extract(made.write(tmp_path / "a.r3d"), tmp_path / "out", monkeypatch)
@@ -61,7 +61,7 @@ def test_intrinsics_of_each_frame_win_over_the_first(tmp_path, monkeypatch):
     np.testing.assert_allclose(clip.intrinsics[:, 0, 0], 50 + source)
 
 
-def test_old_recordings_get_times_from_the_rate_and_no_gravity(tmp_path, monkeypatch):
+def test_old_recordings_have_times_from_the_frame_rate_and_no_gravity(tmp_path, monkeypatch):
     made = walk(88)
     made.timestamp_s = np.arange(88) / 60
     first = made.world_from_camera[0] @ np.diag([1, -1, -1, 1])
@@ -75,7 +75,7 @@ def test_old_recordings_get_times_from_the_rate_and_no_gravity(tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("pose", [[0, 0, 0, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0, 0]], ids=["zero", "identity"])
-def test_unusable_poses_are_left_out_and_said(tmp_path, monkeypatch, pose):
+def test_unusable_poses_are_dropped_and_reported(tmp_path, monkeypatch, pose):
     made = walk(24)
     made.metadata["poses"] = [pose] * 24
     clip = _extract(made.write(tmp_path / "a.r3d"), tmp_path / "out", monkeypatch)
@@ -83,7 +83,7 @@ def test_unusable_poses_are_left_out_and_said(tmp_path, monkeypatch, pose):
     assert '"status": "warn"' in (tmp_path / "out" / "qa.json").read_text()
 
 
-def test_same_recording_same_bytes(tmp_path, monkeypatch):
+def test_extraction_is_deterministic(tmp_path, monkeypatch):
     recording = walk(12, quarter_turns=1).write(tmp_path / "a.r3d")
     for out in ("one", "two"):
         _extract(recording, tmp_path / out, monkeypatch)
@@ -106,7 +106,7 @@ def test_large_pictures_are_reduced_with_their_intrinsics(tmp_path, monkeypatch,
     np.testing.assert_allclose(clip.odometry_from_camera[0], made.world_from_camera[0], atol=1e-6)
 
 
-def test_a_mesh_that_the_app_made_comes_along(tmp_path, monkeypatch):
+def test_mesh_of_the_app_is_extracted(tmp_path, monkeypatch):
     folder = made_formats.polycam(tmp_path / "a", walk(24))
     made_formats.polycam_mesh(folder, trimesh.creation.box((4.0, 2.5, 5.0)), np.eye(4))
     clip = _extract(folder, tmp_path / "out", monkeypatch)

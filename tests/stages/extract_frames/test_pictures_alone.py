@@ -1,6 +1,5 @@
-"""A video without depth becomes frames like any other.
-
-Path and lens by COLMAP, depth from pictures, metres from elsewhere.
+"""Videos without depth: camera path and intrinsics by COLMAP, depth from pictures, scale from other
+recordings.
 """
 
 from pathlib import Path
@@ -58,7 +57,7 @@ def _mapped(recording: Recording, measured, folder: Path):
 
 
 @pytest.mark.slow
-def test_a_walk_is_mapped_and_a_session_with_depth_tells_its_metres(room, tmp_path):
+def test_walkthrough_is_mapped_and_scaled_by_a_session_with_depth(room, tmp_path):
     truth = textured_room.walk(14)
     session = _recording(
         room, textured_room.walk(14)[2:12:3] @ rigid.make(np.eye(3), np.array([0.03, 0, 0])), with_depth=True
@@ -83,7 +82,7 @@ def test_a_walk_is_mapped_and_a_session_with_depth_tells_its_metres(room, tmp_pa
     assert np.mean(known) > 0.5
 
 
-def test_a_turn_on_the_spot_gives_no_map(room, tmp_path):
+def test_pure_rotation_is_refused(room, tmp_path):
     here = np.array([0.0, 1.3, 0.0])
     angles = np.linspace(0, 1.2, 12)
     spot = np.stack(
@@ -93,12 +92,12 @@ def test_a_turn_on_the_spot_gives_no_map(room, tmp_path):
         _mapped(_recording(room, spot), {}, tmp_path)
 
 
-def test_a_still_camera_gives_no_map(room, tmp_path):
+def test_static_camera_is_refused(room, tmp_path):
     with pytest.raises(InputError, match="MAP-004"):
         _mapped(_recording(room, np.repeat(textured_room.walk(1), 12, axis=0)), {}, tmp_path)
 
 
-def test_depth_of_known_cameras_is_right_where_others_agree(room):
+def test_consistent_multi_view_depth_is_accurate(room):
     path = textured_room.walk(60)[10:19:3]
     pictures = [_seen(room, camera) for camera in path]
     views = [
@@ -116,7 +115,7 @@ def test_depth_of_known_cameras_is_right_where_others_agree(room):
     assert np.median(off[agree == 0]) > 2 * np.median(off[agree == 2]), "what is refused is worse"
 
 
-def test_keyframes_follow_motion_and_not_time():
+def test_keyframes_are_selected_by_motion():
     config = PhotogrammetryConfig(keyframe_share=0.1, max_keyframes=20)
     travelled = np.concatenate([np.zeros(50), np.linspace(0, 1, 50)])
     sharpness = np.ones(100)

@@ -1,4 +1,4 @@
-"""The basis is fitted on training recordings only, and each video's features follow it."""
+"""The feature basis is fitted on training recordings only and applied to every video."""
 
 import json
 import sys
@@ -24,7 +24,7 @@ def _write_clip(folder, seed):
         images.write_depth(inside / "depth" / "000000.exr", np.ones((8, 6)))
         for i in range(3):
             small = rng.integers(0, 255, (24, 18, 3), dtype=np.uint8)
-            picture = cv2.resize(small, (78, 101))  # no whole number of cells
+            picture = cv2.resize(small, (78, 101))  # not a multiple of the cell size
             images.write_color(inside / "color" / f"{i:06d}.jpg", picture)
         eye = np.tile(np.eye(3), (3, 1, 1))
         table = dict(timestamp_s=np.arange(3) / 10, intrinsics=eye, depth_intrinsics=eye)
@@ -33,7 +33,7 @@ def _write_clip(folder, seed):
 
 @pytest.fixture
 def world(tmp_path):
-    """Four recordings, the last of which is the test video."""
+    """Four recordings; the last is the test video."""
     videos = []
     for i, role in enumerate(ROLES):
         _write_clip(tmp_path / "frames" / f"v{i:03d}", seed=i)
@@ -67,7 +67,7 @@ def _fit(world, monkeypatch, out):
     cli.main("Fit.", fit.run, fit.Inputs, fit.Config)
 
 
-def test_basis_ignores_the_test_video_and_features_follow_it(world, monkeypatch):
+def test_basis_ignores_the_test_video_and_projects_its_features(world, monkeypatch):
     _fit(world, monkeypatch, world / "basis")
     before = (world / "basis" / "basis.npz").read_bytes()
     test_video = world / "frames" / "v003"

@@ -1,4 +1,4 @@
-"""Gathering: the summary names what was registered and why the rest was not, the picture survives gaps."""
+"""Summary of registration: registered and rejected recordings with reasons, and a picture with gaps."""
 
 import json
 
@@ -24,7 +24,7 @@ def _poses() -> RegisteredPoses:
     return RegisteredPoses(np.arange(5.0), camera, agent, ones, ones, ones > 0)
 
 
-def test_summary_and_checks():
+def test_summary_has_counts_and_checks():
     poses = _poses()
     outcomes = [gather.SessionOutcome("v002", STATUS, poses), gather.SessionOutcome("v003", REFUSED, None)]
     summary = gather.summarise(outcomes)
@@ -34,7 +34,7 @@ def test_summary_and_checks():
     assert gather.paths(outcomes).shape == (560, 560, 3)
 
 
-def test_a_gap_that_was_not_measured_does_not_count():
+def test_unmeasured_gaps_are_ignored():
     measured = gather.SessionOutcome("v002", STATUS, _poses())
     unmeasured = gather.SessionOutcome(
         "v003", {**STATUS, "figures": {"depth_gap_m": None, "confidence": 0.9}}, _poses()
@@ -45,13 +45,13 @@ def test_a_gap_that_was_not_measured_does_not_count():
     ]
 
 
-def test_nothing_registered_is_reported_without_a_fault():
+def test_no_registered_recording_is_reported():
     outcomes = [gather.SessionOutcome("v002", REFUSED, None)]
     assert gather.checks(outcomes)[0].status == "fail"
     assert gather.paths(outcomes).shape == (560, 560, 3)
 
 
-def test_a_rejection_is_described_by_name_with_its_nearest_view():
+def test_rejection_is_reported_with_its_nearest_view():
     refused = gather.SessionOutcome(
         "v003", {**REFUSED, "nearest_view": {"walkthrough_s": 12.34}}, None, "b.r3d"
     )
@@ -59,7 +59,7 @@ def test_a_rejection_is_described_by_name_with_its_nearest_view():
     assert gather.summarise([refused])["videos"]["v003"]["file"] == "b.r3d"
 
 
-def test_the_stage_copies_poses_and_stops_where_too_few_fit(tmp_path):
+def test_stage_copies_poses_and_fails_if_too_few_are_registered(tmp_path):
     folders = {}
     for name, status in (("v002", STATUS), ("v003", REFUSED)):
         folders[name] = tmp_path / name

@@ -1,4 +1,4 @@
-"""Tables of motion: what is written is read back, joints find their tree, and nonsense is refused by name."""
+"""Motion tables: round trip, inference of the kinematic tree from joints, and refusal of invalid input."""
 
 import zipfile
 
@@ -21,7 +21,7 @@ def table(path, rows, header="id,time,x,y,z,heading"):
     return path
 
 
-def test_a_table_becomes_poses_id_by_id(tmp_path):
+def test_table_is_converted_to_poses_per_id(tmp_path):
     rows = [f"{name},{0.1 * i},{i * 0.01},0.2,{-i * 0.02},{0.1 * i}" for name in ("b", "a") for i in range(5)]
     motion = read(table(tmp_path / "t.csv", rows), READING)
     assert len(motion.timestamp_s) == 10
@@ -31,7 +31,7 @@ def test_a_table_becomes_poses_id_by_id(tmp_path):
     assert (motion.world_from_camera[:, 0, 3] == ABSENT_M).all()
 
 
-def test_stretches_days_apart_become_clips_of_one_recording(tmp_path):
+def test_distant_segments_become_clips_of_one_recording(tmp_path):
     rows = [f"{1.7e9 + 86400 * day + 0.1 * i:.1f},{i * 0.01},0.2,0,0" for day in (0, 1, 7) for i in range(20)]
     time = read(table(tmp_path / "t.csv", rows, "time,x,y,z,heading"), READING).timestamp_s
     step = np.diff(time)
@@ -40,7 +40,7 @@ def test_stretches_days_apart_become_clips_of_one_recording(tmp_path):
     np.testing.assert_allclose(np.delete(step, [19, 39]), 0.1, atol=1e-6)
 
 
-def test_unseen_rows_and_observers_are_kept_apart(tmp_path):
+def test_invisible_rows_and_observers_are_separated(tmp_path):
     rows = ["a,0.0,1,0,2,0,3,1,4", "a,0.1,,,,,3,1,4", "a,0.2,1,0,2,0,,,"]
     motion = read(
         table(tmp_path / "t.csv", rows, "id,time,x,y,z,heading,observer_x,observer_y,observer_z"), READING
@@ -50,7 +50,7 @@ def test_unseen_rows_and_observers_are_kept_apart(tmp_path):
     assert motion.world_from_camera[2, 0, 3] == ABSENT_M
 
 
-def test_beings_of_a_table_with_kinds_share_its_clock(tmp_path):
+def test_ids_of_a_table_with_kinds_share_timestamps(tmp_path):
     def rows(name, kind, begin, end, x):
         return [f"{name},{kind},{0.1 * i:.1f},{x},0,{0.01 * i:.2f},0" for i in range(begin, end)]
 
@@ -72,7 +72,7 @@ def test_beings_of_a_table_with_kinds_share_its_clock(tmp_path):
         read(table(tmp_path / "w.csv", ["a,tree,0,0,0,0,0"], "id,kind,time,x,y,z,heading"), READING)
 
 
-def test_an_obstacle_map_stands_where_it_says(tmp_path):
+def test_obstacle_map_has_its_position(tmp_path):
     folder = tmp_path / "clip"
     folder.mkdir()
     table(folder / "trajectory.csv", [f"a,{0.1 * i},{0.1 * i},0.25,0,1.57" for i in range(20)])
@@ -90,8 +90,8 @@ def test_an_obstacle_map_stands_where_it_says(tmp_path):
 
 
 def skeleton_motion(frames=300):
-    """A pelvis that turns and walks, a two-joint spine ahead, a leg that swings: who hangs on whom is 0 -> 1
-    -> 2, 0 -> 3 -> 4.
+    """A pelvis that turns and walks, a two-joint spine ahead, a swinging leg; the tree is 0 -> 1 -> 2, 0 -> 3
+    -> 4.
     """
     swing = 0.6 * np.sin(np.arange(frames) * 0.2)
     leg = np.stack([0 * swing, -np.cos(swing), np.sin(swing)], axis=-1)
@@ -107,7 +107,7 @@ def skeleton_motion(frames=300):
     return rigid.apply(root, local)
 
 
-def test_joints_find_the_tree_and_bones_turn_with_it():
+def test_kinematic_tree_is_inferred_and_bones_rotate_with_it():
     joints = skeleton_motion()
     parent = captured.parents(joints, 0)
     assert parent.tolist() == [-1, 0, 1, 0, 3]
@@ -151,7 +151,7 @@ def test_clips_of_joints_stand_on_the_floor(tmp_path):
         ("time,x,y,z,heading,observer_x\n0,0,0,0,0,0\n", "TRJ-001.*no column observer_y, observer_z"),
     ],
 )
-def test_nonsense_is_refused(tmp_path, text, code):
+def test_invalid_tables_are_refused(tmp_path, text, code):
     (tmp_path / "t.csv").write_text(text)
     with pytest.raises(InputError, match=code):
         read(tmp_path / "t.csv", READING)
@@ -160,14 +160,14 @@ def test_nonsense_is_refused(tmp_path, text, code):
 @pytest.mark.parametrize(
     "stored", [{"depth": np.zeros((4, 5))}, {}, {"a": np.zeros((0, 5, 3))}, {"a": np.array(["x"])}]
 )
-def test_arrays_that_are_no_joints_are_refused(tmp_path, stored):
+def test_arrays_of_wrong_shape_are_refused(tmp_path, stored):
     np.savez(tmp_path / "t.npz", **stored)
     with pytest.raises(InputError, match="TRJ-001.*no joint positions"):
         read(tmp_path / "t.npz", READING)
 
 
 @pytest.mark.parametrize("wrong", ["volume/origin", "timestamp_s", "agent_from_bone"])
-def test_a_life_that_is_not_whole_is_refused(tmp_path, wrong):
+def test_incomplete_motion_is_refused(tmp_path, wrong):
     poses, frames = np.tile(np.eye(4), (5, 1, 1)), np.arange(5) / 10
     stored = {"timestamp_s": frames, "world_from_agent": poses, "agent_from_bone": poses[:, None]}
     stored |= {"world_from_camera": poses, "agent_from_bone_rest": np.eye(4)[None]}
@@ -183,14 +183,14 @@ def test_a_life_that_is_not_whole_is_refused(tmp_path, wrong):
         read(tmp_path / "a.npz", READING)
 
 
-def test_a_table_that_unpacks_to_gigabytes_is_refused(tmp_path):
+def test_table_that_expands_to_gigabytes_is_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         with archive.open("a.npy", "w", force_zip64=True) as member:
             shape = (reading.MAX_BYTES // 24 + 1, 1, 3)
             header = {"descr": "<f8", "fortran_order": False, "shape": shape}
             np.lib.format.write_array_header_1_0(member, header)
     data = (tmp_path / "a.npz").read_bytes()
-    at = data.rindex(b"PK\x01\x02") + 24  # the directory says how much a member unpacks to
+    at = data.rindex(b"PK\x01\x02") + 24  # the directory declares the decompressed size
     (tmp_path / "a.npz").write_bytes(
         data[:at] + (reading.MAX_BYTES + 128).to_bytes(4, "little") + data[at + 4 :]
     )
@@ -198,14 +198,14 @@ def test_a_table_that_unpacks_to_gigabytes_is_refused(tmp_path):
         read(tmp_path / "a.npz", READING)
 
 
-def test_a_file_that_is_no_archive_of_arrays_is_refused(tmp_path):
+def test_file_that_is_no_npz_is_refused(tmp_path):
     (tmp_path / "t.npz").write_bytes(b"PK")
     with pytest.raises(InputError, match="TRJ-001.*no.* zip"):
         read(tmp_path / "t.npz", READING)
 
 
 @pytest.mark.parametrize(("unit", "status"), [(1.0, "ok"), (180 / np.pi, "warn")])
-def test_degrees_turn_too_fast(tmp_path, unit, status):
+def test_headings_in_degrees_are_refused(tmp_path, unit, status):
     rows = [f"{0.1 * i},{0.01 * i},0,0,{0.05 * np.sin(i) * unit}" for i in range(100)]
     found = {
         check.name: check.status
@@ -214,7 +214,7 @@ def test_degrees_turn_too_fast(tmp_path, unit, status):
     assert found["turning, 99 % below"] == status
 
 
-def test_joints_that_are_not_known_are_refused(tmp_path):
+def test_unknown_joints_are_refused(tmp_path):
     joints = skeleton_motion()
     joints[7, 2] = np.nan
     np.savez(tmp_path / "t.npz", walk=joints)
@@ -223,7 +223,7 @@ def test_joints_that_are_not_known_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("cells", ["x,z\n,1\n", "x,z\n1e5,1e5\n"])
-def test_obstacle_maps_that_cannot_be_are_refused(tmp_path, cells):
+def test_impossible_obstacle_maps_are_refused(tmp_path, cells):
     (tmp_path / "trajectory.csv").write_text("time,x,y,z,heading\n0,0,0,0,0\n1,1,0,0,0\n")
     (tmp_path / "obstacles.csv").write_text(cells)
     with pytest.raises(InputError, match="TRJ-001"):
@@ -231,8 +231,8 @@ def test_obstacle_maps_that_cannot_be_are_refused(tmp_path, cells):
 
 
 @pytest.mark.parametrize("rate_hz", [2.5, 10.0, 60.0, 7.0])
-def test_clips_begin_on_the_grid_of_their_rate(rate_hz):
-    """So that slicing at that rate takes frames as they are, and none that is mixed with a later one."""
+def test_clips_start_on_the_grid_of_their_rate(rate_hz):
+    """Slicing at that rate then keeps frames unchanged, without interpolation with later ones."""
     times = concatenated_times([3.0 + np.arange(count) / rate_hz for count in (9, 4, 21)])
     frame = times * rate_hz
     np.testing.assert_allclose(frame, frame.round(), atol=1e-6)

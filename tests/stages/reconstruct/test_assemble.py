@@ -1,4 +1,4 @@
-"""Doubtful roots that leap away from certain ones near in time are given up, and their masks hardly count."""
+"""Uncertain roots that jump away from certain neighbours are dropped and their masks down-weighted."""
 
 import dataclasses
 
@@ -13,8 +13,8 @@ from tests.stages.reconstruct.test_optimise import WIDE, film, problem
 
 
 def doubted(confidence: np.ndarray, leap_m: float = 2.0) -> assemble.RegisteredVideo:
-    """Return a ball that moves 3 cm a frame along x, two frames a second; where it is doubted, it is
-    registered too high and turned round.
+    """Return a ball that moves 3 cm per frame along x at 2 Hz; uncertain frames are registered too high and
+    reversed.
     """
     video = film("v002", len(confidence), True, np.random.default_rng(0), WIDE)
     root = rigid.make(np.eye(3), np.arange(len(confidence))[:, None] * np.array([0.03, 0, 0]))
@@ -27,7 +27,7 @@ def doubted(confidence: np.ndarray, leap_m: float = 2.0) -> assemble.RegisteredV
     )
 
 
-def test_leaps_are_given_up_where_certain_roots_are_near():
+def test_jumps_near_certain_roots_are_dropped():
     confidence = np.ones(12)
     confidence[[3, 4, 11]] = 0.1
     root, kept = assemble.replace_outliers(doubted(confidence))
@@ -47,7 +47,7 @@ def test_leaps_are_given_up_where_certain_roots_are_near():
     assert np.isnan(assemble.replace_outliers(unknown)[0]).all()
 
 
-def test_what_is_joined_comes_back_from_disk(tmp_path):
+def test_joined_videos_survive_saving(tmp_path):
     _, videos = problem()
     stores = [video.store for video in videos]
     joined = rays.join(stores, tmp_path, (32, 32))
@@ -62,7 +62,7 @@ def test_what_is_joined_comes_back_from_disk(tmp_path):
     assert not list(tmp_path.iterdir()), "the files have no names"
 
 
-def test_given_up_frames_hardly_count_and_the_joint_phase_leaves_them_out():
+def test_dropped_frames_are_down_weighted_and_excluded_from_the_joint_phase():
     confidence = np.ones(12)
     confidence[5] = 0.2
     _, videos = problem()
@@ -78,8 +78,8 @@ def test_given_up_frames_hardly_count_and_the_joint_phase_leaves_them_out():
     )
 
 
-def test_masks_count_by_how_much_of_the_animal_they_show(monkeypatch):
-    """Three quarters of the ball's mask are hidden in one frame, nearly all of it in another."""
+def test_masks_are_weighted_by_visibility(monkeypatch):
+    """Three quarters of the ball are occluded in one frame, nearly all of it in another."""
     built, _ = problem()
     views = built.store.views
     hidden = views.outside_px.clone()
@@ -96,7 +96,7 @@ def test_masks_count_by_how_much_of_the_animal_they_show(monkeypatch):
     torch.testing.assert_close(after[rest], before[rest])
 
 
-def test_cameras_are_held_as_firmly_as_registration_is_sure():
+def test_camera_prior_precision_follows_registration_confidence():
     pose = torch.eye(4).repeat(40, 1, 1)
     table = MotionTable(pose, pose, torch.eye(4)[None], [40], [True], knot_frames=10)
     confidence = np.repeat([0.3, 1.0], 20)

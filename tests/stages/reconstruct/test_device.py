@@ -1,6 +1,4 @@
-"""Every step of the reconstruction runs on a simulated second device, on which a forgotten `.to(device)`
-fails.
-"""
+"""Every step of the reconstruction runs on a simulated second device, where a forgotten `.to(device)` fails."""
 
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from pipeline.fields.render import Renderer, render_depth
 from stages.reconstruct import assemble, optimise, results
 from stages.reconstruct.config import LearningRates, LossWeights, PhaseSteps, RayBatches
 from tests.simulated_device import DEVICE, is_on_device, simulated_device
-from tests.stages.reconstruct.test_fuse import ground
+from tests.stages.reconstruct.test_fuse import fused_scene
 from tests.stages.reconstruct.test_optimise import RADIUS_M, SHAPES, UPRIGHT, film, template
 
 STEPS = PhaseSteps(template=40, scene=2, stance=1, body=2, joint=2, save_every=2)
@@ -21,10 +19,10 @@ BATCHES = RayBatches(scene_rays=32, joint_scene_rays=16, rendered_rays=8, render
 
 @pytest.mark.slow
 @pytest.mark.parametrize("form", ["fused", "measured", "rendered"])
-def test_all_phases_and_results_run_on_another_device(form, tmp_path):
+def test_all_phases_run_on_another_device(form, tmp_path):
     rng = np.random.default_rng(0)
     videos = [film("v002", 8, True, rng), film("v001", 4, False, rng, UPRIGHT)]
-    fused, rendered = ground() if form == "fused" else None, form == "rendered"
+    fused, rendered = fused_scene() if form == "fused" else None, form == "rendered"
     with simulated_device():
         problem = assemble.build(
             videos, template(RADIUS_M), SHAPES, 0, DEVICE, fused, tmp_path, rendered=rendered

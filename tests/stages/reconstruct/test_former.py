@@ -1,4 +1,6 @@
-"""A reconstruction that starts from a former one takes over what it had, and poses what was added alone."""
+"""A reconstruction that starts from an earlier one keeps its fields and motion, and poses only added
+recordings.
+"""
 
 from dataclasses import replace
 
@@ -41,7 +43,7 @@ def added():
 
 
 @pytest.mark.slow
-def test_fields_and_motion_are_those_of_the_former(made):
+def test_fields_and_motion_of_the_earlier_reconstruction_are_kept(made):
     folder, before, motions = made
     found, videos = problem(videos=films(added()))
     known = former.begin(found, videos, folder)
@@ -65,7 +67,7 @@ def test_fields_and_motion_are_those_of_the_former(made):
     np.testing.assert_array_equal(found.scene.codes.weight[0].detach(), before.scene.codes.weight[0].detach())
 
 
-def test_what_was_added_alone_is_posed(made, tmp_path):
+def test_only_added_recordings_are_posed(made, tmp_path):
     folder, *_ = made
     found, videos = problem(videos=films(added()))
     known = former.begin(found, videos, folder)
@@ -77,7 +79,7 @@ def test_what_was_added_alone_is_posed(made, tmp_path):
     assert np.isfinite(results.motions(found, videos, 0.75)["v003"].world_from_agent).all()
 
 
-def test_a_recording_whose_times_differ_is_another_one(made):
+def test_recording_with_other_timestamps_is_added(made):
     folder, *_ = made
     videos = films(added())
     videos[0] = replace(videos[0], timestamp_s=videos[0].timestamp_s + 1.0)

@@ -1,4 +1,4 @@
-"""Fused ground: what all videos share, what one saw otherwise, and the way to disk and back."""
+"""Fused geometry: shared surfaces, surfaces of single videos, and saving."""
 
 import numpy as np
 import pytest
@@ -13,25 +13,27 @@ VOXEL_M = 0.05
 BALL = torch.tensor([0.4, 0.3, 0.2])
 
 
-def ground():
-    """Three videos see a floor at y = -0.5; the last also a ball, red, that the others saw through."""
-    ground = SceneFuser((LOW, HIGH), VOXEL_M)
-    x, y, z = np.meshgrid(*(np.arange(n * 8 + 1) * 0.05 - 1 for n in ground.size), indexing="ij")
+def fused_scene():
+    """Three videos observe a floor at y = -0.5; the last also a red ball where the others observed free
+    space.
+    """
+    fused_scene = SceneFuser((LOW, HIGH), VOXEL_M)
+    x, y, z = np.meshgrid(*(np.arange(n * 8 + 1) * 0.05 - 1 for n in fused_scene.size), indexing="ij")
     floor = y + 0.5
     ball = np.sqrt((x - 0.4) ** 2 + (y - 0.3) ** 2 + (z - 0.2) ** 2) - 0.25
     for video in range(3):
-        volume = ground.empty()
+        volume = fused_scene.empty()
         distance = np.minimum(floor, ball) if video == 2 else floor
         volume.distance[:] = np.clip(distance / 0.1, -1, 1)
         volume.weight[:] = np.where(distance > -0.1, 1.0, 0.0)
         volume.color[:] = (200, 0, 0) if video == 2 else (0, 0, 200)
         volume.color_weight[:] = np.abs(distance) < 0.05
-        ground.add(volume)
-    return ground.finish()
+        fused_scene.add(volume)
+    return fused_scene.finish()
 
 
-def test_videos_share_the_floor_and_one_has_the_ball():
-    fused = ground()
+def test_floor_is_shared_and_the_ball_belongs_to_one_video():
+    fused = fused_scene()
     generator = torch.Generator().manual_seed(0)
     on_floor = torch.rand(200, 3, generator=generator) * 1.6 - 0.8
     on_floor[:, 1] = -0.5 + 0.04 * torch.rand(200, generator=generator)
@@ -54,8 +56,8 @@ def test_videos_share_the_floor_and_one_has_the_ball():
     assert len(fused.blocks) < fused.table[0].numel(), "sparse"
 
 
-def test_points_outside_are_free_and_gradients_lead_to_the_surface():
-    fused = ground()
+def test_outside_is_free_with_gradients_towards_the_surface():
+    fused = fused_scene()
     far = fused(torch.tensor([[5.0, 0, 0], [0, -7.0, 0]]), torch.tensor([0, -1]))
     assert (far[:, 0] == 1).all() and (far[:, 4] == 0).all()
     points = torch.tensor([[0.1, -0.47, -0.3]], requires_grad=True)
@@ -63,12 +65,12 @@ def test_points_outside_are_free_and_gradients_lead_to_the_surface():
     torch.testing.assert_close(points.grad, torch.tensor([[0.0, 1.0, 0.0]]), atol=0.02, rtol=0)
 
 
-def test_a_field_on_fused_ground_comes_back_from_files(tmp_path: pytest.TempPathFactory):
+def test_field_on_fused_geometry_survives_saving(tmp_path: pytest.TempPathFactory):
     shape = FieldShape(LOW, HIGH, (0.5,), videos=3, truncation_m=0.1)
     agent = FieldShape(LOW, HIGH, (0.5,))
     body = ArticulatedBody(torch.eye(4).repeat(3, 1, 1), torch.full((3, 3), 0.1), agent)
     fields.save(
-        tmp_path, Reconstruction(Field(shape, 0.0, ground()), Field(agent, 0.1), body, ("a", "b", "c"))
+        tmp_path, Reconstruction(Field(shape, 0.0, fused_scene()), Field(agent, 0.1), body, ("a", "b", "c"))
     )
     scene = fields.load(tmp_path).scene
     values = scene(BALL[None] + torch.tensor([[0.25, 0, 0]]), torch.tensor([2]))

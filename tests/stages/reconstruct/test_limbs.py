@@ -1,4 +1,4 @@
-"""Limbs: a turn carries all that hangs on its bone, and slow waves move many frames at once."""
+"""Kinematic trees: a rotation moves all descendants of a bone; low frequencies move many frames."""
 
 import torch
 
@@ -10,8 +10,8 @@ LENGTH_M = 0.1
 
 
 def chain() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return points, weights and bones of a body with its middle at 0: one bone before it, a tail of three
-    behind, in no order.
+    """Return points, weights and bones of a body at 0 with one bone in front and a tail of three, in random
+    order.
     """
     place = LENGTH_M * torch.tensor([-2.0, 0.0, -3.0, 1.0, -1.0])
     bones = torch.eye(4).repeat(5, 1, 1)
@@ -21,7 +21,7 @@ def chain() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     return points, weights, bones
 
 
-def test_bones_hang_on_each_other_outward_from_the_middle():
+def test_tree_is_rooted_at_the_center():
     limbs = KinematicTree.of(*chain())
     parent = dict(zip(limbs.order.tolist(), limbs.order[limbs.parent].tolist(), strict=True))
     assert parent == {1: 1, 3: 1, 4: 1, 0: 4, 2: 0}
@@ -29,7 +29,7 @@ def test_bones_hang_on_each_other_outward_from_the_middle():
     assert abs(at[0] + 1.5 * LENGTH_M) < 0.01, "half-way between the two bones that share the skin there"
 
 
-def test_a_turn_at_the_root_of_a_tail_lifts_the_whole_tail():
+def test_rotation_at_the_root_moves_the_whole_tail():
     points, weights, bones = chain()
     limbs = KinematicTree.of(points, weights, bones)
     turn = torch.zeros(2, 5, 3)
@@ -51,8 +51,8 @@ def test_a_turn_at_the_root_of_a_tail_lifts_the_whole_tail():
     torch.testing.assert_close(relative, rigid_torch.inverse(bones[4]) @ bones[2], msg="straight as before")
 
 
-def test_a_leg_hangs_on_the_body_and_not_on_the_other_leg_of_its_pair():
-    """Two legs that share more skin with each other than with the halves of the body above them."""
+def test_parent_of_a_leg_is_the_body():
+    """Two legs share more skin with each other than with the body above them."""
     place = torch.tensor(
         [[0.02, 0, 0], [-0.04, 0.02, 0.08], [0.04, 0.02, 0.08], [-0.04, -0.08, 0.1], [0.04, -0.08, 0.1]]
     )
@@ -70,7 +70,7 @@ def test_a_leg_hangs_on_the_body_and_not_on_the_other_leg_of_its_pair():
     assert parent == {0: 0, 1: 0, 2: 0, 3: 1, 4: 2}
 
 
-def test_waves_add_knots_of_each_scale():
+def test_temporal_basis_adds_knots_of_each_scale():
     waves = MultiscaleRotations(frames=20, bones=1, knot_frames=(8,))
     assert waves().shape == (20, 1, 3) and not waves().any()
     with torch.no_grad():
@@ -81,10 +81,8 @@ def test_waves_add_knots_of_each_scale():
     torch.testing.assert_close(waves()[:, 0, 0].detach(), expected)
 
 
-def test_legs_are_what_stands_on_the_ground():
-    """A body of two bones on a fore and a hind leg of two each, with a tail that hangs beside but never so
-    low.
-    """
+def test_legs_are_limbs_in_contact_with_the_ground():
+    """A body of two bones with fore and hind legs of two each, and a tail that never hangs as low."""
     place = torch.tensor(
         [
             [0, 0, 0.05],

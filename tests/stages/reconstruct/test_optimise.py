@@ -1,6 +1,4 @@
-"""A ball in a box, seen by a moving camera: the phases find both, and a killed run ends with the same
-bits.
-"""
+"""All phases on a ball in a box seen by a moving camera; resumed runs are bit-identical."""
 
 from dataclasses import replace
 
@@ -28,7 +26,7 @@ SHAPES = FieldSizes(scene_voxel_m=(0.4, 0.2), agent_voxel_m=(0.1, 0.05), width=3
 
 
 def cast(origin, direction, world_from_agent, half_m):
-    """Return z-depth and whether the animal is hit, an ellipsoid with these half axes, inside a cube room."""
+    """Return z-depth and the mask of an ellipsoid with these half axes inside a cubic room."""
     with np.errstate(divide="ignore"):
         wall = np.min(
             np.where(direction > 0, (ROOM_M - origin) / direction, (-ROOM_M - origin) / direction), axis=-1
@@ -43,7 +41,7 @@ def cast(origin, direction, world_from_agent, half_m):
 
 
 def film(id: str, frames: int, has_scene: bool, rng, size=WIDE) -> RegisteredVideo:
-    """Film the ball as it moves along x; the turnaround's world is the ball."""
+    """Render the ball as it moves along x; the world of the turnaround is that of the ball."""
     root = np.tile(np.eye(4), (frames, 1, 1))
     if has_scene:
         root[:, 0, 3] = 0.03 * np.arange(frames)
@@ -54,9 +52,7 @@ def film(id: str, frames: int, has_scene: bool, rng, size=WIDE) -> RegisteredVid
 def film_animal(
     id: str, root, registered, half_m: float | np.ndarray, has_scene: bool, rng, size=WIDE
 ) -> RegisteredVideo:
-    """Film an ellipsoid of these half axes from all around as its root moves; registration has it
-    elsewhere.
-    """
+    """Render an ellipsoid from all around as its root moves; registered roots differ from the true ones."""
     frames = len(root)
     height, width = size[0] * 4, size[1] * 4
     intrinsics = np.array([[100.0, 0, width / 2], [0, 100.0, height / 2], [0, 0, 1]])
@@ -119,7 +115,7 @@ def problem(shapes: FieldSizes = SHAPES, videos=None):
 
 
 def template(half_m: float | np.ndarray) -> AgentTemplate:
-    """Return the template of a ball, or of an ellipsoid with these half axes."""
+    """Return the template of a ball or of an ellipsoid with these half axes."""
     ball = trimesh.creation.icosphere(2)
     mesh = Mesh(
         (half_m * ball.vertices).astype(np.float32),
@@ -146,7 +142,7 @@ def solved():
 
 
 @pytest.mark.slow
-def test_room_and_ball_are_found(solved):
+def test_room_and_ball_are_reconstructed(solved):
     found, _ = solved
     centre = torch.tensor([[0.0, 0.0, -0.8], [0.5, 0.5, 0.5]])
     wall = torch.tensor([[ROOM_M, 0.1, 0.1], [0.1, -0.2, ROOM_M]])
@@ -159,7 +155,7 @@ def test_room_and_ball_are_found(solved):
 
 
 def test_posed_surface_comes_nearer_to_the_truth(solved):
-    """Registered roots are off by 4.7 cm; bones and root together must carry the ball to where it is."""
+    """Registered roots are off by 4.7 cm; bones and root must correct the error together."""
     found, videos = solved
     motion = results.motions(found, videos, 1.0)["v002"]
     with torch.no_grad():
@@ -172,8 +168,8 @@ def test_posed_surface_comes_nearer_to_the_truth(solved):
     assert np.linalg.norm(centre - truth, axis=-1).mean() < 0.6 * before
 
 
-def test_a_distance_field_of_the_template_has_no_loss_anywhere_around_it():
-    """Its terms in the second phase agree, so that distances do not end near the surface."""
+def test_true_distance_field_has_no_loss():
+    """The terms of the second phase are consistent, so that distances extend beyond the surface."""
     found, _ = problem()
 
     class Ball(torch.nn.Module):
@@ -201,7 +197,7 @@ def test_long_gaps_are_interpolated_with_low_confidence(solved):
     assert not motion.agent_known[6:9].any() and motion.agent_known[:6].all() and motion.agent_known[9:].all()
 
 
-def test_posing_is_the_same_however_many_are_posed_at_once():
+def test_posing_is_independent_of_the_batch_size():
     def posed(workers: int) -> torch.Tensor:
         found, _ = problem()
         optimise._pose(found, replace(plan(body=3), workers=workers), list(optimise.split_segments(found, 5)))
@@ -211,7 +207,7 @@ def test_posing_is_the_same_however_many_are_posed_at_once():
     assert one.abs().max() > 0.01 and torch.equal(one, posed(2))
 
 
-def test_bare_masked_pixels_draw_the_surface_to_them():
+def test_uncovered_mask_pixels_attract_the_surface():
     found, _ = problem()
     frame, rays, generator = found.agent_frames[:4], found.store.agent, torch.Generator().manual_seed(0)
     masked = torch.nonzero(rays.label == AGENT)[:, 0]
@@ -239,9 +235,7 @@ def test_bare_masked_pixels_draw_the_surface_to_them():
 
 
 def beside(found, metres: float) -> dict:
-    """Return what `surface_terms` says of the session when the ball stands so far to the right in all
-    pictures.
-    """
+    """Return `surface_terms` of the session with the ball shifted to the right in all pictures."""
     pose = Pose.of(found, torch.arange(4))
     right = (
         pose.world_from_camera
@@ -257,9 +251,9 @@ def beside(found, metres: float) -> dict:
     }
 
 
-def test_what_pads_pictures_says_nothing():
-    """Across the right border of an upright picture the mask is as far as its last pixel says, also beside a
-    wide recording.
+def test_padding_of_pictures_is_ignored():
+    """Beyond the border of an upright picture the mask distance is extrapolated, also beside a wide
+    recording.
     """
     alone, padded = (
         beside(
@@ -270,7 +264,7 @@ def test_what_pads_pictures_says_nothing():
     assert alone.max() > 1 and torch.equal(alone, padded)
 
 
-def test_where_depth_ends_at_something_nearer_the_surface_may_be_hidden():
+def test_surface_behind_a_depth_edge_may_be_occluded():
     found, _ = problem()
     views = found.store.views
     edge = torch.nonzero((views.outside_px[:4] < 0).any(0).any(0)).max() + 1
@@ -288,10 +282,8 @@ def test_where_depth_ends_at_something_nearer_the_surface_may_be_hidden():
     assert torch.equal(outside(edge, 0.0), hidden), "sensors do not measure along edges"
 
 
-def test_what_is_buried_in_the_ground_is_lifted():
-    """A floor 10 cm below the ball's middle: its underside lies as deep as it lies below that, and is drawn
-    up.
-    """
+def test_penetration_of_the_floor_is_penalized():
+    """The floor is 10 cm below the centre of the ball; the bottom of the ball is moved up."""
     found, _ = problem()
     height = torch.linspace(-0.4, 0.4, 9).view(1, 9, 1, 1).expand(9, 9, 9, 1) + 0.1
     block = torch.cat([(height / 0.2).clamp(-1, 1), torch.zeros(9, 9, 9, 4)], dim=-1)
@@ -310,10 +302,8 @@ def test_what_is_buried_in_the_ground_is_lifted():
     assert -shift.grad[1] > 10 * shift.grad[[0, 2]].abs().max()
 
 
-def test_below_the_floor_nothing_is_free_however_deep():
-    """What is fused ends a little below a surface; a ball half a metre below the floor is drawn up all the
-    same.
-    """
+def test_deep_penetration_is_penalized():
+    """Fused distances end a little below a surface; a ball half a metre below the floor is moved up too."""
     found, _ = problem()
     block = torch.cat([torch.ones(9, 9, 9, 1), torch.zeros(9, 9, 9, 4)], dim=-1)
     fused = FusedGeometry(
@@ -337,10 +327,8 @@ def test_below_the_floor_nothing_is_free_however_deep():
     torch.testing.assert_close(shift.grad, -torch.eye(3)[1])
 
 
-def test_soles_that_touch_the_floor_are_drawn_to_where_they_were():
-    """A ball that rolls over the floor of an empty home at 1 cm, then at 1 m a frame, and flies 20 cm above
-    it.
-    """
+def test_foot_skate_is_penalized_only_in_slow_contact():
+    """A ball rolls at 1 cm and at 1 m per frame, and flies 20 cm above the floor."""
     found, _ = problem()
     free = (
         torch.cat([torch.ones(9, 9, 9, 1), torch.zeros(9, 9, 9, 4)], dim=-1).expand(2, -1, -1, -1, -1).half()
@@ -368,8 +356,8 @@ def test_soles_that_touch_the_floor_are_drawn_to_where_they_were():
     assert not foot_skate(rolling.detach() + 0.2 * torch.eye(3)[1]).gt(1e-6).any()
 
 
-def test_bones_are_tied_along_limbs_and_not_across_them():
-    """Two legs nearer to each other than their own bones: each hangs on its own hip."""
+def test_bones_are_connected_along_limbs():
+    """Two legs are closer to each other than their own bones; each is connected to its own hip."""
     heights = torch.tensor([0.0, -0.1, -0.2])
     side = torch.tensor([-0.02, 0.02])
     centre = torch.stack([side[:, None].expand(2, 3), heights.expand(2, 3), torch.zeros(2, 3)], dim=-1).view(
@@ -389,7 +377,7 @@ def test_bones_are_tied_along_limbs_and_not_across_them():
     torch.testing.assert_close(knee, torch.tensor([[-0.02, -0.15, 0.0]]), atol=0.01, rtol=0)
 
 
-def test_fields_come_back_from_files_as_they_went(solved, tmp_path):
+def test_fields_survive_saving(solved, tmp_path):
     found, videos = solved
     fields.save(tmp_path, Reconstruction(found.scene, found.agent, found.body, assemble.scene_ids(videos)))
     back = fields.load(tmp_path)
@@ -400,10 +388,8 @@ def test_fields_come_back_from_files_as_they_went(solved, tmp_path):
 
 
 @pytest.mark.slow
-def test_plain_networks_without_codes_learn_and_come_back(tmp_path):
-    """The baselines of Table 3 take the same way: waves of the place instead of grids, one scene for all
-    videos.
-    """
+def test_positional_networks_without_codes_train_and_survive_saving(tmp_path):
+    """Baselines of Table 3: positional encoding instead of grids, one scene for all videos."""
     found, videos = problem(replace(SHAPES, encoding="mlp", code_channels=0))
     records = optimise.optimise(found, plan(template=30, scene=30, body=2, joint=2))
     total = records["scene"].total()
@@ -416,7 +402,7 @@ def test_plain_networks_without_codes_learn_and_come_back(tmp_path):
     )
 
 
-def test_volume_tells_free_surface_and_unseen(solved):
+def test_volume_marks_free_surface_and_unobserved_space(solved):
     volume = results.feature_volume(solved[0])
 
     def at(*point: float) -> int:
@@ -429,7 +415,7 @@ def test_volume_tells_free_surface_and_unseen(solved):
     assert surface.any() and not volume.features[:, ~surface].any()
 
 
-def test_frames_whose_camera_is_in_doubt_look_through_nothing(solved):
+def test_frames_with_uncertain_cameras_carve_no_free_space(solved):
     found = solved[0]
     points = torch.rand(500, 3) * 2 - 1
 
@@ -441,7 +427,7 @@ def test_frames_whose_camera_is_in_doubt_look_through_nothing(solved):
 
 
 @pytest.mark.slow
-def test_a_killed_run_ends_with_the_same_bits(tmp_path):
+def test_resumed_run_is_bit_identical(tmp_path):
     settings = dict(template=6, scene=8, body=2, joint=6, save_every=3)
     whole, _ = problem()
     optimise.optimise(whole, plan(**settings))

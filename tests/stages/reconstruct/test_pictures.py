@@ -1,4 +1,4 @@
-"""The quality page states what was measured, whatever else was not."""
+"""The quality page shows measured values even if others are missing."""
 
 import json
 from types import SimpleNamespace
@@ -8,7 +8,7 @@ import numpy as np
 from stages.reconstruct import pictures
 
 
-def test_a_frame_without_depth_hides_no_figure(tmp_path, monkeypatch):
+def test_frame_without_depth_does_not_hide_metrics(tmp_path, monkeypatch):
     rows = iter([(20.0, np.nan, 0.8), (30.0, 0.9, 0.6)])
     opened = SimpleNamespace(open=lambda folder: {0: folder, 1: folder})
     for name, stub in {

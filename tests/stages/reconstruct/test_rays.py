@@ -1,4 +1,4 @@
-"""What is read of pictures stands where it was seen."""
+"""Ray samples of pictures are at their positions."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from stages.reconstruct.rays import (
 
 
 @pytest.mark.parametrize(("radius_px", "label"), [(9.0, AGENT), (25.0, AGENT), (25.0, UNKNOWN)])
-def test_distance_from_the_mask_is_that_of_the_thumbnail_pixels_middle(radius_px, label):
+def test_mask_distance_is_measured_at_pixel_centers(radius_px, label):
     height, width, centre = 80, 120, np.array([53.0, 37.0])
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     mask = np.where(np.hypot(x - centre[0], y - centre[1]) < radius_px, label, NOT_AGENT).astype(np.uint8)
@@ -31,12 +31,12 @@ def test_distance_from_the_mask_is_that_of_the_thumbnail_pixels_middle(radius_px
     assert abs((found - true)[np.abs(true) < 6].mean()) < 0.1, "neither shifted nor eroded, pixels"
 
 
-def test_without_a_mask_everything_is_far():
+def test_mask_distance_without_mask_is_maximal():
     assert (mask_distance_px(np.zeros((8, 8), np.uint8), (2, 2)) == FAR_PX).all()
 
 
 @pytest.mark.parametrize("count", [150, 4000])
-def test_thin_limbs_are_looked_at_as_much_as_the_trunk(count):
+def test_thin_limbs_are_sampled_as_much_as_the_trunk(count):
     mask = np.zeros((100, 100), np.uint8)
     mask[20:60, 20:60] = mask[60:90, 38:42] = AGENT  # a leg four pixels wide
     near = near_agent(mask, 5)

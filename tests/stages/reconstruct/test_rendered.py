@@ -1,4 +1,4 @@
-"""The papers' form: geometry learned by differentiable rendering alone, which codes and their swaps shape."""
+"""The form of the papers: geometry learned by differentiable rendering, with per-video codes and annealing."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ WEIGHTS = replace(LossWeights(), rendered_depth=1.0)
 
 
 def learned(batches: RayBatches, weights: LossWeights = WEIGHTS) -> tuple[Problem, list]:
-    """Return the problem after the first steps of the scene's phase, from two sessions and a turnaround."""
+    """Return the problem after the first steps of the scene phase, from two sessions and a turnaround."""
     torch.set_num_threads(1)
     rng = np.random.default_rng(0)
     videos = [film(name, 10, True, rng) for name in ("v002", "v003")] + [film("v001", 4, False, rng, UPRIGHT)]
@@ -46,7 +46,7 @@ def geometry(problem: Problem, code: int) -> torch.Tensor:
         return problem.scene.distance_at(points, torch.full((300,), code))
 
 
-def test_depth_is_rendered_right_without_any_loss_at_measured_depth(with_annealing):
+def test_rendered_depth_is_correct_without_surface_losses(with_annealing):
     problem, videos = with_annealing
     reconstruction = Reconstruction(problem.scene, problem.agent, problem.body, assemble.scene_ids(videos))
     views = videos[0].store.views
@@ -60,14 +60,14 @@ def test_depth_is_rendered_right_without_any_loss_at_measured_depth(with_anneali
     assert not agent.any(), "its pose was not given"
 
 
-def test_codes_shape_geometry_so_that_annealing_can_matter(with_annealing):
+def test_codes_change_geometry(with_annealing):
     problem = with_annealing[0]
     assert (geometry(problem, 0) - geometry(problem, 1)).abs().max() > 1e-5
     other = learned(RayBatches(scene_rays=96, rendered_samples=40, swap_first=0.0, swap_last=0.0))[0]
     assert (geometry(problem, 0) - geometry(other, 0)).abs().max() > 1e-3
 
 
-def test_the_feature_loss_reaches_geometry(with_annealing):
+def test_feature_loss_has_gradients_for_geometry(with_annealing):
     other = learned(RayBatches(scene_rays=96, rendered_samples=40), replace(WEIGHTS, rendered_feature=0.0))[0]
     assert (geometry(with_annealing[0], -1) - geometry(other, -1)).abs().max() > 1e-3
 
@@ -82,8 +82,8 @@ def test_importance_samples_lie_at_the_surface():
     torch.testing.assert_close(empty, depth, atol=0.11, rtol=0)
 
 
-def test_a_fused_wall_thinner_than_the_spacing_of_samples_is_met_by_every_ray():
-    """What is fused ends 6 cm behind a surface; the first pass has a sample every 9 cm."""
+def test_every_ray_hits_a_thin_fused_wall():
+    """Fused distances end 6 cm behind a surface; the first pass samples every 9 cm."""
     wall_m = torch.linspace(1, 4, 500)[:, None]
     depth = torch.linspace(0.1, 5.9, 65).expand(500, -1)
 

@@ -1,4 +1,4 @@
-"""An animal that sits is told from one that stands, in each frame, though registration has it level."""
+"""Sitting is distinguished from standing per frame, although registered roots are level."""
 
 from dataclasses import replace
 
@@ -14,14 +14,14 @@ HALF_M = np.array([0.1, 0.1, 0.3])
 """half axes of the animal, an ellipsoid"""
 
 
-def test_a_stance_must_be_sure_and_lasts():
+def test_stances_require_confidence_and_duration():
     level, raised = np.full(6, 0.2), np.full(6, 0.2)
     raised[[1, 3, 4]] -= [0.05, 0.08, 0.08]
     assert posing.decode_stances(np.stack([level, raised], -1), 0.2).tolist() == [0, 0, 0, 1, 1, 0]
     assert posing.decode_stances(np.stack([level, level - posing.STANCE_COST], -1), 0.2).tolist() == [0] * 6
 
 
-def test_the_better_of_two_misfits_tells_nothing():
+def test_two_bad_fits_are_inconclusive():
     loss = np.tile([0.8, 0.5], (6, 1))
     assert posing.decode_stances(loss, 0.39).tolist() == [0] * 6
     assert posing.decode_stances(loss, 0.5).tolist() == [1] * 6
@@ -29,7 +29,7 @@ def test_the_better_of_two_misfits_tells_nothing():
     assert posing.decode_stances(loss, 0.5).tolist() == [1] * 6, "unseen, it is thought to sit on"
 
 
-def test_a_process_chooses_none_where_others_have_all_that_is_new():
+def test_process_without_new_videos_chooses_none():
     found, _ = problem()
     without = replace(found, agent_frames=found.agent_frames[:0])
     before = found.motion.initial_agent.clone()
@@ -37,14 +37,14 @@ def test_a_process_chooses_none_where_others_have_all_that_is_new():
     assert torch.equal(found.motion.initial_agent, before)
 
 
-def test_parts_are_told_by_frame():
+def test_stances_are_per_frame():
     found = posing.by_frame(np.array([0, 1, 0]), 25)
     assert found.tolist() == [0] * 10 + [1] * 10 + [0] * 5
 
 
 @pytest.mark.slow
-def test_sitting_is_found_where_it_is_seen():
-    """What is ahead rises by half its length: 30 degrees; registration has it level."""
+def test_sitting_is_detected():
+    """The front rises by half its length, 30 degrees; registered roots are level."""
     level = np.tile(np.eye(4), (FRAMES, 1, 1))
     root = level.copy()
     root[SITS, :3, 1:3] = [[0, 0], [0.75**0.5, 0.5], [-0.5, 0.75**0.5]]

@@ -1,4 +1,4 @@
-"""Losses, composite rendering and gap filling: each with the property that a wrong one cannot have."""
+"""Properties of losses, volume rendering and gap filling."""
 
 from types import SimpleNamespace
 
@@ -20,10 +20,10 @@ def layer(value: torch.Tensor, color: tuple[float, float, float]) -> Layer:
     return Layer(value, tint, torch.zeros(*value.shape, 16))
 
 
-def test_composite_shows_what_stands_in_front():
+def test_composite_shows_the_front_surface():
     depth = torch.linspace(0.1, 3, 300).expand(2, -1)
     wall = layer(density(2.0 - depth, torch.tensor(0.005)), (0.0, 0.0, 1.0))
-    agent_at = torch.tensor([[1.0], [9.0]])  # before the wall on the first ray, nowhere on the second
+    agent_at = torch.tensor([[1.0], [9.0]])  # in front of the wall on the first ray, nowhere on the second
     agent = layer(density((depth - agent_at).abs() - 0.1, torch.tensor(0.005)), (1.0, 0.0, 0.0))
     seen = composite(depth, torch.ones(2), wall, agent)
     torch.testing.assert_close(seen.agent, torch.tensor([1.0, 0.0]), atol=0.01, rtol=0)
@@ -43,8 +43,8 @@ def test_composite_mixes_by_density():
     torch.testing.assert_close(seen.color[0, 0] / seen.color[0, 2], torch.tensor(1 / 3))
 
 
-def test_free_space_is_clear_however_far_it_reaches():
-    """Fused distances saturate 6 cm before a wall 4 m away."""
+def test_long_free_space_is_transparent():
+    """Fused distances saturate 6 cm in front of a wall at 4 m."""
     depth = torch.linspace(0.1, 4.5, 800)[None]
     distance, beta_m = (4.0 - depth).clamp(-0.06, 0.06), torch.tensor(0.02)
     clear, fog = (density(distance, beta_m, truncation_m) for truncation_m in (0.06, None))
@@ -78,7 +78,7 @@ def test_eikonal_is_zero_on_a_distance_field_and_not_on_a_scaled_one():
     assert losses.eikonal(2 * points @ plane, 2 * beside @ plane, step).min() > 0.9
 
 
-def test_codes_are_swapped_as_often_as_asked():
+def test_codes_are_swapped_with_the_given_probability():
     video = torch.zeros(20000, dtype=torch.int64)
     generator = torch.Generator().manual_seed(0)
     assert (
@@ -91,7 +91,7 @@ def test_codes_are_swapped_as_often_as_asked():
     assert abs(changed - 0.4 * 3 / 4) < 0.02, "a swap may draw the same video again"
 
 
-def test_held_cameras_do_not_move_and_free_ones_move_smoothly():
+def test_fixed_cameras_do_not_move_and_free_ones_move_smoothly():
     pose = torch.eye(4).repeat(30, 1, 1)
     table = MotionTable(pose, pose, torch.eye(4)[None], [10, 20], [False, True], knot_frames=5)
     torch.nn.init.normal_(table.camera, std=0.1)
@@ -101,7 +101,7 @@ def test_held_cameras_do_not_move_and_free_ones_move_smoothly():
     assert (bend.abs() > 1e-6).sum() <= 3, "corrections bend at knots only"
 
 
-def test_corrections_of_one_video_say_nothing_of_the_next():
+def test_corrections_are_independent_between_videos():
     pose = torch.eye(4).repeat(30, 1, 1)
     table = MotionTable(pose, pose, torch.eye(4)[None], [10, 20], [True, True], knot_frames=5)
     problem = SimpleNamespace(motion=table, camera_precision=torch.ones(len(table.camera)))
@@ -113,7 +113,7 @@ def test_corrections_of_one_video_say_nothing_of_the_next():
     assert (scene.camera_prior(problem)["drift"][1].sum(1) > 0).tolist() == [False] * 5 + [True]
 
 
-def test_gaps_are_bridged_by_straight_lines():
+def test_gaps_are_interpolated_linearly():
     time = np.arange(40) * 0.1
     root = rigid.make(np.tile(np.eye(3), (40, 1, 1)), np.stack([time, 0 * time, 0 * time], axis=-1))
     good = np.ones(40, bool)
@@ -130,7 +130,7 @@ def test_gaps_are_bridged_by_straight_lines():
     assert (gaps_s(time, time < 1)[10:] == np.inf).all()
 
 
-def test_surface_of_a_ball_is_closed_and_looks_outwards():
+def test_surface_of_a_ball_is_closed_and_faces_outwards():
     axis = np.arange(-0.6, 0.61, 0.1)
     x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
     ball = zero_level((np.sqrt(x * x + y * y + z * z) - 0.413).astype(np.float32), np.full(3, -0.6), 0.1)

@@ -1,6 +1,4 @@
-"""Two processes that share the videos find what one finds in the same batch, and come through all phases
-alike.
-"""
+"""Two processes that share the videos give the gradients of one with the same batch, and complete all phases."""
 
 import sys
 from pathlib import Path
@@ -52,9 +50,7 @@ def fitted(found: Problem, loss, shared: bool) -> tuple[torch.Tensor, np.ndarray
 
 
 def side(rank: int, port: str, folder: Path) -> tuple[torch.Tensor, torch.Tensor, np.ndarray]:
-    """Do what one process of two does; the same steps, and then a whole run, whose weights it leaves in a
-    file.
-    """
+    """Run one of two processes: the same steps, then a whole run whose weights are saved."""
     two_processes.join(rank, port)
     found, whole = three_videos(), three_videos()
     weights, total = fitted(found, loss_of(found, rank), shared=True)
@@ -66,7 +62,7 @@ def side(rank: int, port: str, folder: Path) -> tuple[torch.Tensor, torch.Tensor
 
 
 @pytest.mark.slow
-def test_two_processes_do_what_one_does_with_the_same_batch(tmp_path, monkeypatch):
+def test_two_processes_agree_with_one_on_the_same_batch(tmp_path, monkeypatch):
     with two_processes.started(__name__, tmp_path, monkeypatch) as port:
         whole, weights, total = side(0, port, tmp_path)
     alone = three_videos()
@@ -92,7 +88,7 @@ def test_two_processes_do_what_one_does_with_the_same_batch(tmp_path, monkeypatc
     assert sorted(path.parent.name for path in (tmp_path / "resume").glob("*/step*2.pt")).count("scene") == 1
 
 
-def test_videos_are_dealt_out_whole():
+def test_videos_are_not_split_between_processes():
     found = three_videos()
     shares = [found.share(rank, 2) for rank in range(2)]
     for kind in ("scene", "agent"):

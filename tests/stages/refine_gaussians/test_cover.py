@@ -1,5 +1,5 @@
-"""A wall, plain on one side and checked on the other, in two videos of different light: colours, light and
-density are found; a board that stands elsewhere in each video is covered once for each.
+"""Refinement of Gaussians on walls filmed in two videos with different light, with objects that differ
+between videos.
 """
 
 from dataclasses import replace
@@ -24,14 +24,14 @@ EVERYWHERE, SHARED = np.ones((3, 8000), bool), np.full(8000, -1)
 
 
 def paint(points: np.ndarray) -> np.ndarray:
-    """Grey where x < 0, squares of 10 cm, red and blue, elsewhere."""
+    """Grey for x < 0, elsewhere red and blue squares of 10 cm."""
     checked = (np.floor(points[:, 0] / 0.1) + np.floor(points[:, 1] / 0.1)) % 2
     squares = np.where(checked[:, None], [0.9, 0.2, 0.2], [0.2, 0.2, 0.9])
     return np.where(points[:, :1] < 0, 0.5, squares)
 
 
 def film(video: int) -> DrawnVideo:
-    """Film the wall from its front, the camera a little aside in each frame."""
+    """Render the wall from the front with small camera motion."""
     intrinsics = np.array([[FOCAL, 0, 80], [0, FOCAL, 60], [0, 0, 1]])
     camera = np.tile(np.eye(4), (4, 1, 1))
     camera[:, 0, 3] = np.linspace(-0.1, 0.1, 4)
@@ -60,9 +60,7 @@ def film(video: int) -> DrawnVideo:
 
 @pytest.fixture(scope="module")
 def wall() -> gaussians.SurfaceSamples:
-    """The wall as the reconstruction has it: its colours blurred to the mean of each side; a second layer
-    behind faces away.
-    """
+    """The reconstructed wall: colours blurred to the mean of each side, and a back-facing second layer."""
     vertices = np.array(
         [[x, y, WALL_M + z] for z in (0, 0.02) for x in (-1.4, 0, 1.4) for y in (-1, 1)], np.float32
     )
@@ -73,7 +71,7 @@ def wall() -> gaussians.SurfaceSamples:
     )
 
 
-def test_pictures_tell_colour_and_light(wall):
+def test_colour_and_light_are_recovered(wall):
     seen = cover.observe(wall, EVERYWHERE, [film(0), film(1)], FRAMES)
     shown = seen.weight > 0
     assert not shown[wall.points[:, 2] > WALL_M + 0.01].any(), "what faces away is not seen"
@@ -89,8 +87,8 @@ def test_pictures_tell_colour_and_light(wall):
     )
 
 
-def test_what_was_carried_away_is_left_out(wall):
-    """The second layer stands half a metre before the wall: all pictures see through it."""
+def test_surfaces_in_observed_free_space_are_removed(wall):
+    """All pictures see through the second layer, half a metre in front of the wall."""
     ghost = wall.points[:, 2] > WALL_M + 0.01
     points = wall.points - ghost[:, None] * np.array([0, 0, 0.5])
     seen = cover.observe(replace(wall, points=points), EVERYWHERE, [film(0), film(1)], FRAMES)
@@ -101,7 +99,7 @@ def test_what_was_carried_away_is_left_out(wall):
     )
 
 
-def test_most_gaussians_lie_where_colours_change(wall, monkeypatch):
+def test_gaussians_concentrate_at_colour_edges(wall, monkeypatch):
     monkeypatch.setattr(cover, "BASE_GRADIENT", 0.01)
     monkeypatch.setattr(cover, "UNIFORM_SHARE", 0.1)
     seen = cover.observe(wall, EVERYWHERE, [film(0), film(1)], FRAMES)
@@ -114,16 +112,16 @@ def test_most_gaussians_lie_where_colours_change(wall, monkeypatch):
 
 
 def board(height_cells: float | None) -> torch.Tensor:
-    """Return a block that is cut by a level surface (None: empty)."""
+    """Return a block of the volume with a horizontal surface (None: empty)."""
     block = torch.ones(NODES, NODES, NODES, 5)
     if height_cells is not None:
         block[..., 0] = ((torch.arange(NODES) - height_cells) / 2).clamp(-1, 1)[None, :, None]
     return block
 
 
-def test_what_was_moved_stands_only_where_each_video_saw_it():
-    """Four blocks in a row: all share a floor in the first; video 0 has a board in the second, video 1 no
-    floor and one in the third.
+def test_moved_objects_are_separate_per_video():
+    """Four blocks: the floor is shared in the first; video 0 has a board in the second, video 1 a board and
+    no floor in the third.
     """
     table = torch.tensor([[1, 2, 0, 0], [3, 0, 2, 0], [1, 0, 0, 0]], dtype=torch.int32)[:, :, None, None]
     blocks = torch.stack([board(None), board(4.5), board(2.5), board(None)]).half()

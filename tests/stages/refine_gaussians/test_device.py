@@ -1,6 +1,4 @@
-"""Every step of the refinement runs on a simulated second device, on which a forgotten `.to(device)`
-fails.
-"""
+"""Every step of the refinement runs on a simulated second device, where a forgotten `.to(device)` fails."""
 
 from dataclasses import replace
 
@@ -22,7 +20,7 @@ class _Masks(list):
 
 
 def session() -> DrawnVideo:
-    """Return four frames of a wall with an animal of one bone before it, with masks and flow."""
+    """Return four frames of a wall behind an animal of one bone, with masks and flow."""
     plain, root = film(0), np.tile(np.eye(4), (4, 1, 1))
     root[:, 2, 3] = 1.0
     masks = _Masks([np.where(np.indices(SIZE)[1] > 80, 255, 0).astype(np.uint8)] * 4)

@@ -1,6 +1,4 @@
-"""Gaussians: they cover surfaces, follow bones, survive their file, and their optimisation makes pictures
-better.
-"""
+"""Gaussians cover surfaces, follow bones, survive saving, and improve by optimization."""
 
 from dataclasses import replace
 
@@ -22,7 +20,7 @@ def ball(radius_m: float = 0.5, number: int = 400) -> gaussians.Gaussians:
     return gaussians.from_mesh(mesh, number, np.random.default_rng(0))
 
 
-def test_they_lie_flat_on_the_surface():
+def test_gaussians_are_flat_on_the_surface():
     cloud = ball()
     radius = cloud.means.norm(dim=-1)
     assert radius.min() > 0.46 and radius.max() < 0.5001
@@ -31,7 +29,7 @@ def test_they_lie_flat_on_the_surface():
     assert along.min() > 0.95, "the thin axis looks outwards"
 
 
-def test_file_has_rows_of_248_bytes_and_leaves_out_what_cannot_be_seen(tmp_path):
+def test_file_has_rows_of_248_bytes_without_transparent_gaussians(tmp_path):
     cloud = ball(number=50)
     with torch.no_grad():
         cloud.opacity_logit[3] = -20.0
@@ -47,7 +45,7 @@ def test_file_has_rows_of_248_bytes_and_leaves_out_what_cannot_be_seen(tmp_path)
     torch.testing.assert_close(back.opacity, cloud.opacity[keep])
 
 
-def test_the_animal_turns_with_its_root_and_bones():
+def test_gaussians_follow_root_and_bones():
     agent, rest = ball(0.2), torch.eye(4).repeat(2, 1, 1)
     splats = Splats(ball(), agent, torch.full((len(agent), 2), 0.5), rest, videos=1)
     motion = rigid_torch.se3_exp(torch.tensor([0.3, -0.8, 0.2, 0.4, 0.1, -0.3]))
@@ -61,7 +59,7 @@ def test_the_animal_turns_with_its_root_and_bones():
     )
 
 
-def test_a_picture_of_known_gaussians_is_approached():
+def test_optimization_converges_to_a_known_picture():
     camera = torch.eye(4)
     camera[2, 3] = 1.5
     intrinsics = torch.tensor([[40.0, 0, 20], [0, 40.0, 15], [0, 0, 1]])
@@ -83,7 +81,7 @@ def test_a_picture_of_known_gaussians_is_approached():
     assert abs(truth.depth[15, 20] - 1.0) < 0.05, "metres: the front of a ball of 0.5 m at 1.5 m"
 
 
-def test_the_animal_hides_the_room_behind_it():
+def test_animal_occludes_the_room():
     splats = Splats(ball(), ball(0.2), torch.ones(400, 1), torch.eye(4)[None], videos=1)
     camera = torch.eye(4)
     camera[2, 3] = 1.5
@@ -95,12 +93,12 @@ def test_the_animal_hides_the_room_behind_it():
     assert view.agent[15, 20] > 0.9 and view.agent[1, 1] < 0.05
 
 
-def test_flow_cells_meet_the_pixels_under_them():
+def test_flow_cells_correspond_to_pixels():
     row, column = views.flow_lattice(80, 60, (320, 240), (160, 120))
     assert row[0, 0] == 1 and row[-1, 0] == 159 and column[0, -1] == 119
 
 
-def test_what_is_out_of_view_can_be_left_out():
+def test_gaussians_outside_the_view_are_culled():
     splats = Splats(ball(), ball(0.2), torch.ones(400, 1), torch.eye(4)[None], videos=1)
     camera, intrinsics = torch.eye(4), torch.tensor([[40.0, 0, 20], [0, 40.0, 15], [0, 0, 1]])
     camera[0, 3], camera[2, 3] = -0.4, 0.3

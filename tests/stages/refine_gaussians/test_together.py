@@ -1,4 +1,4 @@
-"""Two processes draw a frame each and refine as one does on both."""
+"""Two processes that render one frame each agree with one that renders both."""
 
 import sys
 from dataclasses import replace
@@ -22,7 +22,7 @@ STEPS = 4
 
 
 def refined(steps: int) -> tuple[FitRecord, torch.Tensor]:
-    """Refine a room and an animal; the last frame has no later one, and so no flow."""
+    """Refine a room and an animal; the last frame has no flow."""
     torch.manual_seed(0)
     splats = Splats(ball(0.5, 60), ball(0.2, 60), torch.ones(60, 1), torch.eye(4)[None], videos=1)
     deltas, sequence = MotionDeltas(4, 1), session()
@@ -32,7 +32,7 @@ def refined(steps: int) -> tuple[FitRecord, torch.Tensor]:
 
 
 def side(rank: int, port: str, folder: Path) -> tuple[FitRecord, torch.Tensor]:
-    """Do what one process of two does, and leave what it found in a file."""
+    """Run one of two processes and save its result."""
     two_processes.join(rank, port)
     record, found = refined(2 * STEPS)
     torch.save(found, folder / f"rank{rank}.pt")
@@ -42,7 +42,7 @@ def side(rank: int, port: str, folder: Path) -> tuple[FitRecord, torch.Tensor]:
 
 
 @pytest.mark.slow
-def test_two_processes_refine_as_one_does_on_both_frames(tmp_path, monkeypatch):
+def test_two_processes_agree_with_one(tmp_path, monkeypatch):
     with two_processes.started(__name__, tmp_path, monkeypatch) as port:
         record, found = side(0, port, tmp_path)
     assert len(record.total()) == STEPS, "each process draws half of the frames"

@@ -1,4 +1,4 @@
-"""The animal's root: the body is fitted from wrong starts, gaps stay NaN, noise is calmed."""
+"""Agent roots: fitting from wrong initial headings, NaN gaps, smoothing."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ K = np.array([[236.0, 0, 120], [0, 236.0, 160], [0, 0, 1]])
 
 
 def animal() -> Mesh:
-    """Body, head, tail and legs of boxes; dark in front, light behind."""
+    """Body, head, tail and legs as boxes; dark front, light back."""
     parts = [
         ((0.14, 0.15, 0.4), (0, 0, 0)),
         ((0.12, 0.13, 0.14), (0, 0.12, 0.24)),
@@ -45,7 +45,7 @@ def observation_of(mesh: Mesh, world_from_agent: np.ndarray, frame: int = 0) -> 
 
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 70.0, 160.0, -100.0])
-def test_body_is_found_from_all_headings(yaw_deg):
+def test_root_is_found_from_all_initial_headings(yaw_deg):
     mesh = animal()
     model = agent_fit.make_model(mesh, np.random.default_rng(0))
     truth = rigid.make(rigid.rotation_from_vector(UP * np.deg2rad(yaw_deg)), np.array([0.1, 0.22, -0.05]))
@@ -59,7 +59,7 @@ def test_body_is_found_from_all_headings(yaw_deg):
     assert best[1, 1] > 1 - 1e-4, "upright"
 
 
-def test_tilt_is_followed_when_asked():
+def test_tilt_is_estimated_if_enabled():
     mesh = animal()
     model = agent_fit.make_model(mesh, np.random.default_rng(0))
     truth = rigid.make(
@@ -71,7 +71,7 @@ def test_tilt_is_followed_when_asked():
     assert np.rad2deg(rigid.rotation_angle(placed[:3, :3], truth[:3, :3])) < 10, "degrees, of 20"
 
 
-def test_smoothing_keeps_gaps_and_calms_noise():
+def test_smoothing_keeps_gaps_and_reduces_noise():
     rng, time = np.random.default_rng(0), np.arange(50) * 0.1
     truth = rigid.make(
         rigid.rotation_from_vector(0.5 * time[:, None] * UP),
@@ -89,7 +89,7 @@ def test_smoothing_keeps_gaps_and_calms_noise():
     assert after < 0.7 * before
 
 
-def test_an_animal_that_lies_is_not_lifted_to_where_it_would_stand():
+def test_lying_animal_is_not_lifted_to_standing_height():
     mesh = animal()
     model = agent_fit.make_model(mesh, np.random.default_rng(0))
     truth = rigid.make(rigid.rotation_from_vector(UP * 0.6), np.array([0.1, 0.22, -0.05]))
@@ -102,15 +102,15 @@ def test_an_animal_that_lies_is_not_lifted_to_where_it_would_stand():
 def partly(
     observation: agent_fit.AgentObservation, agent_from_world: np.ndarray
 ) -> agent_fit.AgentObservation:
-    """Leave the hind part of the animal."""
+    """Keep only the hind part of the animal."""
     hind = rigid.apply(agent_from_world, observation.points_world)[:, 2] < -0.12
     return replace(
         observation, points_world=observation.points_world[hind], color=observation.color[hind], share=0.1
     )
 
 
-def test_what_shows_little_is_tracked_from_what_shows_more_or_is_not_placed():
-    """Ten frames of a turn; of four only the hind part is seen, and of two more, after two seconds."""
+def test_partial_views_are_tracked_or_left_without_root():
+    """Ten frames of a turn; four show only the hind part, and two more do after two seconds."""
     mesh, time = animal(), np.append(np.arange(10) * 0.1, [3.0, 3.1])
     model = agent_fit.make_model(mesh, np.random.default_rng(0))
     truth = rigid.make(

@@ -1,4 +1,4 @@
-"""An animal of another size than the template's is noticed, whatever its legs do."""
+"""Animals whose size differs from the template are detected, independently of the pose of their legs."""
 
 from dataclasses import dataclass, replace
 
@@ -27,7 +27,7 @@ def _body(swing: float = 0.0) -> Mesh:
 
 @dataclass(frozen=True)
 class Filmed:
-    """A `Clip` and its `Masks` of one animal before a wall."""
+    """A `Clip` and `Masks` of an animal in front of a wall."""
 
     seen: list[np.ndarray]
     """depth of the animal alone"""
@@ -44,7 +44,7 @@ class Filmed:
 
 
 def _compared(size: float, frames: int = FRAMES):
-    """Film a walking animal so many times larger than the template, both with their paws on the floor."""
+    """Render a walking animal scaled relative to the template, both with paws on the floor."""
     rng, root = np.random.default_rng(0), np.eye(4)
     eyes = [np.array([2 * np.sin(a), 0.8, 2 * np.cos(a)]) for a in rng.uniform(0, 2 * np.pi, frames)]
     cameras = np.stack([rigid.look_at(eye, np.zeros(3), UP) for eye in eyes])
@@ -60,20 +60,20 @@ def _compared(size: float, frames: int = FRAMES):
 
 
 @pytest.mark.parametrize("size", [0.97, 1.0, 1.03])
-def test_the_right_animal_has_its_size(size):
+def test_animal_of_the_template_has_scale_one(size):
     found = _compared(size)
     assert found.better is None, found
     assert found.iou > 0.7
 
 
 @pytest.mark.parametrize(("size", "better"), [(0.8, 0.8), (1.1, 1.1), (1.25, 1.25)])
-def test_another_size_is_named(size, better):
+def test_other_sizes_are_measured(size, better):
     found = _compared(size)
     assert found.better == better, found
     assert found.better_iou > found.iou
 
 
-def test_an_animal_that_is_never_placed_has_no_size():
+def test_animal_without_roots_has_no_size():
     nowhere = np.full((3, 4, 4), np.nan)
     found = compare_sizes(Filmed([]), Filmed([]), _body(), np.repeat(np.eye(4)[None], 3, axis=0), nowhere)
     assert found.frames == 0

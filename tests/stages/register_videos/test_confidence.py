@@ -1,6 +1,4 @@
-"""Confidence says what is known: how firmly poses are held, and how seldom a wrong pose looks so much
-alike.
-"""
+"""Pose confidence from covariance and from appearance compared with decoy poses."""
 
 import numpy as np
 import pytest
@@ -9,7 +7,7 @@ from pipeline.geometry import rigid
 from stages.register_videos import confidence
 
 
-def test_near_probability_is_the_share_of_draws_that_stay_near():
+def test_near_probability_equals_a_monte_carlo_estimate():
     rng = np.random.default_rng(0)
     sigma = (
         np.array([0.5, 1.0, 3.0])[:, None] * np.array([confidence.TOL_RAD] * 3 + [confidence.TOL_M] * 3) / 2
@@ -24,7 +22,7 @@ def test_near_probability_is_the_share_of_draws_that_stay_near():
 
 
 @pytest.mark.parametrize(("right", "low", "high"), [(1.0, 0.9, 1.0), (0.0, 0.0, 0.1), (0.5, 0.35, 0.6)])
-def test_what_looks_like_decoys_is_not_the_right_place(right, low, high):
+def test_poses_that_look_like_decoys_have_low_confidence(right, low, high):
     rng = np.random.default_rng(1)
     decoys = rng.normal(0.1, 0.15, 100)
     targets = np.where(np.arange(400) < right * 400, rng.normal(0.85, 0.05, 400), rng.normal(0.1, 0.15, 400))
@@ -33,7 +31,7 @@ def test_what_looks_like_decoys_is_not_the_right_place(right, low, high):
     assert np.corrcoef(found, targets)[0, 1] > 0.9 or right in (0.0, 1.0)
 
 
-def test_nothing_to_compare_is_no_confidence():
+def test_confidence_without_comparison_is_zero():
     assert (confidence.place_probability(np.full(5, np.nan), np.array([0.1]), 3) == 0).all()
     assert (confidence.place_probability(np.full(5, 0.9), np.array([np.nan]), 3) < 0.2).all(), (
         "no decoy, no evidence"
@@ -50,7 +48,7 @@ def test_decoys_are_wrong():
     assert np.allclose(rigid.log(rigid.exp(twist))[:, 3:], twist[:, 3:], atol=1e-6)
 
 
-def test_averages_leave_what_is_far_unknown():
+def test_averages_are_unknown_far_from_samples():
     time = np.arange(20.0)
     found = confidence.kernel_mean(time, time[:5], np.linspace(0, 1, 5), 1.0)
     assert found[2] == pytest.approx(0.5, abs=0.02)

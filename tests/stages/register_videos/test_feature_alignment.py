@@ -1,6 +1,4 @@
-"""Feature-metric alignment: rendered template features pull a camera to its pose, whatever the pictures'
-light.
-"""
+"""Feature-metric alignment of a camera to rendered template features, independent of light."""
 
 from dataclasses import replace
 
@@ -20,7 +18,7 @@ CHANNELS = 16
 
 @pytest.fixture(scope="module")
 def scene():
-    """A room whose features are smooth waves of the position, and what a camera sees of them."""
+    """A room whose features are smooth functions of position, and its view from a camera."""
     mesh, truth = textured_room(edge_m=0.04), walk(8)[3]
     rng = np.random.default_rng(0)
     waves = mesh.vertices @ rng.normal(0, 1.5, (3, CHANNELS)) + rng.uniform(0, 6, CHANNELS)
@@ -36,7 +34,7 @@ def scene():
     return clip, FeatureMap(caster, vertex, seen / np.linalg.norm(seen, axis=-1, keepdims=True)), truth
 
 
-def test_features_pull_a_camera_to_its_pose(scene):
+def test_alignment_recovers_the_pose(scene):
     clip, features, truth = scene
     moved = truth @ rigid.exp(np.array([0.008, -0.01, 0.004, 0.015, 0.01, -0.01]))
     poses = moved[None]
@@ -48,13 +46,13 @@ def test_features_pull_a_camera_to_its_pose(scene):
     assert errors.meters[1] < 0.25 * errors.meters[0]
 
 
-def test_the_truth_is_a_fixed_point(scene):
+def test_true_pose_is_a_fixed_point(scene):
     clip, features, truth = scene
     matches = feature_correspondences(clip, NoAgent(1), features, 0, truth)
     assert np.abs(residuals(truth[None], matches)).max() < 1e-4, "metres"
 
 
-def test_features_that_say_nothing_align_nothing(scene):
+def test_constant_features_do_not_move_the_camera(scene):
     clip, features, truth = scene
     flat = np.full_like(features.frame_features, CHANNELS**-0.5)
     matches = feature_correspondences(clip, NoAgent(1), replace(features, frame_features=flat), 0, truth)

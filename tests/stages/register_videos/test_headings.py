@@ -1,6 +1,4 @@
-"""Front and back are told apart by walking, and kept while the animal is hardly seen, while it rests, while
-it turns.
-"""
+"""Front and back are distinguished by walking, and the decision persists during occlusion, rest and turns."""
 
 import numpy as np
 import pytest
@@ -22,7 +20,7 @@ def seen(
     misfit: float = 5.0,
     eye=(2.0, 1, 0),
 ) -> RootHypotheses:
-    """Return a front and a back placement; the wrong one looks better by ``advantage`` units."""
+    """Return a front and a back hypothesis; the wrong one scores better by ``advantage``."""
     yaw, place = np.deg2rad([yaw_deg, yaw_deg + 180]), np.asarray(place, float)
     poses = rigid.make(rigid.rotation_from_vector(yaw[:, None] * UP), np.repeat(place[None], 2, axis=0))
     return RootHypotheses(
@@ -34,19 +32,19 @@ def chosen(sights: list[RootHypotheses]) -> list[int]:
     return headings.choose_hypotheses(np.arange(len(sights)) * 0.1, sights)
 
 
-def test_animals_walk_head_first():
+def test_walking_direction_determines_the_heading():
     assert chosen([seen(frame, 0.0, (0, 0, 0.06 * frame), 1.5) for frame in range(30)]) == [0] * 30
 
 
-def test_a_template_whose_head_is_the_tail_walks_the_other_way():
-    """An animal whose looks say clearly in every frame that it walks along -z."""
+def test_reversed_template_is_detected():
+    """The appearance clearly indicates in every frame that the animal walks along -z."""
     there_and_back = 3.0 - np.abs(np.arange(60) * 0.06 - 1.8)
     yaw = np.where(np.arange(60) < 30, 180.0, 0.0)
     sights = [seen(frame, yaw[frame], (0, 0, there_and_back[frame]), -3.0) for frame in range(60)]
     assert chosen(sights) == [0] * 60
 
 
-def test_what_was_learned_walking_is_kept_at_rest():
+def test_heading_persists_at_rest():
     z = np.minimum(np.arange(40), 15) * 0.06
     assert (
         chosen([seen(frame, 0.0, (0, 0, z[frame]), 1.0 if frame > 18 else -1.0) for frame in range(40)])
@@ -55,14 +53,14 @@ def test_what_was_learned_walking_is_kept_at_rest():
 
 
 @pytest.mark.parametrize("spoilt", [{"share": 0.02}, {"misfit": 60.0}])
-def test_frames_that_show_little_or_fit_badly_do_not_turn_it_round(spoilt):
+def test_occluded_and_badly_fitted_frames_do_not_flip_the_heading(spoilt):
     sights = [seen(frame, 0.0, (0, 0, 0), -2.0, eye=(2, 1, 0.1 * frame)) for frame in range(40)]
     for frame in range(15, 25):
         sights[frame] = seen(frame, 0.0, (0, 0, 0), 6.0, eye=(2, 1, 0.1 * frame), **spoilt)
     assert chosen(sights) == [0] * 40
 
 
-def test_noise_of_single_placements_is_no_turn():
+def test_noise_does_not_flip_the_heading():
     rng = np.random.default_rng(0)
     yaw = 1.5 * np.arange(60) + rng.normal(0, 20, 60)
     sights = [
@@ -76,7 +74,7 @@ def test_noise_of_single_placements_is_no_turn():
     )
 
 
-def test_an_animal_may_turn_round_in_a_second():
+def test_turn_within_a_second_is_tracked():
     yaw = np.clip((np.arange(40) - 15) * 20.0, 0, 180)
     sights = [seen(frame, yaw[frame], (0, 0, 0), -2.0, eye=(2, 1, 0.1 * frame)) for frame in range(40)]
     assert chosen(sights) == [0] * 40

@@ -1,4 +1,4 @@
-"""Points of the walk-through's pictures move a session's cameras to where they were."""
+"""Alignment of session cameras to points of the walk-through."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ NOTHING = Correspondences(NO_INDEX, NO_INDEX, NO_POINT, NO_POINT, NO_POINT, np.z
 FRAMES = 6
 
 
-def test_displaced_cameras_return():
+def test_displaced_cameras_are_corrected():
     caster, path, truth = RayCaster(textured_room()), walk(14), walk(14)[1:13:2].copy()
     truth = truth @ rigid.exp(np.tile([0.03, -0.02, 0.02, 0.03, 0.02, -0.03], (FRAMES, 1)))
     known = path.copy()

@@ -1,6 +1,4 @@
-"""A whole recording in a textured room: registered to a degree and centimetres, its confidence sane, a
-foreign room refused.
-"""
+"""Registration of a recording in a textured room: accuracy, confidence, and rejection of other rooms."""
 
 from dataclasses import replace
 
@@ -54,7 +52,7 @@ def test_recording_is_registered(maps, with_odometry):
 
 
 @pytest.mark.slow
-def test_a_jump_of_the_phones_odometry_displaces_nothing(maps):
+def test_registration_is_robust_to_a_tracking_jump(maps):
     truth = walk(40, seed=7)
     odometry = drifting(truth, 2, deg=0.03, m=0.001)
     odometry[20:, :3, 3] += np.array([0.5, 0.0, 0.35])
@@ -67,8 +65,8 @@ def test_a_jump_of_the_phones_odometry_displaces_nothing(maps):
 
 
 @pytest.mark.slow
-def test_cameras_that_come_from_the_map_are_kept_and_only_believed_where_pictures_agree(maps):
-    """Depth that was cast from a camera fits the map wherever the camera is, and must not confirm it."""
+def test_mapped_cameras_are_kept_and_confirmed_only_by_pictures(maps):
+    """Depth rendered from a camera pose fits the map for any pose, and must not confirm it."""
     truth = walk(40, seed=7)
     clip = MemoryClip(RayCaster(maps.scene), truth, truth, mapped=True)
     found = registration.register(clip, NoAgent(40), maps, RegistrationConfig(), np.random.default_rng(0))
@@ -82,7 +80,7 @@ def test_cameras_that_come_from_the_map_are_kept_and_only_believed_where_picture
 
 
 @pytest.mark.slow
-def test_foreign_room_is_refused(maps):
+def test_other_room_is_rejected(maps):
     truth = walk(40, seed=7)
     other = textured_room(seed=99)
     stretched = Mesh(other.vertices * np.array([1.5, 1.0, 0.8], np.float32), other.faces, other.color)
@@ -92,8 +90,8 @@ def test_foreign_room_is_refused(maps):
     assert found.reason
 
 
-def test_a_recording_of_the_right_shape_in_the_wrong_place_is_not_trusted(maps):
-    """Half a turn about the middle of a rectangular room fits depth as well, and no picture."""
+def test_symmetric_pose_has_low_confidence(maps):
+    """A rotation by 180 degrees about the centre of a rectangular room fits depth, but no picture."""
     truth = walk(40, seed=7)
     caster = RayCaster(maps.scene)
     middle = rigid.make(np.eye(3), (maps.scene.vertices.min(0) + maps.scene.vertices.max(0)) / 2)
@@ -107,7 +105,7 @@ def test_a_recording_of_the_right_shape_in_the_wrong_place_is_not_trusted(maps):
         assert low <= confidence.mean() <= high
 
 
-def test_pictures_pull_a_camera_along_a_wall(maps):
+def test_pictures_constrain_motion_along_a_wall(maps):
     truth = walk(8)[3]
     clip = MemoryClip(RayCaster(maps.scene), truth[None], None, noise_m=0.0)
     moved = truth @ rigid.exp(np.array([0.01, -0.01, 0.0, 0.03, 0.02, 0.0]))
@@ -119,7 +117,7 @@ def test_pictures_pull_a_camera_along_a_wall(maps):
     assert after < 0.5 * before, "the flow asks for the true pose"
 
 
-def test_votes_come_from_masked_frames_only(maps):
+def test_votes_use_only_frames_with_masks(maps):
     truth = walk(12)
     clip = MemoryClip(RayCaster(maps.scene), truth, None)
     hidden = NoAgent(12)
@@ -132,8 +130,8 @@ def test_votes_come_from_masked_frames_only(maps):
 
 
 @pytest.mark.slow
-def test_a_repainted_room_of_the_same_shape_is_refused(maps):
-    """In dim light as well, and unless frames were recognised with certainty."""
+def test_repainted_room_is_rejected(maps):
+    """In dim light too, unless frames were recognized with certainty."""
     truth, caster, rng = walk(40, seed=7), RayCaster(maps.scene), np.random.default_rng(0)
     config = RegistrationConfig(confidence=ConfidenceConfig(decoys=60))
     right = {}
@@ -160,7 +158,7 @@ def test_a_repainted_room_of_the_same_shape_is_refused(maps):
     ), "chance, of so many"
 
 
-def test_frames_without_static_depth_do_not_speak_against_a_recording(maps):
+def test_frames_without_static_depth_are_ignored(maps):
     truth, config = walk(12), RegistrationConfig()
     clip, surface = MemoryClip(RayCaster(maps.scene), truth, None), depth_scans.SurfaceMap(maps.scene)
     seen = [
@@ -185,7 +183,7 @@ def test_frames_without_static_depth_do_not_speak_against_a_recording(maps):
 
 
 @pytest.mark.filterwarnings("error")
-def test_what_was_not_measured_is_null(maps):
+def test_unmeasured_values_are_null(maps):
     truth, nothing = walk(3), np.full(3, np.nan)
     aligned = alignment.AlignedCameras(truth, np.zeros((3, 6, 6)), nothing, nothing)
     found = registration.Registered(
@@ -202,12 +200,12 @@ def test_what_was_not_measured_is_null(maps):
     assert [check.status for check in pictures.checks(found) if "depth" in check.name] == ["warn", "warn"]
 
 
-def test_a_refusal_names_the_nearest_moment_of_the_walk():
+def test_rejection_names_the_nearest_frame_of_the_walkthrough():
     path = walk(30)
     assert pictures.nearest_frame(path, path[17] @ rigid.exp(np.array([0.02, 0, 0, 0.01, 0, 0]))) == 17
 
 
-def test_walking_tail_first_is_found():
+def test_reversed_heading_is_detected():
     ahead = np.tile(np.eye(4), (30, 1, 1))
     ahead[:, 2, 3] = 0.06 * np.arange(30)
     ahead[10] = np.nan

@@ -1,6 +1,4 @@
-"""Votes: the motion most of them share is found among wrong ones, and too little agreement is refused in
-words.
-"""
+"""Voting for a common transform: robustness to outliers, and rejection with a reason."""
 
 import numpy as np
 
@@ -15,7 +13,7 @@ from tests.stages.textured_room import UP, drifting, walk
 
 
 def cast(truth, frames, wrong, rng) -> voting.FrameVotes:
-    """Return votes with 1 deg and 2 cm of noise, some of them anywhere."""
+    """Return votes with noise of 1 degree and 2 cm, and random outliers."""
     hypotheses = []
     for frame, bad in zip(frames, wrong, strict=True):
         pose = truth[frame] @ rigid.exp(rng.normal(0, 1, 6) * ([np.deg2rad(1.0)] * 3 + [0.02] * 3))
@@ -40,7 +38,7 @@ def test_one_motion_is_found_among_wrong_votes():
     assert agreement.world_from_odometry[1, 1] > 1 - 1e-9, "gravity stays"
 
 
-def test_scattered_votes_are_refused():
+def test_scattered_votes_are_rejected():
     rng, truth, options = np.random.default_rng(1), walk(60), VoteConfig()
     frames = np.arange(2, 60, 5)
     votes = cast(truth, frames, np.ones(len(frames), bool), rng)
@@ -51,7 +49,7 @@ def test_scattered_votes_are_refused():
 
 
 def broken_odometry(truth, jump_at) -> Odometry:
-    """Return odometry that drifts, with one jump."""
+    """Return drifting odometry with one jump."""
     poses, jumps = drifting(truth, 5), np.zeros(len(truth), bool)
     jumps[jump_at] = True
     poses[jump_at:] = rigid.exp(np.array([0, 0.5, 0, 0.3, 0, 0.2])) @ poses[jump_at:]
@@ -59,7 +57,7 @@ def broken_odometry(truth, jump_at) -> Odometry:
     return Odometry(poses, jumps, factors)
 
 
-def test_without_odometry_votes_are_propagated_by_visual_odometry_and_outliers_dropped():
+def test_votes_without_odometry_use_visual_odometry_and_drop_outliers():
     rng, truth, options = np.random.default_rng(2), walk(60), VoteConfig()
     frames = np.arange(2, 60, 5)
     wrong = np.isin(np.arange(len(frames)), [3, 8])

@@ -1,4 +1,4 @@
-"""The report judges honestly, shows every note and asks nothing of the network."""
+"""The report shows every note, gives correct verdicts, and works offline."""
 
 import ast
 import base64
@@ -34,7 +34,7 @@ VIDEOS = tuple(
 
 
 def write_notes(build: Path, metrics: dict[str, float | None], reasons: dict[str, str]) -> dict[str, Path]:
-    """Write one small artifact per chapter, or per recording, with a note and a picture."""
+    """Write one small artifact per chapter or recording, with a note and a picture."""
     rng = np.random.default_rng(0)
     for chapter in CHAPTERS:
         videos = (
@@ -64,7 +64,7 @@ def write_notes(build: Path, metrics: dict[str, float | None], reasons: dict[str
 
 
 def inputs_of(paths: dict[str, Path]) -> stage.Inputs:
-    """Return the artifacts as the stage takes them."""
+    """Return the artifacts as inputs of the stage."""
     several = {chapter.artifact for chapter in CHAPTERS if chapter.per_video}
     return stage.Inputs(
         **{
@@ -86,7 +86,7 @@ def make_report(build: Path, out: Path) -> dict[str, str]:
     return {path.name: path.read_text() for path in out.glob("*.html")}
 
 
-def test_every_note_is_shown_and_nothing_is_asked_for(tmp_path: Path) -> None:
+def test_every_note_is_shown_without_network_requests(tmp_path: Path) -> None:
     texts = make_report(tmp_path / "first", tmp_path / "report")
     assert set(texts) == {"index.html", *(f"{chapter.artifact}.html" for chapter in CHAPTERS)}
     for name, text in texts.items():
@@ -108,7 +108,7 @@ def chapter_report(artifact_name: str, light: str, *stands_on: str) -> collect.C
     return collect.ChapterReport(chapter, [note], {}, frozenset(stands_on))
 
 
-def test_a_verdict_is_the_worst_of_its_own_and_of_what_it_stands_on() -> None:
+def test_verdict_includes_the_inputs() -> None:
     chapters = [
         chapter_report("frames", "ok"),
         chapter_report("masks", "fail", "frames"),
@@ -127,14 +127,14 @@ def test_a_verdict_is_the_worst_of_its_own_and_of_what_it_stands_on() -> None:
     assert judged["evaluation"].causes == (), "its own bars"
 
 
-def test_feet_that_slide_are_not_fine() -> None:
+def test_foot_skate_gives_a_warning() -> None:
     slide = {"behavior/ats/foot_slide_m_s": 0.14, "behavior/recorded/foot_slide_m_s": 0.04}
     judged = bars.judge(slide, {})
     assert [row.limit for row in judged if "foot" in row.bar.metric] == [pytest.approx(0.06)]
     assert bars.worst(judged) == "fail" and bars.worst(bars.judge({}, {})) == "ok"
 
 
-def test_a_missed_bar_is_named_where_it_makes_a_page_red(tmp_path: Path) -> None:
+def test_failed_limit_is_named(tmp_path: Path) -> None:
     texts = make_report(tmp_path / "first", tmp_path / "report")
     for page in ("index.html", "evaluation.html"):
         shown = " ".join(re.sub(r"<[^>]*>", " ", texts[page]).split())
@@ -142,14 +142,14 @@ def test_a_missed_bar_is_named_where_it_makes_a_page_red(tmp_path: Path) -> None
     assert "Bars" not in texts["masks.html"], "only where they are judged"
 
 
-def test_the_sign_shown_is_the_comparison_made() -> None:
+def test_comparison_sign_is_correct() -> None:
     met = {"behavior/ats/foot_slide_m_s": 0.06, "behavior/recorded/foot_slide_m_s": 0.04}
     (feet,) = [row for row in bars.judge(met, {}) if row.value is not None]
     assert (feet.bar.sign, feet.verdict) == ("≤", "ok"), "exactly at the limit"
     assert {bar.sign for bar in bars.BARS if "location prior" in bar.words} == {"<"}
 
 
-def test_what_stands_between_backticks_is_code(tmp_path: Path) -> None:
+def test_backticks_give_code(tmp_path: Path) -> None:
     environment = jinja2.Environment(loader=jinja2.PackageLoader("stages.report"), autoescape=True)
     macros = environment.get_template("layout.html").make_module({"words": {}, "marks": {}})
     assert str(macros.code("see `[a]` <b>")) == "see <code>[a]</code> &lt;b&gt;"
@@ -159,7 +159,7 @@ def test_what_stands_between_backticks_is_code(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path(browser.CHROMIUM).exists(), reason="Chromium is not installed")
-def test_a_check_with_small_limits_fits_a_phone(tmp_path: Path) -> None:
+def test_small_limits_fit_a_phone_screen(tmp_path: Path) -> None:
     texts = make_report(tmp_path / "first", tmp_path / "report")
     assert "≤ 1<" in texts["masks.html"]
     long = texts["masks.html"].replace("≤ 1<", "≤ 1.0e-04, ≤ 1.0e-04, ≤ 1.0e-04, ≤ 1.0e-04<")
@@ -170,7 +170,7 @@ def test_a_check_with_small_limits_fits_a_phone(tmp_path: Path) -> None:
         assert page.evaluate("document.documentElement.scrollWidth") <= 390, "pixels"
 
 
-def test_no_raw_key_reaches_a_reader(tmp_path: Path) -> None:
+def test_no_raw_key_is_shown(tmp_path: Path) -> None:
     index = make_report(tmp_path / "first", tmp_path / "report")["index.html"]
     shown = re.sub(r"<[^>]*>", " ", index)
     assert "overlap (IoU), mean" in shown and "LPIPS, whole picture" in shown
@@ -178,7 +178,7 @@ def test_no_raw_key_reaches_a_reader(tmp_path: Path) -> None:
     assert "prefers-color-scheme: dark" in index
 
 
-def test_same_notes_same_bytes(tmp_path: Path) -> None:
+def test_report_is_deterministic(tmp_path: Path) -> None:
     assert make_report(tmp_path / "first", tmp_path / "one") == make_report(
         tmp_path / "second", tmp_path / "two"
     )
@@ -187,7 +187,7 @@ def test_same_notes_same_bytes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("value", "verdict"), [(0.75, "ok"), (0.9, "ok"), (0.74, "fail"), (None, "none"), (float("nan"), "none")]
 )
-def test_a_limit_may_be_met(value: float | None, verdict: str) -> None:
+def test_limits_are_inclusive(value: float | None, verdict: str) -> None:
     judged = {
         row.bar.metric: row for row in bars.judge({"masks/iou_mean": value}, {"masks/iou_mean": "no truth"})
     }
@@ -195,7 +195,7 @@ def test_a_limit_may_be_met(value: float | None, verdict: str) -> None:
     assert (judged["masks/iou_mean"].reason == "no truth") == (verdict == "none")
 
 
-def test_a_baseline_must_be_beaten_and_all_videos_reached() -> None:
+def test_checks_of_baselines_and_coverage() -> None:
     even = {"behavior/ats/goal_minde_m": 0.3, "behavior/stand_still/goal_minde_m": 0.3}
     assert [
         row.verdict for row in bars.judge(even, {}) if row.bar.limit == "behavior/stand_still/goal_minde_m"
@@ -223,10 +223,8 @@ def test_numbers_are_readable(value: float | None, text: str) -> None:
     assert words.number(value) == text
 
 
-def test_a_safe_report_shows_no_view(tmp_path: Path) -> None:
-    """Neighbouring pixels of a blurred picture tell nothing of the original; drawn figures stay as they
-    are.
-    """
+def test_safe_report_blurs_camera_pictures(tmp_path: Path) -> None:
+    """A blurred picture does not reveal pixels of the original; plots are unchanged."""
     sharp = RNG.integers(0, 255, (96, 240, 3), dtype=np.uint8)
     for name in ("masks", "behavior"):
         folder = tmp_path / name
@@ -251,7 +249,7 @@ def embedded(chapter: collect.ChapterReport) -> np.ndarray:
 
 
 def judged_checks() -> list[tuple[str, str]]:
-    """Artifact and name of every check with a threshold that the stages' code spells out."""
+    """Artifact and name of every check whose threshold is a literal in a stage."""
     found = []
     for chapter in CHAPTERS:
         for file in (ROOT / "stages" / dag.NODES[chapter.artifact].stage.replace(".", "/")).glob("*.py"):
@@ -277,7 +275,7 @@ def test_every_threshold_has_a_remedy() -> None:
     assert [each for each in checks if not remedy(*each)] == []
 
 
-def test_worries_come_with_a_remedy(tmp_path: Path) -> None:
+def test_warnings_have_a_remedy(tmp_path: Path) -> None:
     known = {
         (chapter.artifact, begin)
         for chapter in CHAPTERS

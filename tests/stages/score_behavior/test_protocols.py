@@ -1,6 +1,4 @@
-"""Scores of a trial: the truth scores nothing, every family goes through both protocols that it knows, scenes
-are its own.
-"""
+"""Scores of a trial: an oracle has no error, and every method runs through its protocols in its own scenes."""
 
 from dataclasses import replace
 
@@ -35,7 +33,7 @@ def untrained(architecture):
 
 
 class Oracle:
-    """A sampler that is told the future, to try the protocols on."""
+    """A sampler that knows the future."""
 
     def __init__(self, architecture, data, index):
         context, future = data.windows(index)
@@ -59,7 +57,7 @@ class Oracle:
         return np.repeat(self.body, count, axis=0)
 
 
-def test_a_sampler_that_knows_the_future_makes_no_error_when_fed_with_it():
+def test_oracle_has_no_error():
     data, index = wandering(), np.array([0, 30, 100])
     context, future = data.windows(index)
     ats = replace(untrained(ARCHITECTURE), sampler=Oracle(ARCHITECTURE, data, index))
@@ -80,7 +78,7 @@ def test_a_sampler_that_knows_the_future_makes_no_error_when_fed_with_it():
     ],
     ids=lambda changes: "-".join(map(str, changes.values())) or "ats",
 )
-def test_every_method_goes_through_the_protocols_it_knows(changes):
+def test_every_method_runs_through_its_protocols(changes):
     architecture = replace(ARCHITECTURE, **changes)
     data = wandering().with_horizon(architecture.future)
     found = protocols.scores(untrained(architecture), data, architecture.family, EFFORT)
@@ -95,7 +93,7 @@ def test_every_method_goes_through_the_protocols_it_knows(changes):
     assert found["recorded/solid"].tolist() == again["recorded/solid"].tolist()
 
 
-def test_windows_are_seen_in_their_own_scene():
+def test_windows_are_observed_in_their_own_scene():
     data, open_room = wandering(), room()
     walls = replace(open_room, occupancy=np.ones_like(open_room.occupancy), features=open_room.features * 0)
     scenes = Scenes((open_room, walls), (open_room.occupancy != 1, walls.occupancy != 1), np.array([0, 0, 1]))
@@ -107,7 +105,7 @@ def test_windows_are_seen_in_their_own_scene():
     assert np.abs(grids[0]).max() > 0 and np.abs(grids[1]).max() == 0
 
 
-def test_flight_is_counted_as_the_animal_does_it():
+def test_flight_rate_is_that_of_the_animal():
     steps = np.concatenate([np.zeros(8), np.linspace(0, 2, 56)])
     poses = np.tile(np.eye(4), (2, 3, 64, 1, 1))
     poses[0, :, :, 2, 3] = steps
@@ -121,8 +119,8 @@ def test_flight_is_counted_as_the_animal_does_it():
     assert found["flees/seen"].shape == (3,)
 
 
-def test_a_gaussian_draws_what_its_networks_tell():
-    class Told:
+def test_gaussian_samples_have_the_predicted_moments():
+    class FixedNetworks:
         def perceive(self, grid, others, past, keep):
             return np.zeros((len(past), 1), np.float32)
 
@@ -133,7 +131,7 @@ def test_a_gaussian_draws_what_its_networks_tell():
             return np.ones_like(x) if t[0] == samplers.MEAN_STEP else np.full_like(x, -9)
 
     scaling = Scaling(np.full(3, 0.3), np.ones(4), np.ones((3, 56)), np.zeros(6), np.ones(6))
-    sampler = samplers.GaussianSampler(Told(), STANDARD, scaling)
+    sampler = samplers.GaussianSampler(FixedNetworks(), STANDARD, scaling)
     codes = sampler.codes(behavior_observation(), PlanSamplingConfig(), 4000)
     goals = sampler.goals(codes, PlanSamplingConfig(), np.random.default_rng(0))
     drawn = scaling.scaled_goal(goals)
@@ -149,7 +147,7 @@ def test_a_gaussian_draws_what_its_networks_tell():
     ("method", "steps", "calls"), [("dpm_solver", 0, 9), ("ddpm", 0, 50), ("ddpm", 10, 9)]
 )
 def test_networks_alone_sample_by_the_schedule_and_do_not_snap_to_goals(method, steps, calls):
-    class Counted:
+    class CountingNetworks:
         def __init__(self):
             self.calls = 0
 
@@ -160,7 +158,10 @@ def test_networks_alone_sample_by_the_schedule_and_do_not_snap_to_goals(method, 
             self.calls += 1
             return x
 
-    scaling, counted = Scaling(np.ones(3), np.ones(4), np.ones((3, 56)), np.zeros(6), np.ones(6)), Counted()
+    scaling, counted = (
+        Scaling(np.ones(3), np.ones(4), np.ones((3, 56)), np.zeros(6), np.ones(6)),
+        CountingNetworks(),
+    )
     sampler, goal = Sampler(counted, replace(STANDARD, method=method), scaling), np.full((4, 3), 2.0)
     snapped = PlanSamplingConfig(guidance=1.0, max_path_draws=1, sequence_steps=steps)
     alone, ends = snapped.networks_only(), []

@@ -1,4 +1,4 @@
-"""Depth steps are sharp again, and a texture a little askew is no other colour."""
+"""Sharpening of depth edges, and colour evidence that tolerates misalignment."""
 
 import numpy as np
 import pytest
@@ -9,20 +9,20 @@ from stages.segment_agent.windows import Window, snap_depth_steps
 
 
 @pytest.mark.parametrize(("share", "nearer"), [(0.4, 1.5), (0.6, 2.5)])
-def test_what_floats_between_two_surfaces_goes_to_the_nearer_one(share, nearer):
+def test_flying_pixels_are_assigned_to_the_nearer_surface(share, nearer):
     step = np.where(np.arange(40) < 20, 1.5, 2.5)[None].repeat(30, 0).astype(np.float32)
     blurred, expected = step.copy(), step.copy()
     blurred[:, 20], expected[:, 20] = 1.5 + share, nearer
     np.testing.assert_array_equal(snap_depth_steps(blurred), expected)
 
 
-def test_a_slope_and_unknown_depth_stay():
+def test_slopes_and_unknown_depth_are_unchanged():
     slope = np.linspace(1, 2, 60)[None].repeat(30, 0).astype(np.float32)
     slope[10:14, 20:24] = 0
     np.testing.assert_array_equal(snap_depth_steps(slope), slope)
 
 
-def test_only_what_is_no_neighbouring_colour_is_another_one():
+def test_colours_of_adjacent_pixels_are_tolerated():
     rng = np.random.default_rng(0)
     stripes = np.where(np.arange(60) // 6 % 2 == 0, 60, 200)[None, :, None].repeat(60, 0).repeat(3, 2)
     before = stripes + rng.normal(0, 2, stripes.shape)

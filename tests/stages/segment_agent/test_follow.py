@@ -1,4 +1,4 @@
-"""Masks from one box without depth, on drawn scenes."""
+"""Masks from one box without depth, on synthetic scenes."""
 
 from pathlib import Path
 
@@ -47,8 +47,8 @@ def _footage(folder: Path, pictures: list[np.ndarray], steps: list[np.ndarray]) 
     return Footage(Clip.open(folder), folder, SIZE[0])
 
 
-def test_motion_tells_the_animal_from_what_else_is_in_its_box(tmp_path):
-    """A wall of a color that is hardly seen outside the box stands in half of it; only the animal moves."""
+def test_motion_separates_the_animal_from_background_in_its_box(tmp_path):
+    """Half of the box shows a wall whose colour is rare outside; only the animal moves."""
     rng = np.random.default_rng(0)
     picture = np.full((*SIZE, 3), (40, 110, 40), np.uint8)
     picture[30:60, 40:120] = 190, 190, 180
@@ -65,7 +65,7 @@ def test_motion_tells_the_animal_from_what_else_is_in_its_box(tmp_path):
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory) -> tuple[Footage, list[np.ndarray]]:
-    """An animal walks to the right before a wall; something of its color stands at the wall."""
+    """An animal walks to the right in front of a wall with an object of its colour."""
     rng = np.random.default_rng(0)
     wall = np.clip(rng.normal((40, 110, 40), 12, (*SIZE, 3)), 0, 255).astype(np.uint8)
     coat = np.clip(rng.normal((150, 90, 50), 12, (*SIZE, 3)), 0, 255).astype(np.uint8)
@@ -81,7 +81,7 @@ def walk(tmp_path_factory) -> tuple[Footage, list[np.ndarray]]:
 
 
 @pytest.mark.parametrize("prompted", [0, 5])
-def test_an_animal_is_followed_both_ways(walk, prompted):
+def test_animal_is_tracked_forward_and_backward(walk, prompted):
     footage, masks = walk
     left = 20.0 + SHIFT_PX * prompted
     prompt = Prompt(prompted, (left, 40, left + 50, 80))
@@ -91,7 +91,7 @@ def test_an_animal_is_followed_both_ways(walk, prompted):
         assert ((mask.labels == 255) & true).sum() > 0.9 * ((mask.labels == 255) | true).sum()
 
 
-def test_labels_come_along_the_flow(walk):
+def test_labels_are_propagated_by_flow(walk):
     footage, masks = walk
     found: Beliefs = [None for _ in masks]
     found[0] = np.where(masks[0], MAX_LOG_ODDS, -MAX_LOG_ODDS).astype(np.float16)
@@ -100,7 +100,7 @@ def test_labels_come_along_the_flow(walk):
     assert not message(footage, 3, found).any(), "no flow is stored over three frames"
 
 
-def test_motion_speaks_for_what_moves_and_against_what_does_not(walk):
+def test_motion_evidence_has_the_right_sign(walk):
     footage, masks = walk
     inside = masks[4].copy()
     inside[84:94, 40:80] = True
@@ -117,7 +117,7 @@ def test_motion_speaks_for_what_moves_and_against_what_does_not(walk):
     assert (labels[84:94, 40:80] == 128).mean() > 0.9 and (labels[masks[4]] == 255).mean() > 0.6
 
 
-def test_parts_apart_from_the_animal_are_left_out():
+def test_disconnected_parts_are_removed():
     inside = np.zeros(SIZE, bool)
     inside[10:30, 10:30] = inside[10:30, 50:70] = True
     carried = inside & (np.arange(SIZE[1]) < 20)

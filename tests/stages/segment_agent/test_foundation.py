@@ -1,6 +1,4 @@
-"""Grounding DINO and SAM 2 as a backend: every frame a mask, in order, from whichever frame the animal was
-found in.
-"""
+"""Grounding DINO and SAM 2 as a backend: ordered masks for all frames, from any prompted frame."""
 
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ from tests.pipeline.backends import small_checkpoints
 
 
 class Clip:
-    """Nine pictures in which a patch moves."""
+    """Nine pictures with a moving patch."""
 
     folder = "memory"
     color_size = (48, 64)
@@ -35,7 +33,7 @@ def options(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_prompt_is_followed_to_both_ends(options):
+def test_prompt_is_propagated_in_both_directions(options):
     from pipeline.backends.sam2 import Sam2
 
     prompt, clip = Prompt(4, (14.0, 14, 40, 36)), Clip()
@@ -51,14 +49,14 @@ def test_a_prompt_is_followed_to_both_ends(options):
             )
 
 
-def test_the_detector_takes_the_place_of_a_prompt_or_says_that_it_found_nothing(options):
+def test_detector_replaces_the_prompt_or_reports_no_detection(options):
     assert len(list(foundation.segment(Clip(), None, options, "cpu"))) == 9
     strict = FoundationConfig(options.detector, options.tracker, threshold=1.0)
     with pytest.raises(InputError, match="MSK-004.*a cat"):
         foundation.segment(Clip(), None, strict, "cpu")
 
 
-def test_log_odds_become_labels():
+def test_log_odds_are_converted_to_labels():
     mask = foundation.labelled(np.array([[5.0, 0.5, -5]]), 2.0, 1.0)
     assert mask.labels.tolist() == [[255, 128, 0]]
     assert mask.visible
@@ -68,12 +66,12 @@ def test_log_odds_become_labels():
     assert gone.confidence > 0.8
 
 
-def test_a_click_becomes_a_box():
+def test_click_is_converted_to_a_box():
     box = foundation.widened(Prompt(0, (1.0, 20, 1, 20)), (48, 64))
     np.testing.assert_allclose(box, [0, 18.72, 2.28, 21.28])
     np.testing.assert_allclose(foundation.widened(Prompt(0, (10.0, 10, 30, 40)), (48, 64)), [10, 10, 30, 40])
 
 
-def test_missing_weights_are_told():
+def test_missing_weights_are_refused():
     with pytest.raises(InputError, match="MOD-001"):
         foundation.segment(Clip(), Prompt(0, (1.0, 1, 9, 9)), FoundationConfig(), "cpu")

@@ -1,4 +1,4 @@
-"""The estimated overlap is near the true one, and the quality check fails wrong masks and no right ones."""
+"""The estimated IoU is close to the true one, and the quality check fails only wrong masks."""
 
 import importlib.util
 from pathlib import Path
@@ -20,12 +20,12 @@ scenery = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(scenery)
 
 THING, RADIUS_M = np.array([0.4, 0.0, 0.2]), 0.25
-"""a part of the room that is taken for the animal, world, metres"""
+"""a part of the room that is mistaken for the animal, world, metres"""
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
-    """Record a session in which the animal walks, rests half of the time, and is away at the end."""
+    """A session in which the animal walks, rests half of the time, and is absent at the end."""
     folder, (poses, agent) = tmp_path_factory.mktemp("session") / "frames", scenery.session()
     truth = scenery.record(folder, poses, agent, poses)
     clip = Clip.open(folder)
@@ -55,7 +55,7 @@ def with_room(session):
 
 
 def while_it_rests(session):
-    """Leave the masks of the middle half alone."""
+    """Keep the masks of the middle half unchanged."""
     frames = np.arange(len(session[3]))[:, None, None]
     return session[3] & (frames > 14) & (frames < 26)
 
@@ -71,7 +71,7 @@ WRONG = {
 }
 
 
-def test_right_masks_are_ok_while_the_animal_rests_too(session):
+def test_correct_masks_pass_also_at_rest(session):
     estimated, true, status = judged(session, session[3])
     assert true == 1
     assert estimated > 0.85, "feet within the noise of the floor are nobody's"

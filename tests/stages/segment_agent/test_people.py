@@ -1,4 +1,4 @@
-"""People who walk through a session: found, and never taken for the animal."""
+"""People who walk through a session are detected and not mistaken for the animal."""
 
 import importlib.util
 from pathlib import Path
@@ -22,7 +22,7 @@ OPTIONS = Config(learning=LearningConfig(examples=30, steps=60, batch=4, crop_px
 
 @pytest.fixture(scope="module")
 def visited(tmp_path_factory):
-    """A session through which a person walks, behind the animal: its folder, truth and the person's poses."""
+    """A session with a person who walks behind the animal: its folder, ground truth and poses of the person."""
     poses, agent = scenery.session()
     along = np.linspace(-1.2, 1.2, len(poses))
     person = np.repeat(np.eye(4)[None], len(poses), axis=0)
@@ -42,7 +42,7 @@ def visited(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_person_is_found_and_is_not_the_animal(visited, tmp_path):
+def test_person_is_separated_from_the_animal(visited, tmp_path):
     folder, truth, person = visited
     clip = Clip.open(folder)
     found = masks.segment(clip, Path("none"), "session", None, OPTIONS, np.random.default_rng(0))
@@ -65,7 +65,7 @@ def test_a_person_is_found_and_is_not_the_animal(visited, tmp_path):
     assert np.nanmedian(off) < 0.1, "metres"
 
 
-def test_an_animal_alone_is_nobody(tmp_path):
+def test_no_people_are_found_without_people(tmp_path):
     poses, agent = scenery.session()
     scenery.record(tmp_path / "frames", poses, agent, poses)
     references, walkers = people.gather_without_people(Clip.open(tmp_path / "frames"), poses, 40)

@@ -1,5 +1,5 @@
-"""Noise is measured, holes and things that people moved prove nothing, and wrong masks are reported as
-such.
+"""Depth noise, presence of the animal, robustness to holes and moved objects, and detection of implausible
+masks.
 """
 
 from dataclasses import replace
@@ -24,9 +24,7 @@ INTRINSICS = np.array([[80.0, 0, 50], [0, 80.0, 40], [0, 0, 1]])
 
 
 def slanted_wall(count, noise, rng):
-    """Return pictures of a wall that runs from 1 m to 4 m, by a still camera, with noise that grows with the
-    square of z.
-    """
+    """Return pictures of a wall between 1 m and 4 m by a static camera, with noise proportional to z squared."""
     z = np.broadcast_to(np.linspace(1.0, 4.0, 100), (80, 100))
     return (z + noise.sigma_m(z) * rng.normal(size=(count, 80, 100))).astype(np.float32)
 
@@ -35,7 +33,7 @@ def test_depth_noise_is_measured_by_range():
     true, rng = DepthNoise(0.004, 0.003), np.random.default_rng(0)
     depth = slanted_wall(12, true, rng)
     found = free_space.measure_noise(depth, np.tile(np.eye(4), (12, 1, 1)), np.tile(INTRINSICS, (12, 1, 1)))
-    twice = np.sqrt(2)  # both pictures err
+    twice = np.sqrt(2)  # both pictures have noise
     for z in (1.5, 3.5):
         assert found.sigma_m(np.array(z)) == pytest.approx(twice * true.sigma_m(np.array(z)), rel=0.15)
 
@@ -47,8 +45,8 @@ def references_of(depth):
     return References(pose, k, depth, nearest, color, np.arange(count), DepthNoise())
 
 
-def test_what_is_seen_beside_a_hole_is_not_free():
-    """A thin leg at 1.5 m that the sensor loses in half of the pictures, before a wall at 3 m."""
+def test_space_around_depth_holes_is_not_free():
+    """A thin leg at 1.5 m, missing in half of the depth pictures, in front of a wall at 3 m."""
     depth = np.full((10, 80, 100), 3.0, np.float32)
     depth[::2, :, 50] = 1.5
     depth[1::2, :, 50] = 0.0
@@ -59,8 +57,8 @@ def test_what_is_seen_beside_a_hole_is_not_free():
     assert free_space.vote(references_of(moving), point, frame=-1).free.item() == 10
 
 
-def test_what_people_moved_is_no_animal():
-    """Something that stays in place for 2 s where it was put, then something that walks, then flashes."""
+def test_moved_objects_are_no_animal():
+    """An object that stays for 2 s where it was put, one that walks, and one that flashes."""
     thing = [Candidate(np.array([1.0, 0.0, 0.0]), 0.05, 0.2)] * 20
     animal = [Candidate(np.array([0.05 * i, 0.0, 2.0]), 0.05, 0.2) for i in range(20)]
     flashes = [Candidate(np.array([3.0 * (i % 2), 0.0, 0.0]), 0.05, 0.2) for i in range(6)]
@@ -92,7 +90,7 @@ def test_presence_is_decided_by_appearance_and_motion(similarity, moved, presume
     assert abs(found) < segmenter.LOG_ODDS_LIMIT + segmenter.PRESENCE_LIMIT
 
 
-def test_masks_that_are_implausible_over_time_are_reported_where_nothing_else_judges():
+def test_temporally_implausible_masks_are_reported():
     count, rng = 100, np.random.default_rng(0)
     good = Summary([True] * 60 + [False] * 40, [0.95] * count, [0.05] * 60 + [0.0] * 40)
     assert {check.status for check in pictures.checks_of(good)} == {"ok"}
@@ -105,8 +103,8 @@ def test_masks_that_are_implausible_over_time_are_reported_where_nothing_else_ju
         assert "fail" in {check.status for check in pictures.checks_of(wrong)}
 
 
-def test_appearance_decides_where_geometry_knows_nothing():
-    """An animal that stands where no other frame looked, and clearly looks like one, has a mask."""
+def test_appearance_decides_without_geometry():
+    """An animal at a place that no other frame observed is segmented by its appearance."""
     shape, unknown = (60, 80), np.zeros((60, 80), bool)
     animal = np.zeros(shape, bool)
     animal[20:40, 20:60] = True
@@ -122,8 +120,8 @@ def test_appearance_decides_where_geometry_knows_nothing():
     assert not (labels == 255).any()
 
 
-def test_gloss_that_does_not_look_like_the_animal_is_room():
-    """A surface of another colour than at other times, beside the animal, is animal where it looks like one."""
+def test_specular_surfaces_are_labelled_by_appearance():
+    """A surface whose colour changes beside the animal is labelled animal only if it looks like one."""
     shape, no = (60, 80), np.zeros((60, 80), bool)
     animal, gloss = no.copy(), no.copy()
     animal[20:40, 10:40], gloss[20:40, 40:75] = True, True

@@ -1,4 +1,4 @@
-"""Masks of small rendered recordings with truth: walking, resting, away; standing; prompts."""
+"""Masks of small rendered recordings: walking, resting and absent animals, and prompts."""
 
 import importlib.util
 from pathlib import Path
@@ -21,7 +21,7 @@ scenery = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(scenery)
 
 OPTIONS = Config(learning=LearningConfig(examples=30, steps=60, batch=4, crop_px=96))
-"""a short training: the pictures are small"""
+"""short training for small pictures"""
 
 
 def iou(found, truth) -> float:
@@ -29,7 +29,7 @@ def iou(found, truth) -> float:
 
 
 def make(folder, role, poses, agent, odometry, flow=Path("none"), prompt=None):
-    """Record, segment, and return the masks with the truth."""
+    """Render and segment a recording; return the masks and the truth."""
     truth = scenery.record(folder, poses, agent, odometry)
     found = masks.segment(Clip.open(folder), flow, role, prompt, OPTIONS, np.random.default_rng(0)).masks
     return list(found), truth
@@ -42,7 +42,7 @@ def walk(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_walking_and_a_resting_animal_is_found(walk):
+def test_walking_and_resting_animal_is_segmented(walk):
     found, truth = walk
     scores = np.array(
         [iou(mask.labels == 255, true) for mask, true in zip(found, truth.masks, strict=True)][:-3]
@@ -52,13 +52,13 @@ def test_a_walking_and_a_resting_animal_is_found(walk):
     assert scores.min() > 0.6
 
 
-def test_an_absent_animal_leaves_frames_empty(walk):
+def test_masks_are_empty_without_animal(walk):
     found, _ = walk
     assert [mask.visible for mask in found[-3:]] == [False] * 3
     assert not any(mask.labels.any() for mask in found[-3:])
 
 
-def test_masks_speak_three_values_at_colour_resolution(walk):
+def test_masks_have_three_labels_at_colour_resolution(walk):
     for mask in walk[0]:
         assert mask.labels.shape == scenery.COLOR_SIZE
         assert mask.labels.dtype == np.uint8
@@ -66,7 +66,7 @@ def test_masks_speak_three_values_at_colour_resolution(walk):
         assert 0 <= mask.confidence <= 1
 
 
-def test_a_standing_animal_is_found_from_around(tmp_path):
+def test_standing_animal_is_segmented_in_a_turnaround(tmp_path):
     poses, agent = scenery.turnaround(30)
     found, truth = make(tmp_path / "frames", "turnaround", poses, agent, scenery.drifted(poses))
     assert (
@@ -75,7 +75,7 @@ def test_a_standing_animal_is_found_from_around(tmp_path):
 
 
 def around(middle, radius_m, outward=False, count=12):
-    """Return level cameras on a circle that look at its middle, or away from it."""
+    """Return level cameras on a circle that face its centre or away from it."""
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
     away = np.stack([np.cos(angles), np.zeros(count), np.sin(angles)], axis=1)
     eyes = np.array(middle) + radius_m * away
@@ -97,13 +97,13 @@ def around(middle, radius_m, outward=False, count=12):
     ],
     ids=["alongside", "on the spot", "outward", "at the ceiling"],
 )
-def test_a_turnaround_around_nothing_is_refused(tmp_path, poses, what):
+def test_turnaround_without_animal_is_refused(tmp_path, poses, what):
     _, agent = scenery.turnaround(len(poses))
     with pytest.raises(InputError, match=f"MSK-003.*{what}"):
         make(tmp_path / "frames", "turnaround", poses, agent, poses)
 
 
-def test_a_recording_without_odometry_still_works(tmp_path):
+def test_recording_without_odometry_is_segmented(tmp_path):
     poses, agent = scenery.turnaround(40)
     flow = tmp_path / "flow"
     flow.mkdir()
@@ -119,23 +119,23 @@ def candidate(x, area=0.03):
     return Candidate(np.array([x, 0.0, 0.0]), area, 0.2)
 
 
-def test_the_track_prefers_a_steady_mover_to_larger_flashes():
+def test_persistent_motion_is_preferred_to_larger_flashes():
     estimate_path = [[candidate(0.05 * i, 0.02)] for i in range(12)]
     for i in (3, 7):
         estimate_path[i].append(candidate(3.0 + i, 0.04))
     assert movers.track(estimate_path, np.arange(12) * 0.1, AnimalConfig()).tolist() == [0] * 12
 
 
-def test_a_prompt_decides_between_two_movers():
+def test_prompt_selects_one_of_two_moving_objects():
     both = [[candidate(0.0, 0.05), candidate(2.0, 0.02)] for _ in range(10)]
     time = np.arange(10) * 0.1
     assert set(movers.track(both, time, AnimalConfig())) == {0}
     assert set(movers.track(both, time, AnimalConfig(), PlacedPrompt(4, np.array([2.0, 0.0, 0.0])))) == {1}
 
 
-def test_a_prompt_holds_what_hangs_together_with_it():
-    """Seen, hidden for two frames, seen, gone for more than a second, and something else in its place or far
-    away.
+def test_prompt_applies_to_connected_tracks():
+    """Visible, occluded for two frames, visible, absent for more than a second, another object at the same
+    place or far away.
     """
     at = [0.1 * i for i in range(20)] + [None] * 12 + [2.0] * 8 + [4.0] * 10
     at[7:9] = [None, None]
@@ -156,13 +156,13 @@ def test_a_prompt_holds_what_hangs_together_with_it():
 
 
 def click(mask, frame):
-    """Return a click on the middle of what a true mask shows."""
+    """Return a click at the centre of a true mask."""
     row, column = np.argwhere(mask)[mask.sum() // 2]
     return prompts.Prompt(frame, (column + 0.5, row + 0.5) * 2)
 
 
 @pytest.mark.slow
-def test_an_animal_that_never_moves_is_found_by_a_prompt(tmp_path):
+def test_prompted_static_animal_is_segmented(tmp_path):
     poses, agent = scenery.session()
     agent = np.repeat(agent[20:21], 40, axis=0)
     truth = scenery.record(tmp_path / "frames", poses, agent, scenery.drifted(poses))
@@ -177,8 +177,8 @@ def test_an_animal_that_never_moves_is_found_by_a_prompt(tmp_path):
 
 
 @pytest.mark.slow
-def test_with_a_prompt_another_mover_does_not_take_over(tmp_path):
-    """The animal leaves for good after 1.6 s; something of its size and of another colour walks about all the
+def test_other_moving_object_does_not_replace_a_prompted_animal(tmp_path):
+    """The animal leaves for good after 1.6 s; an object of similar size and another colour moves all the
     time.
     """
     poses, agent = scenery.session()
@@ -219,7 +219,7 @@ def test_with_a_prompt_another_mover_does_not_take_over(tmp_path):
         "frame = 0\nbox = " + "[" * 5000 + "]" * 5000,
     ],
 )
-def test_a_wrong_prompt_is_refused(tmp_path, text):
+def test_invalid_prompt_is_refused(tmp_path, text):
     poses, agent = scenery.turnaround(2)
     scenery.record(tmp_path / "frames", poses, agent, poses)
     (tmp_path / "prompt.toml").write_text(text)
@@ -227,7 +227,7 @@ def test_a_wrong_prompt_is_refused(tmp_path, text):
         prompts.parse(tmp_path / "prompt.toml", Clip.open(tmp_path / "frames"))
 
 
-def test_a_prompt_speaks_in_seconds_and_shares_too(tmp_path):
+def test_prompt_accepts_seconds_and_relative_coordinates(tmp_path):
     poses, agent = scenery.turnaround(3)
     scenery.record(tmp_path / "frames", poses, agent, poses)
     clip = Clip.open(tmp_path / "frames")
@@ -238,7 +238,7 @@ def test_a_prompt_speaks_in_seconds_and_shares_too(tmp_path):
     assert prompt == prompts.Prompt(2, (0.1 * width, 0.25 * height, 0.5 * width, height))
 
 
-def test_a_click_finds_the_surface(tmp_path):
+def test_click_is_placed_on_the_surface(tmp_path):
     poses, agent = scenery.turnaround(2)
     scenery.record(tmp_path / "frames", poses, agent, poses)
     clip = Clip.open(tmp_path / "frames")
@@ -250,10 +250,8 @@ def test_a_click_finds_the_surface(tmp_path):
 
 
 @pytest.mark.slow
-def test_looks_are_learnt_in_spite_of_frames_labelled_wrongly():
-    """A striped thing before noise; every seventh frame calls it room, as when first masks miss an animal at
-    rest.
-    """
+def test_appearance_is_learned_despite_label_noise():
+    """A striped object in front of noise; every seventh frame is labelled as background."""
     rng, examples, truths = np.random.default_rng(1), [], []
     for frame in range(28):
         color = rng.integers(90, 130, (96, 96, 3)).astype(np.uint8)
@@ -273,7 +271,7 @@ def test_looks_are_learnt_in_spite_of_frames_labelled_wrongly():
         np.testing.assert_array_equal(network.log_odds(example.color), again.log_odds(example.color))
 
 
-def test_what_is_beyond_the_corner_of_a_picture_is_shown_from_nearer_too():
+def test_extrapolated_corners_are_consistent():
     labels = np.zeros((120, 160), np.uint8)
     labels[112:, 152:] = 255
     example, rng = Example(np.repeat(labels[..., None], 3, 2), labels), np.random.default_rng(0)
@@ -282,7 +280,7 @@ def test_what_is_beyond_the_corner_of_a_picture_is_shown_from_nearer_too():
         assert (zoomed.labels == 255).any()
 
 
-def test_a_recording_without_depth_asks_for_a_prompt(tmp_path):
+def test_recording_without_depth_requires_a_prompt(tmp_path):
     poses, agent = scenery.turnaround(2)
     scenery.record(tmp_path / "frames", poses, agent, poses)
     for path in (tmp_path / "frames" / "depth").iterdir():

@@ -1,4 +1,4 @@
-"""An orange and a green animal in one room: their looks are learned from turnarounds, and each pixel is one's."""
+"""Two animals in one room: appearance is learned from turnarounds, and pixels are assigned to one animal."""
 
 import importlib.util
 from pathlib import Path
@@ -49,7 +49,7 @@ def turnarounds(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def learned(turnarounds, tmp_path_factory):
-    """Return the artifact of both animals' looks."""
+    """Return the appearance artifact of both animals."""
     out = tmp_path_factory.mktemp("identities")
     identities.run(identities.Inputs(turnarounds, turnarounds), SHORT, out, videos=VIDEOS)
     return out
@@ -65,7 +65,7 @@ def portraits(learned):
     return identity.load_portraits(learned)
 
 
-def test_portraits_are_kept_and_are_examples_of_their_animal(portraits):
+def test_portraits_are_saved_and_show_their_animal(portraits):
     assert {each.animal for each in portraits} == {0, 1}
     assert all((each.labels == 255).any() and each.color.shape[:2] == each.labels.shape for each in portraits)
     own = [each for each in portraits if each.animal == 1]
@@ -74,7 +74,7 @@ def test_portraits_are_kept_and_are_examples_of_their_animal(portraits):
     assert examples[0].color is own[0].color and examples[-1].labels is own[-1].labels
 
 
-def test_what_turnarounds_recognize_beside_the_animal_is_not_learned_as_room(monkeypatch):
+def test_other_animals_in_a_turnaround_are_not_learned_as_background(monkeypatch):
     labels = np.zeros((60, 80), np.uint8)
     labels[20:30, 20:30] = 255
     segmenter = SimpleNamespace(
@@ -100,7 +100,7 @@ def test_what_turnarounds_recognize_beside_the_animal_is_not_learned_as_room(mon
     assert (found[50:, 20:60] == 0).all() and (found[25:50, 50:60] == 0).all(), "too far from its track"
 
 
-def test_looks_are_told_apart_and_kept(network, turnarounds):
+def test_appearances_are_distinguished_and_saved(network, turnarounds):
     assert network.names == ("green", "orange")
     clip = Clip.open(turnarounds["v001"])
     log_prob = network.predict(clip.color(3))
@@ -110,13 +110,13 @@ def test_looks_are_told_apart_and_kept(network, turnarounds):
     assert np.allclose(identity.identity_log_odds(log_prob, 0)[50:70, 35:55][middle > 3].max(), -3, atol=3.1)
 
 
-def test_one_animal_filmed_twice_is_refused(turnarounds, tmp_path):
+def test_two_turnarounds_of_the_same_appearance_are_refused(turnarounds, tmp_path):
     twice = dict.fromkeys(turnarounds, turnarounds["v000"])
     with pytest.raises(InputError, match="MSK-005"):
         identities.run(identities.Inputs(twice, twice), SHORT, tmp_path, videos=VIDEOS)
 
 
-def test_bodies_that_touch_are_parted_and_a_patch_does_not_part_one():
+def test_touching_bodies_are_separated_and_a_patch_does_not_split_one():
     moving = np.zeros((80, 80), bool)
     moving[30:50, 10:70] = True
     log_odds = np.where(np.arange(80) < 40, 4.0, -4.0) * np.ones((80, 1))
@@ -132,7 +132,7 @@ def test_bodies_that_touch_are_parted_and_a_patch_does_not_part_one():
 
 @pytest.fixture(scope="module")
 def together(tmp_path_factory):
-    """Return a session in which the animals pass each other, and its truth."""
+    """Return a session in which the animals pass each other, and its ground truth."""
     poses, agent = scenery.session()
     other = agent[np.r_[36:2:-1, [2] * 6]].copy()
     other[:, 2, 3] += 0.45
@@ -141,7 +141,7 @@ def together(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_two_that_pass_each_other_keep_their_masks(network, portraits, together):
+def test_identities_persist_when_animals_pass_each_other(network, portraits, together):
     folder, truth = together
     for name, own, others in (("orange", truth.masks, truth.others), ("green", truth.others, truth.masks)):
         found = several.segment(Clip.open(folder), Path("none"), name, network, portraits, OPTIONS)
@@ -158,7 +158,7 @@ def test_two_that_pass_each_other_keep_their_masks(network, portraits, together)
 
 
 @pytest.mark.slow
-def test_one_that_is_not_here_has_no_mask(network, portraits, tmp_path):
+def test_absent_animal_has_no_mask(network, portraits, tmp_path):
     poses, agent = scenery.session()
     scenery.record(tmp_path / "frames", poses, agent, scenery.drifted(poses))
     found = several.segment(
@@ -168,7 +168,7 @@ def test_one_that_is_not_here_has_no_mask(network, portraits, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_third_animal_without_a_turnaround_is_reported(network, portraits, tmp_path, monkeypatch):
+def test_third_animal_without_turnaround_is_reported(network, portraits, tmp_path, monkeypatch):
     monkeypatch.setattr(scenery, "ANIMAL_COLOR", np.array([60, 70, 190]))
     poses, agent = scenery.session()
     scenery.record(tmp_path / "frames", poses, agent, scenery.drifted(poses))
@@ -177,7 +177,7 @@ def test_a_third_animal_without_a_turnaround_is_reported(network, portraits, tmp
         several.segment(clip, Path("none"), "green", network, portraits, OPTIONS)
 
 
-def test_a_prompt_that_names_no_animal_is_refused(network, together, tmp_path):
+def test_prompt_with_unknown_animal_is_refused(network, together, tmp_path):
     network.save(tmp_path)
     prompt = tmp_path / "prompt.toml"
     prompt.write_text("frame = 0\nclick = [0.5, 0.5]\n")

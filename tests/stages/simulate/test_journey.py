@@ -66,7 +66,7 @@ def test_sub_goals_are_read(tmp_path):
         "[[subgoal]]\nposition = [1, 2]\ntime_s = 5\n[[subgoal]]\nposition = [2, 2]\ntime_s = 4\n",
     ],
 )
-def test_bad_sub_goals_are_told(tmp_path, text):
+def test_invalid_sub_goals_are_refused(tmp_path, text):
     with pytest.raises(InputError, match="SIM-002"):
         read(tmp_path / "goals.toml", text)
 
@@ -80,12 +80,12 @@ def test_bad_sub_goals_are_told(tmp_path, text):
         "position = " + "[" * 5000 + "]" * 5000,
     ],
 )
-def test_sub_goals_that_no_number_is_like_are_told(tmp_path, line):
+def test_sub_goals_that_are_no_numbers_are_refused(tmp_path, line):
     with pytest.raises(InputError, match="REC-00[23].*goals.toml"):
         read(tmp_path / "goals.toml", f"[[subgoal]]\n{line}\n")
 
 
-def test_a_journey_is_made_and_written(world, tmp_path):
+def test_journey_is_generated_and_written(world, tmp_path):
     goals = [Subgoal(np.array([-1.2, np.nan, -1.0])), Subgoal(np.array([1.2, np.nan, -1.0]))]
     made = journeys.travel(world, goals, SETTINGS, np.random.default_rng(0))
     again = journeys.travel(world, goals, SETTINGS, np.random.default_rng(0))
@@ -105,22 +105,22 @@ def test_a_journey_is_made_and_written(world, tmp_path):
     assert len(list((tmp_path / "frames").glob("*.jpg"))) == 10
 
 
-def test_one_sub_goal_is_too_few(world):
+def test_single_sub_goal_is_refused(world):
     with pytest.raises(InputError, match="SIM-001"):
         journeys.travel(world, [Subgoal(np.zeros(3))], None, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("place", [(100.0, np.nan, -1.0), (1.2, 50.0, -1.0), (1.2, -50.0, -1.0)])
-def test_a_sub_goal_outside_the_scene_is_refused(world, place):
+def test_sub_goal_outside_the_scene_is_refused(world, place):
     goals = [Subgoal(np.array([-1.2, np.nan, -1.0])), Subgoal(np.array(place))]
     with pytest.raises(InputError, match="SIM-003"):
         journeys.travel(world, goals, None, np.random.default_rng(0))
 
 
-def test_a_take_of_the_behaviour_model_becomes_physical(world):
+def test_behavior_take_is_optimized_to_be_physical(world):
     walk = strider.striding(np.array([[1.0, 0, -1.2], [1.0, 0, 1.2]]), 4.0)[::3]
     root = walk.world_from_agent.copy()
-    root[:, 1, 3] -= 0.03  # all of it is in the floor
+    root[:, 1, 3] -= 0.03  # entirely below the floor
     given = BodyMotion(root, walk.agent_from_bone)
     done, before, after = journeys.refine_at_rate(
         world, np.arange(len(root)) / 10, given, MotionOptimizationConfig(steps=60, vertices=30)
@@ -130,7 +130,7 @@ def test_a_take_of_the_behaviour_model_becomes_physical(world):
     assert np.abs(done.world_from_agent[:, [0, 2], 3] - root[:, [0, 2], 3]).max() < 0.1
 
 
-def test_recorded_motion_becomes_physical(world, tmp_path):
+def test_recorded_motion_is_optimized_to_be_physical(world, tmp_path):
     walk = strider.striding(np.array([[1.0, 0, -1.2], [1.0, 0, 1.2]]), 2.0)
     root = walk.world_from_agent.copy()
     root[:, 1, 3] -= 0.03
@@ -144,7 +144,7 @@ def test_recorded_motion_becomes_physical(world, tmp_path):
     assert left.motion is walk and left.before == left.after
 
 
-def test_a_model_of_another_version_is_told(world, tmp_path):
+def test_model_of_another_version_is_refused(world, tmp_path):
     world.model.save(tmp_path)
     document = json.loads((tmp_path / "longterm.json").read_text())
     assert LongTerm.load(tmp_path).motion_prior == world.model.motion_prior

@@ -1,4 +1,4 @@
-"""All animals of a home at once: two tiny ones with networks of their own."""
+"""Simulation of all animals of a home, with tiny networks."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,15 +17,14 @@ from stages.simulate import stage
 from stages.simulate.config import Config
 from stages.simulate.inputs import Inputs
 from stages.train_behavior.export import write_contract
-from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
-from tests.stages.simulate.test_simulator import scaling
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, scaling, wandering
 
 SETTINGS = Config(seconds=6.0, observer="away", seed=3, goal_steps=4, sequence_steps=2)
 
 
 @pytest.fixture(scope="module")
 def animals(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two animals that were recorded in one room, in the same sessions."""
+    """Two animals recorded in the same sessions in one room."""
     folder, volume = tmp_path_factory.mktemp("animals"), room()
     for seed, name in enumerate(("cat", "dog")):
         for artifact in ("behavior_data", "behavior", "reconstruction"):
@@ -46,7 +45,7 @@ def animals(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def lived(animals: Path, out: Path, **changes: object) -> dict[str, dict[str, np.ndarray]]:
+def simulated(animals: Path, out: Path, **changes: object) -> dict[str, dict[str, np.ndarray]]:
     """Run the stage and return the takes by name."""
     out.mkdir()
     stage.run(Inputs(animals=animals), replace(SETTINGS, **changes), out)
@@ -54,13 +53,13 @@ def lived(animals: Path, out: Path, **changes: object) -> dict[str, dict[str, np
     return {path.parent.name: npz.load(path) for path in sorted(out.glob("*/take.npz"))}
 
 
-def test_animals_of_a_home_perceive_each_other_and_keep_clear(animals, tmp_path):
-    together, again = (lived(animals, tmp_path / name) for name in ("a", "b"))
+def test_animals_perceive_and_avoid_each_other(animals, tmp_path):
+    together, again = (simulated(animals, tmp_path / name) for name in ("a", "b"))
     assert list(together) == ["cat", "dog"]
     for name, take in together.items():
         np.testing.assert_array_equal(take["world_from_agent"], again[name]["world_from_agent"])
         assert len((tmp_path / f"a/{name}/take.csv").read_text().splitlines()) == 1 + 61
-    alone = lived(animals, tmp_path / "c", absent=("dog",))
+    alone = simulated(animals, tmp_path / "c", absent=("dog",))
     assert list(alone) == ["cat"]
     places = [take["world_from_agent"][:, :3, 3] for take in together.values()]
     np.testing.assert_array_equal(places[0][0], alone["cat"]["world_from_agent"][0, :3, 3])
@@ -69,9 +68,9 @@ def test_animals_of_a_home_perceive_each_other_and_keep_clear(animals, tmp_path)
     assert gap[0] >= 0.4 and gap.min() > 0.3, "metres: bodies' 0.4, less what both do at once"
 
 
-def test_a_recorded_clip_takes_an_animals_place_and_is_perceived(animals, tmp_path):
+def test_replayed_animal_is_perceived(animals, tmp_path):
     living, replayed = (
-        lived(animals, tmp_path / name, replayed=who) for name, who in (("a", ()), ("b", ("dog",)))
+        simulated(animals, tmp_path / name, replayed=who) for name, who in (("a", ()), ("b", ("dog",)))
     )
     data = BehaviorData.load(animals / "dog/behavior_data")
     found = replayed["dog"]["world_from_agent"]
@@ -95,14 +94,14 @@ def test_a_recorded_clip_takes_an_animals_place_and_is_perceived(animals, tmp_pa
         ({"absent": ("cat", "dog")}, "SIM-013.*nobody"),
     ],
 )
-def test_names_that_a_home_does_not_have_are_refused(animals, tmp_path, changes, code):
+def test_unknown_names_are_refused(animals, tmp_path, changes, code):
     with pytest.raises(InputError, match=code):
         stage.run(Inputs(animals=animals), replace(SETTINGS, **changes), tmp_path)
     with pytest.raises(InputError, match="SIM-013"):
         stage.run(Inputs(behavior_data=animals / "cat/behavior_data"), replace(SETTINGS, **changes), tmp_path)
 
 
-def test_an_animal_without_a_model_is_named(animals, tmp_path):
+def test_animal_without_model_is_named(animals, tmp_path):
     (animals / "bird/behavior_data").mkdir(parents=True)
     try:
         with pytest.raises(InputError, match=r"ART-003.*bird has no reconstruction.*\n.*leave bird out"):

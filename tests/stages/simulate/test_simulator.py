@@ -8,12 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
+from pipeline.behavior.config import ReplanningConfig
 from pipeline.behavior.diffusion import Schedule
-from pipeline.behavior.model import BehaviorNets, Scaling
-from pipeline.behavior.planning import Sampler, TorchNetworks
-from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.simulator import AnimalBatch, PoseFrames, Simulator, blended_frames
+from pipeline.behavior.model import BehaviorNets
+from pipeline.behavior.simulator import AnimalBatch, PoseFrames, blended_frames
 from pipeline.core.errors import InputError
 from pipeline.data import glb, npz
 from pipeline.geometry import rigid
@@ -25,38 +23,23 @@ from stages.simulate.live import LiveAppearance, LiveView
 from stages.simulate.observers import scripted
 from stages.simulate.rollout import rollout, write_take
 from stages.train_behavior.export import write_contract
-from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
+from tests.pipeline.behavior.wandering import (
+    ARCHITECTURE,
+    REST,
+    room,
+    scaling,
+    untrained_simulator,
+    wandering,
+)
 from tests.pipeline.environments import test_other_home
-
-
-def scaling():
-    channels = ARCHITECTURE.body_channels
-    mean = np.concatenate([[1.0, 0, 0, 0, 1, 0], np.zeros(channels - 6)])
-    return Scaling(
-        np.array([0.3, 0.01, 0.3]),
-        np.array([[0.5, 0.1, 0.5, 1.0]]),
-        np.linspace(0.01, 0.3, 56) * np.ones((3, 1)) * [[1], [0.02], [1]],
-        mean,
-        np.full(channels, 0.05),
-    )
 
 
 @pytest.fixture(scope="module")
 def simulator():
-    volume = room()
-    sampler = Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling())
-    sampling = PlanSamplingConfig(goal_steps=4, sequence_steps=2)
-    return Simulator(
-        sampler,
-        wandering(),
-        Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int)),
-        "yaw",
-        sampling=sampling,
-        chaining=ReplanningConfig(candidates=3),
-    )
+    return untrained_simulator(goal_steps=4, candidates=3)
 
 
-def test_same_seed_same_life_and_it_goes_on(simulator):
+def test_simulation_is_deterministic_and_continues(simulator):
     observer = np.array([0.5, 1.3, 0.5])
     lives = []
     for _ in range(2):
@@ -69,13 +52,13 @@ def test_same_seed_same_life_and_it_goes_on(simulator):
     assert states[-1].agent_from_bone.shape == (3, 4, 4)
 
 
-def test_states_keep_the_goals_that_they_had(simulator):
+def test_states_are_not_modified_by_later_steps(simulator):
     person = np.array([0.5, 1.3, 0.5])
     states = [simulator.reset(seed=4)] + [simulator.step(person) for _ in range(55)]
     assert len({tuple(state.goal_world) for state in states}) == 2, "56 frames, of which 4 fade"
 
 
-def test_animals_of_a_flock_go_on_from_their_own_windows(simulator):
+def test_batched_animals_continue_their_own_windows(simulator):
     context, _ = simulator.data.windows(np.array([0, 40, 80]))
     animals = simulator.animals
     animals.begin(replace(context, video=None), np.random.default_rng(0))
@@ -128,7 +111,7 @@ def test_plans_are_followed_until_they_end_or_the_observer_moves(simulator):
     np.testing.assert_array_equal(blind.goal, first)
 
 
-def test_goals_and_paths_are_not_told_sampled_bones(simulator):
+def test_goals_and_paths_do_not_depend_on_sampled_bones(simulator):
     context, _ = simulator.data.windows(np.array([0, 40]))
     lives = []
     for bend in (0.0, 0.3):
@@ -141,7 +124,7 @@ def test_goals_and_paths_are_not_told_sampled_bones(simulator):
     assert np.abs(lives[0].bones - lives[1].bones).max() > 0.01, "the body goes on from the bones that it has"
 
 
-def test_fading_leaves_the_old_plan_and_reaches_the_new_one():
+def test_plans_are_blended_from_the_old_to_the_new_one():
     old = PoseFrames(np.tile(np.eye(4), (10, 1, 1)), np.zeros((10, 6)))
     turned = rigid.make(rigid.rotation_from_vector(np.array([0, 1.0, 0])), np.array([1.0, 0, 0]))
     new = PoseFrames(np.tile(turned, (10, 1, 1)), np.ones((10, 6)))
@@ -174,9 +157,7 @@ def test_take_is_written_completely(simulator, tmp_path):
 
 
 def homes(folder, seen=None, architecture=ARCHITECTURE):
-    """Write a model and recordings in a home each, 20 m apart, beside observers who are not there, or at
-    `seen`.
-    """
+    """Write a model and recordings in a home each, 20 m apart, with absent observers or observers at `seen`."""
     data = wandering()
     for number, (name, track) in enumerate(data.trajectories.items()):
         there = np.array([20.0 * number, 0, 0])
@@ -199,7 +180,7 @@ def homes(folder, seen=None, architecture=ARCHITECTURE):
 
 
 @pytest.mark.parametrize("seen", [None, [0.5, 1.6, -0.5]])
-def test_a_take_in_one_of_several_homes_has_its_observer_there(tmp_path, seen):
+def test_observer_is_in_the_home_of_the_take(tmp_path, seen):
     settings = Config(seconds=1.0, observer="still", seed=3, goal_steps=4, sequence_steps=2)
     takes.of_behavior(homes(tmp_path, seen), settings, "cpu").write(tmp_path)
     take = npz.load(tmp_path / "take.npz")
@@ -214,14 +195,14 @@ def test_a_take_in_one_of_several_homes_has_its_observer_there(tmp_path, seen):
     assert take["blocked"].mean() < 0.9, "it lives in its own home: elsewhere all is blocked"
 
 
-def test_models_whose_plans_cannot_be_chained_are_refused(tmp_path):
+def test_models_without_chainable_plans_are_refused(tmp_path):
     with pytest.raises(InputError, match="SIM-006.*gaussian"):
         takes.of_behavior(
             homes(tmp_path, architecture=replace(ARCHITECTURE, family="gaussian")), Config(), "cpu"
         )
 
 
-def test_a_take_in_the_home_of_another_build(tmp_path):
+def test_take_in_the_home_of_another_build(tmp_path):
     own, other = test_other_home.write(tmp_path / "own"), test_other_home.write(tmp_path / "other")
     (own / "behavior").mkdir()
     wandering().save(own / "behavior_data")
@@ -230,8 +211,8 @@ def test_a_take_in_the_home_of_another_build(tmp_path):
     inputs = Inputs(**{name: own / name for name in artifacts}, home=other)
     settings = Config(seconds=1.0, goal_steps=4, sequence_steps=2)
     stage.run(inputs, settings, tmp_path)
-    told = json.loads((tmp_path / "home.json").read_text())
-    assert told["home"] == "other" and told["share_known"] == 1.0 and told["goals_in_solid"] == 0.0
+    summary = json.loads((tmp_path / "home.json").read_text())
+    assert summary["home"] == "other" and summary["share_known"] == 1.0 and summary["goals_in_solid"] == 0.0
     take, volume = npz.load(tmp_path / "take.npz"), npz.load(tmp_path / "volume.npz")
     assert len(take["timestamp_s"]) == 11 and volume["allowed"].shape == volume["occupancy"].shape
     with pytest.raises(InputError, match="SIM-011"):
@@ -246,7 +227,7 @@ def look():
     return LiveAppearance(mesh, skin, glb.static(mesh, "room"))
 
 
-def test_live_view_answers_and_keeps_its_take(simulator):
+def test_live_view_runs_and_saves_its_take(simulator):
     pytest.importorskip("viser")
     here = LiveView(simulator, look(), np.array([0.0, 1.3, 0.0]), seed=1, port=8117)
     with urllib.request.urlopen(f"http://127.0.0.1:{here.port}", timeout=10) as answer:
@@ -259,8 +240,8 @@ def test_live_view_answers_and_keeps_its_take(simulator):
     np.testing.assert_allclose(here.animal.position, take.world_from_agent[-1, :3, 3], atol=1e-6)
 
 
-def answered(port: int, **headers: str) -> int:
-    """Ask the live view's server for its page and return the status."""
+def http_status(port: int, **headers: str) -> int:
+    """Request the page of the live view and return the HTTP status."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
     connection.putrequest("GET", "/", skip_host=True)
     for name, value in headers.items():
@@ -271,8 +252,8 @@ def answered(port: int, **headers: str) -> int:
     return code
 
 
-def test_live_view_answers_its_own_page_only(simulator):
-    """Another site may point a name at this machine (Host), or open a socket from its page (Origin)."""
+def test_live_view_rejects_other_hosts_and_origins(simulator):
+    """Rejects requests with another Host, and sockets of pages with another Origin."""
     viser = pytest.importorskip("viser")
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
@@ -293,21 +274,23 @@ def test_live_view_answers_its_own_page_only(simulator):
     here = LiveView(simulator, look(), np.array([0.0, 1.3, 0.0]), seed=1, port=8121)
     try:
         own = f"127.0.0.1:{here.port}"
-        assert answered(here.port, Host=own) == answered(here.port, Host=f"localhost:{here.port}") == 200
-        assert answered(here.port, Host=own, Origin=f"http://{own}") == 200
+        assert (
+            http_status(here.port, Host=own) == http_status(here.port, Host=f"localhost:{here.port}") == 200
+        )
+        assert http_status(here.port, Host=own, Origin=f"http://{own}") == 200
         for host in ("evil.example", f"evil.example:{here.port}", "127.0.0.1", f"{own}.evil.example"):
-            assert answered(here.port, Host=host) == 403, host
-        assert answered(here.port) == 403, "no Host at all"
+            assert http_status(here.port, Host=host) == 403, host
+        assert http_status(here.port) == 403, "no Host at all"
         assert opened(f"http://{own}", own) == opened(None, own) == 101
         for origin in ("http://evil.example", "null", f"http://evil.example:{here.port}", f"https://{own}"):
-            assert answered(here.port, Host=own, Origin=origin) == 403, origin
+            assert http_status(here.port, Host=own, Origin=origin) == 403, origin
             assert opened(origin, own) == 403, origin
         assert opened(None, f"evil.example:{here.port}") == 403
     finally:
         here.server.stop()
 
 
-def test_a_viser_that_cannot_be_checked_does_not_serve():
+def test_unknown_viser_version_is_refused():
     started = []
 
     class Unchecked:
@@ -323,7 +306,7 @@ def test_a_viser_that_cannot_be_checked_does_not_serve():
     assert started == ["running", "stopped"]
 
 
-def test_starting_again_in_the_middle_of_a_step_keeps_the_take_whole(simulator):
+def test_restart_during_a_step_keeps_the_take_consistent(simulator):
     pytest.importorskip("viser")
     here = LiveView(simulator, look(), np.array([0.0, 1.3, 0.0]), seed=1, port=8119)
     step, clicked = simulator.step, []
@@ -341,7 +324,7 @@ def test_starting_again_in_the_middle_of_a_step_keeps_the_take_whole(simulator):
     assert len(take.observer_world) == len(take.timestamp_s) == 3
 
 
-def test_live_view_says_what_it_needs(simulator, monkeypatch):
+def test_live_view_names_missing_requirements(simulator, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(InputError, match="make extras"):
         LiveView(simulator, look(), np.zeros(3), seed=1, port=8118)

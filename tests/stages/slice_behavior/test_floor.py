@@ -1,4 +1,4 @@
-"""A root has something beneath it wherever it may be, and may be nowhere outside of the home."""
+"""Support of the floor at all allowed positions, which are inside the home."""
 
 import numpy as np
 
@@ -7,19 +7,17 @@ from stages.slice_behavior.floor import FILLED, SUPPORTED, with_filled_floor
 
 
 def room(seen: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """A room of 20 x 20 voxels in a volume of 40 x 40, of whose floor only a share was seen; and a table in
-    it.
-    """
+    """A room of 20 x 20 voxels in a volume of 40 x 40 with a partly observed floor and a table."""
     rng = np.random.default_rng(seed)
     occupancy = np.full((40, 8, 40), 2, np.uint8)
     occupancy[10:30, 1:, 10:30] = 0
     occupancy[10:30, 0, 10:30] = np.where(rng.random((20, 20)) < seen, 1, 2)
     occupancy[14:18, 1:4, 14:18] = 1
-    occupancy[33:38, 3:6, 33:38] = 0  # air seen through a window
+    occupancy[33:38, 3:6, 33:38] = 0  # free space seen through a window
     return occupancy, mark_supported(occupancy == 0, occupancy)
 
 
-def test_all_that_is_allowed_is_carried_and_at_home():
+def test_allowed_positions_have_support_inside_the_home():
     occupancy, marks = room(0.6)
     before = (marks > 0).any(1) & ~(marks == SUPPORTED).any(1)
     assert before.sum() > 100, "columns without a floor"
@@ -34,12 +32,12 @@ def test_all_that_is_allowed_is_carried_and_at_home():
     assert allowed[11:29, 11:29].all()
 
 
-def test_a_whole_floor_stays_as_it_is():
+def test_complete_floor_is_unchanged():
     occupancy, marks = room(1.0)
     kept = with_filled_floor(marks, occupancy, np.zeros(marks.shape, bool))
     np.testing.assert_array_equal(kept[10:30, :, 10:30], marks[10:30, :, 10:30])
 
 
-def test_where_nothing_carries_nothing_is_filled():
+def test_no_floor_is_filled_without_support():
     marks = np.ones((4, 4, 4), np.uint8)
     np.testing.assert_array_equal(with_filled_floor(marks, np.zeros_like(marks), marks > 0), marks)

@@ -19,7 +19,7 @@ OPTIONS = {"min_confidence": 0.5, "max_gap_s": 0.6, "smooth_s": 0.0}
 
 
 def jittered(rng: np.random.Generator, seconds: float = 20.0) -> ReconstructedMotion:
-    """A steady walk along x with a steady turn, seen at uneven times."""
+    """A steady walk along x with a constant turn rate, sampled at uneven times."""
     time = np.arange(0, seconds, 0.1) + rng.uniform(-0.03, 0.03, round(seconds * 10))
     time -= time[0]
     turn = rigid.rotation_from_vector(np.stack([0 * time, 0.2 * time, 0 * time], axis=-1))
@@ -31,7 +31,7 @@ def jittered(rng: np.random.Generator, seconds: float = 20.0) -> ReconstructedMo
     return ReconstructedMotion(time, camera, agent, bones, np.ones(len(time)), np.ones(len(time), bool))
 
 
-def test_uneven_times_become_even_without_error():
+def test_uneven_times_are_resampled_exactly():
     trajectory = trajectory_from_motion(jittered(np.random.default_rng(0)), **OPTIONS)
     np.testing.assert_allclose(np.diff(trajectory.timestamp_s), 0.1, atol=1e-9)
     assert trajectory.valid.all()
@@ -43,7 +43,7 @@ def test_uneven_times_become_even_without_error():
     )
 
 
-def test_companions_are_resampled_where_they_are():
+def test_companions_are_resampled_where_present():
     motion = jittered(np.random.default_rng(0))
     being = np.full((len(motion.timestamp_s), 2, 4), np.nan)
     being[50:100, 1] = np.stack([0.3 * motion.timestamp_s[50:100], *np.ones((3, 50))], -1)
@@ -55,7 +55,7 @@ def test_companions_are_resampled_where_they_are():
     assert (found[:, 3] == 1).all()
 
 
-def test_another_animal_is_a_companion_where_it_is_seen():
+def test_other_animal_is_a_companion_where_visible():
     mine, its = (jittered(np.random.default_rng(0), 3.0) for _ in range(2))
     seen = np.arange(len(its.timestamp_s)) % 3 > 0
     its = replace(its, agent_visible=seen, confidence=np.where(seen, 0.9, 0.0))
@@ -67,7 +67,7 @@ def test_another_animal_is_a_companion_where_it_is_seen():
     assert np.isfinite(trajectory.companions).all((1, 2)).mean() > 0.9, "short gaps are bridged"
 
 
-def test_only_short_gaps_are_bridged_and_doubtful_frames_are_gaps():
+def test_short_gaps_are_interpolated_and_uncertain_frames_are_gaps():
     motion = jittered(np.random.default_rng(0))
     agent, confidence, visible = (
         motion.world_from_agent.copy(),
@@ -92,7 +92,7 @@ def test_only_short_gaps_are_bridged_and_doubtful_frames_are_gaps():
     assert np.isfinite(trajectory.world_from_agent).all()
 
 
-def test_an_agent_never_seen_gives_no_valid_time():
+def test_invisible_agent_has_no_valid_frames():
     motion = jittered(np.random.default_rng(0))
     trajectory = trajectory_from_motion(
         replace(motion, world_from_agent=motion.world_from_agent * np.nan), **OPTIONS
@@ -101,7 +101,7 @@ def test_an_agent_never_seen_gives_no_valid_time():
     assert np.isfinite(trajectory.world_from_agent).all()
 
 
-def test_smoothing_takes_jitter_and_keeps_rotations():
+def test_smoothing_removes_jitter_and_keeps_rotations():
     rng = np.random.default_rng(0)
     clean = wander(rng).world_from_agent
     noisy = clean @ rigid.exp(rng.standard_normal((len(clean), 6)) * 0.02)
@@ -113,7 +113,7 @@ def test_smoothing_takes_jitter_and_keeps_rotations():
     assert error[0] < 0.7 * error[1]
 
 
-def test_windows_hold_only_valid_frames_of_one_recording():
+def test_windows_contain_only_valid_frames_of_one_recording():
     rng = np.random.default_rng(0)
     trajectories = {name: wander(rng) for name in ("v002", "v003", "v004")}
     trajectories["v003"].valid[70] = False
@@ -127,11 +127,11 @@ def test_windows_hold_only_valid_frames_of_one_recording():
     assert {data.videos[v] for v in data.video[data.indices(TRAIN)]} == {"v002", "v003"}
 
 
-def test_too_short_a_recording_gives_no_window():
+def test_short_recording_has_no_window():
     assert len(window_starts(np.ones(63, bool), 64)) == 0
 
 
-def test_rows_too_far_apart_are_told_how_to_be_bridged(tmp_path):
+def test_sparse_rows_are_refused_with_a_remedy(tmp_path):
     still = np.tile(np.eye(4), (60, 1, 1))
     folder = tmp_path / "v000"
     folder.mkdir()
@@ -153,7 +153,7 @@ def test_rows_too_far_apart_are_told_how_to_be_bridged(tmp_path):
     assert (out / "windows.npz").is_file() and (out / "volume.npz").is_file()
 
 
-def test_a_day_of_windows_is_judged_by_some_of_them():
+def test_checks_subsample_many_windows():
     few, many = np.arange(3, 60, 2), np.arange(7, 100_007)
     np.testing.assert_array_equal(pictures.some(few), few)
     chosen = pictures.some(many)
@@ -161,7 +161,7 @@ def test_a_day_of_windows_is_judged_by_some_of_them():
     assert set(np.diff(chosen)) == {12, 13}
 
 
-def test_animal_may_be_where_it_is_free_or_where_it_has_been():
+def test_allowed_positions_are_free_or_visited():
     volume, trajectory = room(), wander(np.random.default_rng(0))
     volume.occupancy[22, 4, 22] = 2
     allowed = allowed_voxels(volume, {}, reach_voxels=2)

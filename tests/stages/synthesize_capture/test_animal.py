@@ -1,4 +1,4 @@
-"""The animal is one closed surface, reaches for its feet exactly, and does not slide on them."""
+"""The synthetic animal: one closed surface, exact inverse kinematics, no foot skate."""
 
 import numpy as np
 
@@ -10,13 +10,13 @@ CREATURE = animal.grow(np.random.default_rng(0), cell_m=0.02)
 FEET = [animal.INDEX[name] for name in gait.FEET]
 
 
-def test_rest_bones_leave_the_surface_alone():
+def test_rest_pose_gives_the_rest_surface():
     rest = rigid.make(np.eye(3), animal.HEADS)
     np.testing.assert_allclose(animal.surface(CREATURE, rest), CREATURE.vertices, atol=1e-6)
     np.testing.assert_allclose(CREATURE.weight.sum(1), 1, atol=1e-5)
 
 
-def test_planted_feet_do_not_slide():
+def test_feet_in_stance_do_not_slide():
     for speed in (0.6, 1.2, 2.0):
         course = _straight(speed)
         times = np.linspace(1.0, 3.0, 400)

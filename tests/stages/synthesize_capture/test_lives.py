@@ -1,5 +1,5 @@
-"""Lives without pictures: homes can be lived in, volumes agree with where the animal goes, approaches have
-twins.
+"""Simulated motion without rendering: habitable homes, volumes that agree with trajectories, paired
+approaches.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ def test_homes_differ(home):
     assert {place.name for place in home.places} >= {"sofa", "cat tree", "bowl", "window"}
 
 
-def test_the_animal_never_walks_through_what_the_volume_calls_solid(home):
+def test_animal_never_walks_through_solid_voxels(home):
     rng = np.random.default_rng(0)
     life = lives.lived(dwellings.rearranged(home, rng), rng, 30.0, takes=2)
     assert np.flatnonzero(np.diff(life.timestamp_s) > 1).tolist() == [149], (
@@ -40,7 +40,7 @@ def test_the_animal_never_walks_through_what_the_volume_calls_solid(home):
     assert lengths[life.volume.occupancy == 0].max() == 0
 
 
-def test_the_same_thing_has_the_same_code_in_every_home(home):
+def test_features_of_furniture_are_the_same_in_every_home(home):
     volume = voxels.volume_of(home)
     sofa = next(s for s in home.standing if s.name == "sofa")
     voxel, _ = volume.voxel(np.array([sofa.x, 0.25, sofa.z]))
@@ -48,7 +48,7 @@ def test_the_same_thing_has_the_same_code_in_every_home(home):
     assert code @ voxels.CODES[voxels.KINDS.index("sofa")] == pytest.approx(1, abs=1e-2)
 
 
-def test_approaches_and_their_twins_begin_alike_and_end_apart(home):
+def test_paired_approaches_start_equal_and_end_differently(home):
     met = approaches.scripted(home, np.random.default_rng(0), 12)
     root = met.world_from_agent[..., :3, 3]
     walked = np.linalg.norm(met.observer[:, :, -1] - met.observer[:, :, 0], axis=-1)
@@ -61,7 +61,7 @@ def test_approaches_and_their_twins_begin_alike_and_end_apart(home):
     assert fled[1].mean() < 0.3
 
 
-def test_the_same_seed_gives_the_same_life(home, tmp_path):
+def test_simulation_is_deterministic(home, tmp_path):
     for name in ("a", "b"):
         rng = np.random.default_rng(5)
         lives.write(tmp_path / name, lives.lived(dwellings.rearranged(home, rng), rng, 3.0))

@@ -1,4 +1,4 @@
-"""A cat and a dog live together: near each other, never in each other, and both with a truth of their own."""
+"""A cat and a dog in one home: they interact without collisions, and each has its own ground truth."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ CONFIG = Config(
 )
 
 
-def test_the_dog_follows_and_makes_way():
+def test_dog_follows_and_makes_way():
     lived = [
         session.simulate_session(HOME, np.random.default_rng(seed), 40.0, with_dog=True) for seed in (1, 2)
     ]
@@ -60,7 +60,7 @@ def test_its_feet_stand_on_the_floor():
     assert np.abs(lowest).max() < 0.035, "metres: soles sink in as those of the cat do, in proportion"
 
 
-def test_each_has_a_truth_of_its_own(tmp_path):
+def test_each_animal_has_its_own_ground_truth(tmp_path):
     scripts = script.scripts(CONFIG, HOME, PHONE)
     names = ["walkthrough", "turnaround_cat", "turnaround_dog", "session-1", "session-2"]
     assert [part.name for part in scripts] == names
@@ -81,7 +81,7 @@ def test_each_has_a_truth_of_its_own(tmp_path):
     assert "world_from_agent" not in np.load(tmp_path / "cat/turnaround_dog.npz")
 
 
-def test_a_companion_changes_no_walkthrough():
+def test_companion_does_not_change_the_walkthrough():
     both = script.scripts(CONFIG, HOME, PHONE)
     alone = script.scripts(replace(CONFIG, companion="none"), HOME, PHONE)
     np.testing.assert_array_equal(both[0].world_from_camera, alone[0].world_from_camera)

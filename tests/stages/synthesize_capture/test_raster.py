@@ -1,4 +1,4 @@
-"""The scan converter agrees with rays, also for triangles that pass behind the camera."""
+"""The rasterizer agrees with ray casting, also for triangles that cross the camera plane."""
 
 import numpy as np
 
@@ -27,7 +27,7 @@ def test_depth_agrees_with_embree():
     assert agree.mean() > 0.995, "the same depth, but for pixels on an edge"
 
 
-def test_depth_of_another_size_is_exact_on_a_plane():
+def test_depth_at_another_resolution_is_exact_on_a_plane():
     wall = np.array([[-9, -9, 2.0], [9, -9, 2.0], [0, 18, 5.0]])
     view = raster.rasterize(wall, np.array([[0, 1, 2]], np.int32), INTRINSICS, 64, 80)
     depth = raster.depth_through(

@@ -1,5 +1,5 @@
-"""A recording is a real Record3D container whose content agrees with its truth, the same bytes at every
-run.
+"""Rendered recordings are valid Record3D containers that agree with their ground truth, and are
+deterministic.
 """
 
 import json
@@ -43,7 +43,7 @@ def made(scripts, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_same_bytes_whatever_the_order(scripts, made, tmp_path):
+def test_bytes_are_independent_of_the_order(scripts, made, tmp_path):
     produce.record(scripts[2], CREATURE, tmp_path, tmp_path)
     for path in tmp_path.iterdir():
         assert path.read_bytes() == (made / path.name).read_bytes(), path.name
@@ -91,7 +91,7 @@ def test_truth_is_upright_and_the_animal_fills_its_mask(scripts, made):
         )
 
 
-def test_true_flow_moves_depth_onto_depth(scripts):
+def test_true_flow_agrees_with_depth(scripts):
     stage = film.Stage(scripts[2], CREATURE)
     flow = film.true_flow(stage, 0, 2)
     known = np.isfinite(flow[..., 0])
@@ -100,7 +100,7 @@ def test_true_flow_moves_depth_onto_depth(scripts):
 
 
 @pytest.mark.slow
-def test_a_session_of_another_home_changes_no_other(scripts, made, tmp_path):
+def test_session_in_another_home_does_not_change_others(scripts, made, tmp_path):
     more = script.scripts(replace(CONFIG, foreign_sessions=1), room.furnish(np.random.default_rng(4)), PHONE)
     assert [part.name for part in more] == [*(part.name for part in scripts), "session-3"]
     elsewhere = more[-1]

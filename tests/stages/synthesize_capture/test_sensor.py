@@ -1,4 +1,4 @@
-"""The phone's errors have the size that they claim."""
+"""Simulated sensor errors have their specified magnitude."""
 
 import numpy as np
 
@@ -40,7 +40,7 @@ def test_odometry_is_gravity_aligned_with_small_drift():
         assert abs(length / np.linalg.norm(np.diff(position[::15], axis=0), axis=-1).sum() - 1) < 0.03
 
 
-def test_timestamps_begin_at_zero_and_have_gaps():
+def test_timestamps_start_at_zero_and_have_gaps():
     times = sensor.timestamps(np.random.default_rng(1), 60.0, 15.0)
     step = np.diff(times)
     assert times[0] == 0

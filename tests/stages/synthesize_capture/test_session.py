@@ -1,4 +1,4 @@
-"""The animal lives by its rules: it moves, stays on free floor, runs when pressed, and only then."""
+"""Behavior of the simulated animal: it moves, stays on free floor, and flees only when approached."""
 
 import numpy as np
 
@@ -11,13 +11,13 @@ from stages.synthesize_capture.session import simulate_session
 HOME = room.furnish(np.random.default_rng(0))
 
 
-def test_same_seed_same_session():
+def test_session_is_deterministic():
     first, second = (simulate_session(HOME, np.random.default_rng(5), 8.0) for _ in range(2))
     np.testing.assert_array_equal(first.animal.position, second.animal.position)
     np.testing.assert_array_equal(first.observer_looks_at, second.observer_looks_at)
 
 
-def test_who_lives_there_comes_up_from_farther_than_who_films():
+def test_residents_approach_from_farther_than_observers():
     nearest = []
     for style in (FILMING, AT_HOME):
         lived = simulate_session(HOME, np.random.default_rng(5), 40.0, style)
@@ -32,7 +32,7 @@ def test_who_lives_there_comes_up_from_farther_than_who_films():
     assert nearest[1] > nearest[0]
 
 
-def test_manner_over_minutes():
+def test_activities_over_minutes():
     sessions = [simulate_session(HOME.arranged(rng), rng, 60.0) for rng in np.random.default_rng(7).spawn(5)]
     manner = review.manner(sessions)
     assert manner.moving_windows >= 0.4
@@ -46,7 +46,7 @@ def test_manner_over_minutes():
     assert (np.abs(inside[:, 2]) < room.DEPTH_M / 2).all()
 
 
-def test_someone_far_away_or_still_never_makes_it_run():
+def test_distant_or_static_person_causes_no_flight():
     floor = floor_for([], (0.24, 0.3))
     for seen in (
         SeenWalker(np.array([2.8, 2.2]), np.array([-0.9, -0.9])),
@@ -58,7 +58,7 @@ def test_someone_far_away_or_still_never_makes_it_run():
             assert cat.reason != REASONS[1]
 
 
-def test_it_runs_away_from_whoever_comes():
+def test_animal_flees_from_an_approaching_person():
     floor = floor_for([], (0.24, 0.3))
     for angle in np.linspace(0, 2 * np.pi, 7):
         toward = np.array([np.sin(angle), np.cos(angle)])

@@ -1,4 +1,4 @@
-"""Every species is one closed surface that stands, walks and rests on its own feet."""
+"""Every species is one closed surface that stands, walks and rests on the ground."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ SOLES = ("left toes", "right toes", "left hand", "right hand")
 
 
 @pytest.mark.parametrize("species", animal.BODIES)
-def test_surface_is_closed_and_one(species):
+def test_surface_is_closed_and_connected(species):
     creature = animal.grow(np.random.default_rng(1), species=species)
     surface = trimesh.Trimesh(creature.vertices, creature.faces, process=False)
     assert surface.is_watertight
@@ -57,14 +57,14 @@ def test_it_walks_on_the_ground(species, speed):
     assert np.abs([points[:, 1].min() for points, _ in shown]).max() < 0.03, "metres"
 
 
-def test_a_rabbit_hops_with_its_hind_feet_together():
+def test_rabbit_hops_with_both_hind_feet():
     motion = gait.poses(_course(1.0), np.linspace(1, 3, 200), animal.BODIES["rabbit"])
     left, right = (_heights(motion, name) for name in ("left toes", "right toes"))
     assert np.corrcoef(left, right)[0, 1] > 0.9
     assert np.ptp(motion.world_from_agent[:, 1, 3]) > 0.03, "metres that the body rises and falls"
 
 
-def test_a_hen_steps_with_one_foot_at_a_time():
+def test_hen_moves_one_foot_at_a_time():
     motion = gait.poses(_course(0.7), np.linspace(1, 3, 200), animal.BODIES["hen"])
     left, right = (_heights(motion, name) for name in ("left toes", "right toes"))
     assert np.corrcoef(left, right)[0, 1] < -0.2

@@ -1,5 +1,5 @@
-"""Chained lives: an animal that only breathes counts as resting, however its millimetres differ from the
-recorded ones.
+"""Chained simulation: a breathing animal counts as resting, despite millimetres of difference to recorded
+motion.
 """
 
 from types import SimpleNamespace
@@ -35,7 +35,7 @@ class Breathing:
         return SampledPlan(goal, path, np.tile(upright, (len(path), FUTURE, 1)))
 
 
-def test_breathing_is_rest_and_rest_is_one_speed():
+def test_breathing_counts_as_rest():
     data, scenes = wandering(), Scenes.of(room())
     ats = Ats(Breathing(), scenes, REST, "yaw", PlanSamplingConfig())
     found = chaining.figures(ats, data, scenes, count=2, seconds=2.0, seed=0)

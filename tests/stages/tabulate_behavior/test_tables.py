@@ -1,6 +1,4 @@
-"""Tables: intervals know of seeds and of episodes, differences are paired, and text shows what the figures
-say.
-"""
+"""Tables: intervals over seeds and episodes, paired differences, and formatting."""
 
 import numpy as np
 import pytest
@@ -18,7 +16,7 @@ def scores(values):
     )
 
 
-def test_intervals_grow_with_what_seeds_disagree_about():
+def test_intervals_include_the_variance_between_seeds():
     rng = np.random.default_rng(0)
     windows = rng.normal(1, 0.01, (3, 640))
     alike = tables.interval(windows, WINDOWS, 64, 300, 0)
@@ -27,7 +25,7 @@ def test_intervals_grow_with_what_seeds_disagree_about():
     assert apart.high - apart.low > 10 * (alike.high - alike.low)
 
 
-def test_a_difference_is_taken_window_by_window():
+def test_differences_are_paired_per_window():
     rng = np.random.default_rng(1)
     hard = np.repeat(rng.gamma(1, 1, 10), 64)[None] * np.ones((2, 1))
     found = tables.figures({"ats": scores(hard), "baseline": scores(hard + 0.1)}, "ats", draws=300, seed=0)
@@ -38,7 +36,7 @@ def test_a_difference_is_taken_window_by_window():
     assert f"{found['behavior/baseline/goal_minde_m']:.3f}" in text
 
 
-def test_flight_is_held_against_the_animals_own():
+def test_flight_rate_is_compared_with_that_of_the_animal():
     values = {
         "flees/seen": np.full((2, 40), 0.75),
         "flees/true": np.ones((2, 40)),
@@ -50,14 +48,14 @@ def test_flight_is_held_against_the_animals_own():
     assert found["behavior/ats/flees_seen_minus_unseen_ci95_low"] < 0.2
 
 
-def test_plateaus_tell_a_flat_curve_from_a_falling_one():
+def test_plateau_detection():
     step = np.arange(200.0)
     found = tables.plateaus({"a": {"goal": np.ones((2, 200))}, "b": {"goal": (300 - step)[None]}})
     assert found["behavior/a/goal_loss_still_falls"] == 0
     assert found["behavior/b/goal_loss_still_falls"] > 0.1
 
 
-def test_untrained_baselines_stand_on_the_same_windows():
+def test_untrained_baselines_use_the_same_windows():
     data = wandering()
     test = np.flatnonzero(data.split == 1)[::5]
     like = MethodScores(

@@ -47,32 +47,32 @@ def source():
     return MotionSource(split, ComparedModels(model, ablated, bank))
 
 
-def test_the_truth_scores_nothing_and_a_shifted_motion_its_shift(source):
+def test_errors_of_true_and_shifted_motion(source):
     dataset, model = source.split.held_out, source.models.ours
     part = dataset.stretches[0][:61]
     reference = scores.references([part], np.array([0]), dataset, model)[0]
-    told = dict(zip(scores.METRICS, scores.score(part, reference, model.poses, np.zeros(1)), strict=True))
-    assert all(told[name] == pytest.approx(0, abs=1e-6) for name in scores.METRICS[:6])
-    assert told["contact"] == 1 and told["slide_m_s"] < 0.01 and told["planted"] > 0.5
+    metrics = dict(zip(scores.METRICS, scores.score(part, reference, model.poses, np.zeros(1)), strict=True))
+    assert all(metrics[name] == pytest.approx(0, abs=1e-6) for name in scores.METRICS[:6])
+    assert metrics["contact"] == 1 and metrics["slide_m_s"] < 0.01 and metrics["planted"] > 0.5
     step = np.linalg.norm(np.diff(part.world_from_agent[:, :3, 3], axis=0)[[0, -1]], axis=1).mean()
-    assert told["neighbour_v2v_mm"] == pytest.approx(1000 * step, rel=0.5)
+    assert metrics["neighbour_v2v_mm"] == pytest.approx(1000 * step, rel=0.5)
     root = part.world_from_agent.copy()
     root[:, :3, 3] += [0.03, 0.0, 0.04]
-    told = dict(
+    metrics = dict(
         zip(
             scores.METRICS,
             scores.score(BodyMotion(root, part.agent_from_bone), reference, model.poses, np.zeros(1)),
             strict=True,
         )
     )
-    assert told["translation"] == pytest.approx(100 * 0.07 / 3)
+    assert metrics["translation"] == pytest.approx(100 * 0.07 / 3)
     for name in ("mpjpe_mm", "mpvpe_mm"):
-        assert told[name] == pytest.approx(50, abs=0.01)
-    assert told["end_v2v_share"] == pytest.approx(0.05 / dataset.body.length_m, rel=1e-3)
-    assert told["orientation"] == told["pose"] == pytest.approx(0, abs=1e-6)
+        assert metrics[name] == pytest.approx(50, abs=0.01)
+    assert metrics["end_v2v_share"] == pytest.approx(0.05 / dataset.body.length_m, rel=1e-3)
+    assert metrics["orientation"] == metrics["pose"] == pytest.approx(0, abs=1e-6)
 
 
-def test_the_memory_bank_finds_itself(source):
+def test_memory_bank_retrieves_its_own_clips(source):
     found = methods.nearest(source.models.bank, source.models.bank)
     torch.testing.assert_close(found, source.models.bank.channels)
 
@@ -125,7 +125,7 @@ def test_tables_hold_every_method_with_intervals(source):
     assert len(bars.checks(found)) > 10
 
 
-def test_clips_come_two_by_two_and_a_torn_join_is_measured(source):
+def test_clips_are_paired_and_the_gap_at_the_joint_is_measured(source):
     dataset, model = source.split.held_out, source.models.ours
     travelled = select_clips(dataset, np.random.default_rng(0), stride=10, resting=0.0)
     cuts = comparison.select_runs(travelled, 2, 6)
@@ -147,15 +147,15 @@ def test_clips_come_two_by_two_and_a_torn_join_is_measured(source):
     np.testing.assert_array_equal(torn[2:], whole[2:])
 
 
-def test_minutes_are_measured(source):
+def test_long_takes_are_measured(source):
     found = lengths.figures(source, replace(SMALL, minutes_s=12.0, subgoals=3))
     assert found["longterm_minutes/seconds"] >= 12.0
     assert found["longterm_minutes/subgoals"] == 3
     assert found["longterm_minutes/outside_room_m"] < 0.05
 
 
-def test_a_clip_is_blocked_where_the_block_stands_between_its_ends(source):
-    """The strider walks around the block: only ends on opposite sides of it have it between them."""
+def test_clips_with_an_obstacle_between_their_ends_are_marked(source):
+    """Only clips with ends on opposite sides of the block have it in between."""
     clips = comparison.encode_selection(
         source.split.held_out,
         select_clips(source.split.held_out, np.random.default_rng(0), stride=5),

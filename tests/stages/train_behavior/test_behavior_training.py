@@ -95,8 +95,10 @@ def test_no_heading_is_clipped(windows, turn_rad):
 
 
 @pytest.mark.parametrize("family", ["diffusion", "one_stage"])
-def test_the_prior_of_bodies_is_that_of_the_training_windows(windows, family):
-    """Alone it removes most of the noise from bones; paths of one-stage models and roots keep theirs."""
+def test_body_prior_is_fitted_to_training_windows(windows, family):
+    """The linear estimate alone removes most noise from bones, but not from roots and paths of one-stage
+    models.
+    """
     architecture = replace(ARCHITECTURE, family=family, body_components=5)
     statistics = statistics_from_windows(windows, 0.0)
     body = initial_nets(architecture, Schedule(), statistics, 0).body
@@ -112,7 +114,7 @@ def test_the_prior_of_bodies_is_that_of_the_training_windows(windows, family):
 
 
 def body_sequences(body, windows, statistics):
-    """The sequences of one batch, and the postures that they begin with."""
+    """The sequences of one batch and their initial postures."""
     scene = SceneSampler(Scenes.of(room()), 4, "cpu")
     batch = draw_batch(windows, scene, statistics, PLAIN, 64, torch.Generator().manual_seed(1))
     nothing = torch.zeros(64)
@@ -123,7 +125,7 @@ def body_sequences(body, windows, statistics):
 
 
 def linear_error(prior, posture, clean, t=20):
-    """Mean squared error of the noise of each channel, if the UNet corrects nothing."""
+    """Mean squared error of the noise per channel without a correction by the UNet."""
     noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(2))
     share = torch.tensor(Schedule().alpha_bar[t]).float()
     residual = noised(clean, noise, share) - share.sqrt() * prior.mean(posture)
@@ -146,7 +148,7 @@ def test_bodies_have_a_prior_unless_they_are_regressed_or_trained_as_in_the_pape
     assert components["ours"] > 0 == components["gaussian"] == components["paper"]
 
 
-def test_windows_begin_at_the_origin_facing_forward(windows):
+def test_windows_start_at_the_origin_facing_forward(windows):
     tracks = windows.tracks(torch.arange(len(windows)))
     assert tracks.root[:, 7].abs().max() < 1e-5
     torch.testing.assert_close(
@@ -154,7 +156,7 @@ def test_windows_begin_at_the_origin_facing_forward(windows):
     )
 
 
-def test_turning_and_mirroring_move_everything_together(windows):
+def test_rotation_and_mirroring_are_consistent(windows):
     plain, _ = drawn(windows, PLAIN)
     for augmentation in (replace(PLAIN, turn=1.0), replace(PLAIN, mirror=1.0)):
         moved, _ = drawn(windows, augmentation)
@@ -177,7 +179,7 @@ def test_turning_and_mirroring_move_everything_together(windows):
         torch.testing.assert_close(*trace, atol=1e-4, rtol=0)
 
 
-def test_approaches_are_drawn_more_often_and_then_perceived(windows, monkeypatch):
+def test_approaches_are_oversampled_and_perceived(windows, monkeypatch):
     monkeypatch.setattr(objective, "CONDITION_DROPOUT", 1.0)
     coming = replace(windows, approached=torch.tensor([7]))
     batch, _ = drawn(coming, replace(PLAIN, approached=1.0))
@@ -199,7 +201,7 @@ def test_approaches_are_drawn_more_often_and_then_perceived(windows, monkeypatch
     ].oversampled.any()
 
 
-def test_all_conditions_are_dropped_together_as_often_as_asked(windows, monkeypatch):
+def test_conditions_are_dropped_together_with_the_given_probability(windows, monkeypatch):
     monkeypatch.setattr(objective, "CONDITION_DROPOUT", 0.0)
     batch, _ = drawn(windows, replace(PLAIN, approached=0.0))
     nets = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0).eval()
@@ -215,7 +217,7 @@ def test_all_conditions_are_dropped_together_as_often_as_asked(windows, monkeypa
     assert (joint_mask(batch, ObjectiveConfig(), generator) == 1).all()
 
 
-def test_only_who_comes_up_and_is_near_approaches():
+def test_approaches_are_near_and_towards_the_animal():
     agent = np.zeros((4, 3))
     walk, here = np.linspace(1, 0, 8)[:, None] * [0.0, 0.0, 0.7], np.array([0.0, 1.2, 1.0])
     far = np.array([0.0, 0.0, 2.0])
@@ -223,7 +225,7 @@ def test_only_who_comes_up_and_is_near_approaches():
     assert approached(agent, observer).tolist() == [0]
 
 
-def test_approaches_from_rare_distances_are_asked_as_often():
+def test_approaches_are_balanced_over_distances():
     walk = np.linspace(1, 0, 8)[:, None] * [0.0, 0.0, 0.7]
     distance = np.r_[np.full(20, 0.5), np.full(4, 1.5), 2.1]
     observer = walk + distance[:, None, None] * [0.0, 0.0, 1.0]
@@ -231,7 +233,7 @@ def test_approaches_from_rare_distances_are_asked_as_often():
     assert [(asked == near).sum() for near in (0.5, 1.5, 2.1)] == [20, 20, MAX_REPEATS]
 
 
-def test_a_lapse_tilts_and_bends_what_is_remembered_and_nothing_else(windows):
+def test_past_augmentation_changes_only_the_past(windows):
     (plain, _), (with_posture_noise, _) = (
         drawn(windows, replace(PLAIN, posture_offset=share)) for share in (0.0, 1.0)
     )
@@ -255,7 +257,7 @@ def test_mirrored_samples_swap_the_scene_and_hide_their_bones(windows):
     assert not mirrored.bones_keep.any()
     torch.testing.assert_close(mirrored.goal[:, 0], -plain.goal[:, 0])
     same = (mirrored.scene == plain.scene.flip(2)).all(1)
-    assert same.float().mean() > 0.99  # points on the border of two voxels may fall either way
+    assert same.float().mean() > 0.99  # points on voxel borders are ambiguous
 
 
 def test_fast_scene_sampling_agrees_with_the_exact_grid(data, windows):
@@ -273,27 +275,27 @@ def test_fast_scene_sampling_agrees_with_the_exact_grid(data, windows):
     )  # one reads smoothed voxels, the other averages the nearest ones
 
 
-def test_the_error_of_rectified_flow_is_that_of_noise_less_clean_sample():
+def test_rectified_flow_target_is_noise_minus_sample():
     schedule, clean = (
         Schedule(course="rectified"),
         torch.randn(64, 4, generator=torch.Generator().manual_seed(1)),
     )
-    told = {}
+    inputs_seen = {}
 
     def denoise(x, t):
-        told.update(x=x, t=t)
+        inputs_seen.update(x=x, t=t)
         return x.sin()
 
     error = squared_error(denoise, clean, schedule, "flow", torch.Generator().manual_seed(0))
-    moment = ((told["t"] + 1) / (schedule.steps + 1))[:, None]
-    way = told["x"] * ((1 - moment) ** 2 + moment**2).sqrt()
+    moment = ((inputs_seen["t"] + 1) / (schedule.steps + 1))[:, None]
+    way = inputs_seen["x"] * ((1 - moment) ** 2 + moment**2).sqrt()
     true = (way - (1 - moment) * clean) / moment - clean
-    predicted = told["x"].sin() - (way - moment * told["x"].sin()) / (1 - moment)
+    predicted = inputs_seen["x"].sin() - (way - moment * inputs_seen["x"].sin()) / (1 - moment)
     torch.testing.assert_close(error, (predicted - true) ** 2, atol=1e-4, rtol=1e-3)
 
 
-def test_an_error_that_changes_from_frame_to_frame_counts_more_than_one_that_stays():
-    """Of noise errors of size 1 that stay, alternate, or are drawn for each frame alone."""
+def test_high_frequency_errors_have_larger_weight():
+    """Constant, alternating, and independent noise errors of size 1."""
     share, clean = torch.from_numpy(Schedule().alpha_bar).float(), torch.zeros(32, 3, 40)
     alone = torch.randn(clean.shape, generator=torch.Generator().manual_seed(1))
     alternating = 1 - 2.0 * (torch.arange(40) % 2)
@@ -308,7 +310,7 @@ def test_an_error_that_changes_from_frame_to_frame_counts_more_than_one_that_sta
     assert found == pytest.approx([1 / 9, (1 + 16 * 39 / 40) / 9, 1.0], rel=0.03)
 
 
-def test_half_precision_learns_nearly_the_same_and_keeps_its_weights(data):
+def test_mixed_precision_is_accurate_and_keeps_float32_weights(data):
     settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=3, goal_steps=1, batch=8))
     half = replace(settings, optimization=replace(settings.optimization, precision="bfloat16"))
     exact, rough = (
@@ -347,7 +349,7 @@ def test_models_of_other_architectures_are_written_and_read(data, tmp_path, shap
 
 
 @pytest.mark.slow
-def test_training_learns_and_resumes_to_the_same_bits(data, tmp_path, monkeypatch):
+def test_training_reduces_the_loss_and_resumes_bit_exactly(data, tmp_path, monkeypatch):
     settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=8, goal_steps=4, batch=8))
     whole = train(TrainingHomes.of_one(data, Scenes.of(room())), ARCHITECTURE, Schedule(), settings, seed=3)
     assert set(whole.record.terms) == {"goal", "path", "body"}
@@ -385,7 +387,7 @@ def test_training_learns_and_resumes_to_the_same_bits(data, tmp_path, monkeypatc
         torch.testing.assert_close(resumed.nets.state_dict()[name], value, atol=0, rtol=0)
 
 
-def test_goals_and_paths_ask_for_approaches_each_in_its_own_share(data, monkeypatch):
+def test_goals_and_paths_have_their_own_fraction_of_approaches(data, monkeypatch):
     asked = []
 
     def watched(windows, scene, statistics, augmentation, *rest, **how):
@@ -402,7 +404,7 @@ def test_goals_and_paths_ask_for_approaches_each_in_its_own_share(data, monkeypa
     assert asked == [0.5] * prior + [0.2, 0.2, 0.5] and prior > 0
 
 
-def test_contract_is_whole_and_loads_back(windows, tmp_path):
+def test_contract_is_complete_and_round_trips(windows, tmp_path):
     nets, scaling = (
         initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0).eval(),
         statistics_from_windows(windows, 0.0).scaling,
@@ -421,7 +423,7 @@ def test_contract_is_whole_and_loads_back(windows, tmp_path):
 
 
 @pytest.mark.slow
-def test_exported_network_is_exact_and_always_the_same_bytes(windows, tmp_path):
+def test_exported_network_is_exact_and_deterministic(windows, tmp_path):
     goal = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0).eval().goal
     inputs, output = signature("goal", ARCHITECTURE)
     for name in ("first", "second"):
@@ -430,7 +432,7 @@ def test_exported_network_is_exact_and_always_the_same_bytes(windows, tmp_path):
     assert (tmp_path / "first.onnx").read_bytes() == (tmp_path / "second.onnx").read_bytes()
 
 
-def test_golden_plan_uses_the_noise_it_names(windows):
+def test_golden_plan_uses_its_noise(windows):
     nets, scaling = (
         initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0).eval(),
         statistics_from_windows(windows, 0.0).scaling,
@@ -453,10 +455,8 @@ def test_golden_plan_uses_the_noise_it_names(windows):
 
 
 @pytest.mark.slow
-def test_an_animal_that_stands_still_is_exported_too(windows, tmp_path):
-    """A past in which every frame is alike: its velocity is zero, and so is the length that a power is taken
-    of.
-    """
+def test_static_animal_is_exported(windows, tmp_path):
+    """All frames of the past are equal: the velocity is zero, and so is the base of its power."""
     nets = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0).eval()
     inputs, output = signature("perception", ARCHITECTURE)
     export_network(nets.perception, tmp_path / "perception.onnx", inputs, output)
@@ -464,8 +464,8 @@ def test_an_animal_that_stands_still_is_exported_too(windows, tmp_path):
 
 
 class Timid:
-    """Networks of an animal that goes one metre away from an observer who is nearer than 4 m, with 0.1 m of
-    spread.
+    """Networks of an animal that moves one metre away from an observer within 4 m, with a standard deviation
+    of 0.1 m.
     """
 
     def perceive(self, scene_grid, others, past, keep):
@@ -505,7 +505,7 @@ def test_paths_are_drawn_by_scale_of_guidance_for_every_window(data, windows):
         assert np.abs(rows[0] - rows[2]).max() > 50, "guidance changes the paths"
 
 
-def test_learning_rate_falls_twice():
+def test_learning_rate_decays_twice():
     factor = [two_cosines(step / 100, 0.3) for step in range(100)]
     assert max(factor) == pytest.approx(1, abs=0.02)
     assert factor[29] < 0.05
@@ -514,7 +514,7 @@ def test_learning_rate_falls_twice():
     assert two_cosines(0.99, 2.5) < 0.05
 
 
-def test_each_part_of_training_moves_its_own_networks(data, windows):
+def test_each_phase_trains_its_own_networks(data, windows):
     batch, _ = drawn(windows, AugmentationConfig())
     nets = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 3.0), 0)
     every, bodiless = ObjectiveConfig(), ObjectiveConfig(body_share=0.0)
@@ -534,7 +534,7 @@ def test_each_part_of_training_moves_its_own_networks(data, windows):
 
 
 class Asked:
-    """A goal network that notes which part of the future it is asked for, and knows the answer."""
+    """A goal network that records the requested part of the future and returns the true goal."""
 
     def __init__(self, track):
         self.goal, self.track, self.horizons = self, track, torch.zeros(0)
@@ -548,14 +548,14 @@ class Asked:
 
 
 @pytest.mark.parametrize(("share", "lowest", "highest"), [(0.0, 1.0, 1.0), (1.0, 0.2, 0.5)])
-def test_goals_are_asked_for_earlier_times_as_often_as_told(windows, share, lowest, highest):
+def test_earlier_goals_have_the_given_probability(windows, share, lowest, highest):
     batch, _ = drawn(windows, PLAIN)
     torch.testing.assert_close(batch.track[:, :, -1], batch.goal)
     nets, number = Asked(batch.track), torch.arange(len(batch.goal), dtype=torch.float32)[:, None]
     settings = ObjectiveConfig(earlier_share=share, goal_draws=4)
     error = goal_error(nets, batch, number, Schedule(), settings, torch.Generator().manual_seed(0))
     assert error.shape == (4 * len(batch.goal), 3)
-    assert error.abs().max() < 1e-3  # the right answer for the time asked for
+    assert error.abs().max() < 1e-3  # the true goal for the requested time
     assert lowest - 1e-6 <= nets.horizons.min() <= highest
 
 
@@ -571,7 +571,7 @@ def test_goals_are_asked_for_earlier_times_as_often_as_told(windows, share, lowe
         (Config(horizon_s=60.0), "BEH-001"),
     ],
 )
-def test_what_cannot_be_learned_or_made_is_refused_at_once(data, settings, code):
+def test_impossible_configurations_are_refused(data, settings, code):
     def asked(config):
         longer = data.with_horizon(frames_from_seconds(config.horizon_s))
         check_settings(
@@ -584,7 +584,7 @@ def test_what_cannot_be_learned_or_made_is_refused_at_once(data, settings, code)
 
 
 @pytest.mark.slow
-def test_the_network_of_an_accompanied_animal_perceives_any_number_of_others(tmp_path):
+def test_exported_network_accepts_any_number_of_companions(tmp_path):
     torch.manual_seed(0)
     nets = model.BehaviorNets(ARCHITECTURE, Schedule()).eval()
     inputs, output = signature("perception", ARCHITECTURE, accompanied=True)

@@ -1,4 +1,4 @@
-"""One model of several homes: goals and paths from all of them, bodies from the animal's own alone."""
+"""One model for several homes: goals and paths from all of them, bodies from the home of the animal alone."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ MORE_BONES = BONES + 2
 
 @pytest.fixture(scope="module")
 def builds(tmp_path_factory):
-    """Two builds of one animal: the second found more bones."""
+    """Two builds of one animal; the second has more bones."""
     folder = tmp_path_factory.mktemp("homes")
     own, other = write(folder / "own"), write(folder / "other")
     data = wandering()
@@ -58,7 +58,7 @@ def test_training_windows_of_both_homes_and_test_windows_of_its_own(learned):
     assert set(scene[own]) == {0} and set(scene[~own]) == {1}
 
 
-def test_each_home_is_as_likely_to_be_learned_from(learned):
+def test_homes_are_sampled_with_equal_probability(learned):
     data = learned.data
     few = np.concatenate([data.indices(TRAIN)[:5], data.indices(TRAIN)[len(data.indices(TRAIN)) // 2 :]])
     some = replace(data, **{name: getattr(data, name)[few] for name in ("video", "start", "split")})
@@ -68,7 +68,7 @@ def test_each_home_is_as_likely_to_be_learned_from(learned):
     assert set(drawn) == set(range(len(few)))
 
 
-def test_bodies_are_learned_from_the_own_home_alone(learned):
+def test_bodies_are_learned_from_the_own_home_only(learned):
     windows = windows_from_data(learned, ARCHITECTURE)
     drawn = AugmentationConfig(mirror=0.0)
     statistics = statistics_from_windows(windows, largest_turn_rad(drawn))
@@ -88,7 +88,7 @@ def test_bodies_are_learned_from_the_own_home_alone(learned):
     assert known.all() and batch.bones_known[bodies].all(), "windows with bones come first"
 
 
-def test_a_build_with_other_windows_is_refused(builds, tmp_path):
+def test_build_with_other_windows_is_refused(builds, tmp_path):
     own, _ = builds
     slow = write(tmp_path / "slow")
     replace(wandering(), rate_hz=5.0).save(slow / "behavior_data")

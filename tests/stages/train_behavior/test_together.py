@@ -1,4 +1,4 @@
-"""Two processes that share each batch learn what one learns from the whole of it."""
+"""Two processes with half batches train like one with the full batch."""
 
 import sys
 from dataclasses import replace
@@ -22,7 +22,7 @@ FAMILIES = ("diffusion", "gaussian", "one_stage")
 
 
 def trained(family: str, batch: int, folder: Path | None = None) -> training.TrainedBehavior:
-    """Train for six steps, half of them goals; a quarter of the windows are mirrored and have no bones."""
+    """Train for six steps, half of them on goals; a quarter of the windows are mirrored without bones."""
     pace = BehaviorOptimizerConfig(steps=6, goal_steps=3, batch=batch, goal_batch=batch, rate=1e-3)
     return training.train(
         TrainingHomes.of_one(wandering(), Scenes.of(room())),
@@ -39,7 +39,7 @@ def weights(found: training.TrainedBehavior) -> torch.Tensor:
 
 
 def side(rank: int, port: str, folder: Path) -> list[training.TrainedBehavior]:
-    """Do what one process of two does, and leave the weights in a file."""
+    """Run one of two processes and save its weights."""
     two_processes.join(rank, port)
     found = [trained(family, 16, folder / family) for family in FAMILIES]
     torch.save([weights(each) for each in found], folder / f"rank{rank}.pt")
@@ -49,7 +49,7 @@ def side(rank: int, port: str, folder: Path) -> list[training.TrainedBehavior]:
 
 
 class BothRows:
-    """Stands for `distributed` where one process computes the losses of two: rows are counted over both."""
+    """Replacement of `distributed` in a process that computes the losses of two: rows are counted over both."""
 
     def __init__(self) -> None:
         self.counted: list[torch.Tensor] = []
@@ -64,7 +64,7 @@ class BothRows:
 
 
 def alone(family: str, monkeypatch: pytest.MonkeyPatch) -> training.TrainedBehavior:
-    """Train in one process on both processes' halves of each batch."""
+    """Train in one process on the half batches of both."""
     fit, rows = training.fit, BothRows()
     monkeypatch.setattr(objective, "distributed", rows)
     monkeypatch.setattr(baseline_losses, "distributed", rows)
@@ -88,14 +88,14 @@ def alone(family: str, monkeypatch: pytest.MonkeyPatch) -> training.TrainedBehav
 
 
 @pytest.mark.slow
-def test_two_processes_learn_what_one_does_from_the_whole_batch(tmp_path, monkeypatch):
+def test_two_processes_agree_with_one_on_the_full_batch(tmp_path, monkeypatch):
     with two_processes.started(__name__, tmp_path, monkeypatch) as port:
         together = side(0, port, tmp_path)
     theirs = torch.load(tmp_path / "rank1.pt", weights_only=True)
     for family, found, other in zip(FAMILIES, together, theirs, strict=True):
         expected = alone(family, monkeypatch)
         np.testing.assert_allclose(found.record.total(), expected.record.total(), rtol=1e-5, err_msg=family)
-        off = (weights(found) - weights(expected)).abs()  # Adam makes much of gradients that are nearly 0
+        off = (weights(found) - weights(expected)).abs()  # Adam amplifies gradients that are nearly 0
         assert (off > 2e-5).float().mean() < 1e-3 and off.mean() < 1e-6, family
         assert torch.equal(weights(found), other), "both hold the same"
         assert list((tmp_path / family).glob("step*6.pt")), "the first keeps checkpoints"

@@ -1,4 +1,4 @@
-"""Past, horizon and rate are settings: windows of another length are cut, learned, sampled and read back."""
+"""Past, horizon and rate are settings: windows of other lengths are sliced, learned, sampled and loaded."""
 
 from dataclasses import replace
 
@@ -41,7 +41,7 @@ def data() -> BehaviorData:
     return slice_windows(tracks, frozenset({"v002"}), rest, stride=1, past=PAST, rate_hz=RATE_HZ)
 
 
-def test_windows_last_as_long_as_is_asked(data, tmp_path):
+def test_windows_have_the_configured_length(data, tmp_path):
     data.save(tmp_path)
     again = BehaviorData.load(tmp_path)
     assert (again.past, again.future, again.rate_hz) == (PAST, 28, RATE_HZ)
@@ -63,7 +63,7 @@ def test_strides_are_metres_per_second_at_any_rate():
     np.testing.assert_allclose(again, way.numpy(), atol=1e-6)
 
 
-def test_a_model_of_other_windows_is_learned_read_back_and_sampled(data, tmp_path):
+def test_model_with_other_windows_is_trained_loaded_and_sampled(data, tmp_path):
     architecture = replace(ARCHITECTURE, past=data.past, future=data.future, rate_hz=data.rate_hz)
     quick = BehaviorOptimizerConfig(steps=4, goal_steps=2, batch=4, goal_batch=4)
     settings, schedule = BehaviorTrainingConfig(optimization=quick), Schedule()
@@ -76,7 +76,7 @@ def test_a_model_of_other_windows_is_learned_read_back_and_sampled(data, tmp_pat
     assert ats.sample(context, 3, np.random.default_rng(0)).path.shape == (2, 3, 28, 3)
 
 
-def test_what_nobody_can_play_is_not_exported(data):
+def test_unsupported_rates_are_not_exported(data):
     config = Config()
     with pytest.raises(InputError, match="REC-002"):
         check_settings(config, data, ARCHITECTURE, "here")

@@ -1,6 +1,4 @@
-"""The agent's localizer answers from all around, at any distance, through the crop that depth scales; the
-scene's wants a map.
-"""
+"""The agent localizer works from all directions and distances; the scene localizer requires a map."""
 
 import numpy as np
 import pytest
@@ -15,7 +13,7 @@ from tests.stages.textured_room import MemoryClip, noise_color, textured_room, w
 
 
 @pytest.mark.slow
-def test_agent_is_found_from_all_around():
+def test_agent_is_localized_from_all_directions():
     parts = [
         ((0.16, 0.16, 0.4), (0, 0, 0)),
         ((0.12, 0.13, 0.14), (0, 0.12, 0.24)),
@@ -33,7 +31,7 @@ def test_agent_is_found_from_all_around():
     assert localizer.calibration.slope > 0
 
 
-def test_a_map_that_fills_no_view_is_refused(tmp_path, monkeypatch):
+def test_map_that_fills_no_view_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(training, "MAX_DRAWS", 5)
     truth = walk(4)
     clip = MemoryClip(RayCaster(textured_room(edge_m=0.5)), truth, truth, folder=tmp_path)

@@ -1,4 +1,4 @@
-"""The pose regressor learns, files keep it, its certainty ranks errors."""
+"""The pose regressor learns, survives saving, and its confidence ranks errors."""
 
 import numpy as np
 import pytest
@@ -17,8 +17,8 @@ AXES = 16
 
 
 def described(views: int, seed: int) -> DescribedViews:
-    """Return views of points in a box, each described by smooth functions of where it lies; a tenth by
-    noise.
+    """Return views of points in a box, described by smooth functions of position; a tenth of the descriptors
+    is noise.
     """
     rng, fixed = np.random.default_rng(seed), np.random.default_rng(0)
     poses = rigid.exp(
@@ -31,10 +31,10 @@ def described(views: int, seed: int) -> DescribedViews:
         camera = np.concatenate(
             [(cell[:, ::-1] - (4, 5.5)) * 0.12, np.ones((len(cell), 1))], axis=1
         ) * rng.uniform(1.5, 2.0)
-        told = np.sin(rigid.apply(pose, camera) @ frequency + phase)
+        descriptor = np.sin(rigid.apply(pose, camera) @ frequency + phase)
         spoilt = rng.random(len(cell)) < 0.1
-        told[spoilt] = rng.normal(0, 1, (spoilt.sum(), AXES))
-        descriptors.append(told / np.linalg.norm(told, axis=1, keepdims=True))
+        descriptor[spoilt] = rng.normal(0, 1, (spoilt.sum(), AXES))
+        descriptors.append(descriptor / np.linalg.norm(descriptor, axis=1, keepdims=True))
         patches.append(Patches(descriptors[-1], camera, cell))
     basis = PcaBasis(np.zeros(AXES, np.float32), np.eye(AXES, dtype=np.float32))
     return DescribedViews(
@@ -62,23 +62,23 @@ def test_poses_are_regressed():
     assert ((certainty > 0) & (certainty < 1)).all()
 
 
-def test_the_likeliest_prediction_is_the_error_itself():
-    told = torch.linspace(-4, 1, 400)
+def test_optimal_uncertainty_is_the_error():
+    log_scale = torch.linspace(-4, 1, 400)
     turned = torch.from_numpy(rigid.exp(np.array([0, 0.2, 0, 0, 0, 0]))[:3, :3].astype(np.float32)).expand(
         400, 3, 3
     )
     error, surprise = pose_loss(
         torch.eye(3).expand(400, 3, 3),
         torch.zeros(400, 3),
-        told,
+        log_scale,
         turned,
         torch.tensor([0.0, 0.0, 0.1]).expand(400, 3),
     )
     assert torch.allclose(error, torch.tensor(0.21), atol=1e-4), "0.2 rad + (0.1 m)^2"
-    assert abs(float(told[surprise.argmin()]) - np.log(0.3)) < 0.02
+    assert abs(float(log_scale[surprise.argmin()]) - np.log(0.3)) < 0.02
 
 
-def test_files_keep_networks(tmp_path):
+def test_networks_survive_saving(tmp_path):
     seen = described(20, 1)
     net = train_regressor(seen, "agent", NetworkConfig(steps=3, batch_views=4, pose_width=8), 0)
     sampling, solver = PatchSampling("agent", 100.0, 96, 8, (6, 12)), model.RansacSolver(0.1, 0.2, 50, 1)
@@ -92,7 +92,7 @@ def test_files_keep_networks(tmp_path):
     assert [a.inlier_ratio for a in first] == [a.inlier_ratio for a in second]
 
 
-def test_patches_lie_on_the_grid_once_and_in_order():
+def test_patches_are_ordered_grid_cells():
     cell = np.stack(np.meshgrid(np.arange(13), np.arange(10), indexing="ij"), axis=-1).reshape(-1, 2)
     grid = on_grid(np.arange(1, len(cell) + 1, dtype=np.float32)[:, None], cell)
     assert grid.shape == (1, GRID, GRID)

@@ -1,6 +1,4 @@
-"""The stage as a function: DINOv2 descriptors by the features' describer, the paper's regressor on fresh
-views.
-"""
+"""The stage with DINOv2 descriptors, and the regressor with views rendered during training."""
 
 import json
 
@@ -37,8 +35,8 @@ def template(tmp_path_factory):
     return folder
 
 
-def test_patches_are_described_as_the_features_are(template, tmp_path):
-    """With the backend DINOv2 the localizer learns and queries DINOv2 tokens, after a reload too."""
+def test_patches_use_the_descriptors_of_the_features(template, tmp_path):
+    """With the DINOv2 backend the localizer uses DINOv2 tokens in training and queries, also after reloading."""
     basis, out = tmp_path / "feature_basis", tmp_path / "localizer"
     basis.mkdir()
     out.mkdir()
@@ -58,13 +56,13 @@ def test_patches_are_described_as_the_features_are(template, tmp_path):
     assert [a.inlier_ratio for a in first] == [a.inlier_ratio for a in second]
 
 
-def test_a_target_needs_its_template(tmp_path):
+def test_target_requires_its_template(tmp_path):
     with pytest.raises(InputError, match="ART-001.*agent_template|agent_template.*ART-001"):
         stage.run(stage.Inputs(), Config(target="agent"), tmp_path)
 
 
 def test_the_regressor_learns_from_views_rendered_on_the_fly(template, monkeypatch):
-    """Every step replaces the oldest views, and the truth of the new ones comes with them."""
+    """Every step replaces the oldest views together with their ground truth."""
     mesh, rng = ply.read_ply(template / "agent.ply"), np.random.default_rng(0)
     network = NetworkConfig(steps=4, pose_width=8, batch_views=4, fresh_views=3)
     config = Config(

@@ -1,4 +1,4 @@
-"""Two processes that share each batch learn what one learns from the whole of it."""
+"""Two processes with half batches train like one with the full batch."""
 
 import sys
 from pathlib import Path
@@ -23,7 +23,7 @@ def trained(views: int) -> torch.Tensor:
 
 
 def side(rank: int, port: str, folder: Path) -> torch.Tensor:
-    """Do what one process of two does, and leave the weights in a file."""
+    """Run one of two processes and save its weights."""
     two_processes.join(rank, port)
     found = trained(8)
     torch.save(found, folder / f"rank{rank}.pt")
@@ -33,7 +33,7 @@ def side(rank: int, port: str, folder: Path) -> torch.Tensor:
 
 
 @pytest.mark.slow
-def test_two_processes_learn_what_one_does_from_the_whole_batch(tmp_path, monkeypatch):
+def test_two_processes_agree_with_one_on_the_full_batch(tmp_path, monkeypatch):
     records, fit = [], networks.fit
 
     def recorded(**given):
@@ -48,7 +48,7 @@ def test_two_processes_learn_what_one_does_from_the_whole_batch(tmp_path, monkey
     mine, alone = records
     np.testing.assert_allclose(mine.total(), alone.total(), rtol=2e-5)
     theirs = torch.load(tmp_path / "rank1.pt", weights_only=True)
-    off = (together - expected).abs()  # Adam makes much of gradients that are nearly 0
+    off = (together - expected).abs()  # Adam amplifies gradients that are nearly 0
     assert (off > 2e-5).float().mean() < 1e-2 and off.mean() < 1e-5
     assert torch.equal(together, theirs), "both hold the same"
 

@@ -1,4 +1,4 @@
-"""A folder laid out as PROX, written small: a scan with z up, its signed distances, and fits in a camera."""
+"""A small folder in the format of PROX: a scan with z up, its signed distances, and body fits in the camera."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from tests.pipeline.longterm import strider
 from tests.pipeline.longterm.test_smplx_bodies import write_model
 
 SCAN_FROM_WORLD = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""PROX's scans have z up"""
+"""scans of PROX have z up"""
 
 
 def write_prox(folder, frames=80, takes=("Room_00001_01", "Room_00001_02")):
@@ -82,14 +82,14 @@ def test_prox_is_read_upright_with_hands_and_distances(tmp_path, model):
     assert float(above) == pytest.approx(0.3, abs=0.02)
 
 
-def test_without_distances_they_are_measured(tmp_path, model):
+def test_missing_distances_are_computed(tmp_path, model):
     folder = write_prox(tmp_path / "prox")
     (folder / "sdf" / "Room_sdf.npy").unlink()
     scene = sources.people(model, folder).train.scenes[0]
     assert scene.known is None and torch.isfinite(scene.distance.values).all()
 
 
-def test_a_gap_ends_a_stretch(tmp_path, model):
+def test_gap_ends_a_segment(tmp_path, model):
     folder = write_prox(tmp_path / "prox", frames=160, takes=("Room_00001_01",))
     for number in range(70, 90):
         (folder / prox.FITS / "Room_00001_01" / "results").joinpath(
@@ -116,7 +116,7 @@ class _Command:
     ],
     ids=["a command", "cut off", "another table", "no camera", "no scan", "no grid"],
 )
-def test_damage_is_told(tmp_path, model, harm):
+def test_damaged_files_are_refused(tmp_path, model, harm):
     folder = write_prox(tmp_path / "prox", takes=("Room_00001_01",))
     harm(folder, next((folder / prox.FITS).rglob("000.pkl")))
     with pytest.raises(InputError, match="LTM-005"):

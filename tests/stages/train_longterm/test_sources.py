@@ -28,6 +28,6 @@ def test_people_are_read(tmp_path):
     assert parted.train.body.shape.shape == (10,)
 
 
-def test_no_motion_of_people_is_told(tmp_path):
+def test_missing_people_are_refused(tmp_path):
     with pytest.raises(InputError, match="LTM-001"):
         sources.people(tmp_path / "model.npz", tmp_path)

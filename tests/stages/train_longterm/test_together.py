@@ -1,4 +1,4 @@
-"""Two processes that share each batch learn what one learns from the whole of it."""
+"""Two processes with half batches train like one with the full batch."""
 
 import sys
 from pathlib import Path
@@ -30,7 +30,7 @@ def weights(found: learning.TrainedLongTerm) -> torch.Tensor:
 
 
 def side(rank: int, port: str, folder: Path) -> learning.TrainedLongTerm:
-    """Do what one process of two does, and leave the weights in a file."""
+    """Run one of two processes and save its weights."""
     two_processes.join(rank, port)
     found = trained(16)
     torch.save(weights(found), folder / f"rank{rank}.pt")
@@ -40,20 +40,20 @@ def side(rank: int, port: str, folder: Path) -> learning.TrainedLongTerm:
 
 
 def alone(monkeypatch: pytest.MonkeyPatch) -> learning.TrainedLongTerm:
-    """Train in one process on both processes' halves of each batch."""
+    """Train in one process on the half batches of both."""
     monkeypatch.setattr(training, "fit", two_processes.fit_both(training.fit))
     return trained(8)
 
 
 @pytest.mark.slow
-def test_two_processes_learn_what_one_does_from_the_whole_batch(tmp_path, monkeypatch):
+def test_two_processes_agree_with_one_on_the_full_batch(tmp_path, monkeypatch):
     with two_processes.started(__name__, tmp_path, monkeypatch) as port:
         together = side(0, port, tmp_path)
     expected = alone(monkeypatch)
     for name in NETWORKS:
         losses = (found.records[name].total() for found in (together, expected))
         np.testing.assert_allclose(*losses, rtol=2e-5, err_msg=name)
-    off = (weights(together) - weights(expected)).abs()  # Adam makes much of gradients that are nearly 0
+    off = (weights(together) - weights(expected)).abs()  # Adam amplifies gradients that are nearly 0
     assert (off > 2e-5).float().mean() < 1e-2 and off.mean() < 1e-5
     assert torch.equal(weights(together), torch.load(tmp_path / "rank1.pt", weights_only=True))
 

@@ -39,7 +39,7 @@ def test_every_network_learns(learned):
         assert np.mean(total[-8:]) < 0.9 * np.mean(total[:4]), name
 
 
-def test_same_seed_same_weights_and_ablations_are_written(dataset, learned, tmp_path):
+def test_training_is_deterministic_and_ablations_are_written(dataset, learned, tmp_path):
     one = LongTermOptimizerConfig(steps=2, batch=4)
     settings = replace(SETTINGS, body=one, route=one, pose=one, ablations="all")
     first, second = (
@@ -73,7 +73,7 @@ def test_point_nets_start_from_given_weights(tmp_path):
         learning.initialized(lambda: learning.PoseNet(replace(SIZES, scene=8)), settings)
 
 
-def test_a_body_in_the_block_collides_and_one_in_the_air_has_no_contact(dataset, learned):
+def test_body_in_the_block_collides_and_body_in_the_air_has_no_contact(dataset, learned):
     model = learned.model
     distance = [dataset.scenes[0].distance]
     surface = learning.training.PosedSurface(
