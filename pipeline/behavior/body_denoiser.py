@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.fft import dct
 from torch import Tensor, nn
 
-from pipeline.behavior.denoisers import SequenceDenoiser
+from pipeline.behavior.denoisers import Conditions, Keep, SequenceDenoiser, Sequences, Steps
 from pipeline.behavior.diffusion import STANDARD, Schedule
 from pipeline.behavior.path_encoding import PATH_CHANNELS, expected_steps
 from pipeline.behavior.trajectories import RATE_HZ
@@ -24,7 +24,8 @@ HEADING_MEMORY_M = 0.1
 """distance over which the weight of earlier headings decays by a factor of e"""
 PATH_NOISE_M = 0.02
 """step per frame at which the direction of a path has weight one half; shorter steps are mostly noise"""
-
+Paths = Float[Tensor, "batch 3 frame"]
+"""Scaled positions in the ego frame"""
 MIN_DIRECTION = 0.01
 """length (metres, or of a unit vector) below which a vector has no direction"""
 
@@ -74,24 +75,20 @@ class GaussianPrior(nn.Module):
         self.weight[self.leading :] = weight
         self.std[self.leading :] = ((sequence - weight * start) @ self.cosines).square().mean(0).sqrt()
 
-    def project(
-        self, sequence: Float[Tensor, "batch channel frame"]
-    ) -> Float[Tensor, "batch component frame"]:
+    def project(self, sequence: Sequences) -> Float[Tensor, "batch component frame"]:
         """Return the components of sequences."""
         return self.basis.transpose(0, 1) @ sequence
 
-    def mean(self, posture: Float[Tensor, "batch channel frame"]) -> Float[Tensor, "batch channel frame"]:
+    def mean(self, posture: Sequences) -> Sequences:
         """Return the expected sequence given a posture."""
         return self.basis @ (self.weight * self.project(posture))
 
-    def coefficients(
-        self, residual: Float[Tensor, "batch channel frame"]
-    ) -> Float[Tensor, "batch component frequency"]:
+    def coefficients(self, residual: Sequences) -> Float[Tensor, "batch component frequency"]:
         """Return the coefficients of noisy sequences less their mean given the posture."""
         return self.project(residual) @ self.cosines
 
     def whitened(
-        self, coefficients: Float[Tensor, "batch component frequency"], t: Float[Tensor, "batch"]
+        self, coefficients: Float[Tensor, "batch component frequency"], t: Steps
     ) -> Float[Tensor, "batch corrected frame"]:
         """Return the leading components with unit variance at every step, frame and frequency."""
         leading = coefficients[:, : self.corrected] / self.noisy_std(t)[:, : self.corrected]
@@ -101,8 +98,8 @@ class GaussianPrior(nn.Module):
         self,
         coefficients: Float[Tensor, "batch component frequency"],
         velocity: Float[Tensor, "batch corrected frame"],
-        t: Float[Tensor, "batch"],
-    ) -> Float[Tensor, "batch channel frame"]:
+        t: Steps,
+    ) -> Sequences:
         """Return the noise in sequences: its best linear estimate, corrected by a predicted velocity in the
         units of `whitened`.
         """
@@ -154,14 +151,7 @@ class BodyDenoiser(nn.Module):
         self.register_buffer("sqrt_alpha_bar", sqrt_alpha_bar, persistent=False)
         self.register_buffer("causal_mask", torch.ones(frames, frames).tril(), persistent=False)
 
-    def forward(
-        self,
-        x: Float[Tensor, "batch channel frame"],
-        t: Float[Tensor, "batch"],
-        condition: Float[Tensor, "batch condition"],
-        control: Float[Tensor, "batch 3 frame"],
-        keep: Float[Tensor, "batch 1"],
-    ) -> Float[Tensor, "batch channel frame"]:
+    def forward(self, x: Sequences, t: Steps, condition: Conditions, control: Paths, keep: Keep) -> Sequences:
         posture, step, heading = self.posture(x, t, condition, control)
         expected = self.sqrt_alpha_bar[t.long()][:, None, None] * self.prior.mean(posture)
         coefficients = self.prior.coefficients(x - expected)
@@ -186,14 +176,8 @@ class BodyDenoiser(nn.Module):
         return torch.cat([velocity[:, : self.prior.leading], bones], dim=1)
 
     def posture(
-        self,
-        x: Float[Tensor, "batch channel frame"],
-        t: Float[Tensor, "batch"],
-        condition: Float[Tensor, "batch condition"],
-        control: Float[Tensor, "batch 3 frame"],
-    ) -> tuple[
-        Float[Tensor, "batch channel frame"], Float[Tensor, "batch 3 frame"], Float[Tensor, "batch 2 frame"]
-    ]:
+        self, x: Sequences, t: Steps, condition: Conditions, control: Paths
+    ) -> tuple[Sequences, Float[Tensor, "batch 3 frame"], Float[Tensor, "batch 2 frame"]]:
         """Return the current posture in every frame, rotated to the heading; displacements; headings."""
         posture = condition[:, -self.posture_channels :, None].expand(-1, -1, x.shape[-1])
         root = posture[:, :ROOT_CHANNELS] * self.root_std[:, None] + self.root_mean[:, None]
@@ -204,12 +188,7 @@ class BodyDenoiser(nn.Module):
         posture = nn.functional.pad(posture, (0, 0, x.shape[1] - self.posture_channels, 0))
         return posture, step, heading
 
-    def steps(
-        self,
-        x: Float[Tensor, "batch channel frame"],
-        t: Float[Tensor, "batch"],
-        control: Float[Tensor, "batch 3 frame"],
-    ) -> Float[Tensor, "batch 3 frame"]:
+    def steps(self, x: Sequences, t: Steps, control: Paths) -> Float[Tensor, "batch 3 frame"]:
         """Return the displacement per frame, metres; the first frame repeats the second."""
         del x, t
         place = control * self.path_std
@@ -254,12 +233,7 @@ class OneStageDenoiser(BodyDenoiser):
         super().__init__(unet, prior, posture_channels, frames, schedule, rate_hz)
         self.register_buffer("velocity_std", torch.ones(PATH_CHANNELS))
 
-    def steps(
-        self,
-        x: Float[Tensor, "batch channel frame"],
-        t: Float[Tensor, "batch"],
-        control: Float[Tensor, "batch 3 frame"],
-    ) -> Float[Tensor, "batch 3 frame"]:
+    def steps(self, x: Sequences, t: Steps, control: Paths) -> Float[Tensor, "batch 3 frame"]:
         """Return the expected displacement per frame given the noisy path, metres."""
         del control
         strides = (self.sqrt_alpha_bar[t.long()][:, None, None] * x[:, :PATH_CHANNELS]).transpose(-1, -2)

@@ -16,6 +16,16 @@ from torch import Tensor, nn
 from pipeline.behavior.diffusion import STANDARD, Schedule
 
 TIME_CHANNELS, EMBEDDING = 64, 128
+Sequences = Float[Tensor, "batch channel frame"]
+"""Scaled channels over frames"""
+Steps = Float[Tensor, "batch"]
+"""Steps of the diffusion schedule"""
+Conditions = Float[Tensor, "batch condition"]
+"""Perception codes, and what else a level reads"""
+Controls = Float[Tensor, "batch control"] | Float[Tensor, "batch control frame"]
+"""The level above: a scaled goal, or a scaled path"""
+Keep = Float[Tensor, "batch 1"]
+"""1, or 0 to drop the control"""
 
 
 def time_embedding(t: Float[Tensor, "batch"]) -> Float[Tensor, "batch 64"]:
@@ -38,7 +48,7 @@ class NoiseFromVelocity(nn.Module):
         self.register_buffer("alpha", alpha_bar.sqrt(), persistent=False)
 
     def forward(
-        self, x: Float[Tensor, "batch ..."], velocity: Float[Tensor, "*stack"], t: Float[Tensor, "batch"]
+        self, x: Float[Tensor, "batch ..."], velocity: Float[Tensor, "*stack"], t: Steps
     ) -> Float[Tensor, "*stack"]:
         step, shape = t.long(), (-1, *[1] * (x.ndim - 1))
         return self.sigma[step].reshape(shape) * x + self.alpha[step].reshape(shape) * velocity
@@ -61,9 +71,7 @@ class Embedding(nn.Module):
         )
         self.read = read
 
-    def forward(
-        self, t: Float[Tensor, "batch"], code: Float[Tensor, "batch code"]
-    ) -> Float[Tensor, "batch 128"]:
+    def forward(self, t: Steps, code: Float[Tensor, "batch code"]) -> Float[Tensor, "batch 128"]:
         return nn.functional.silu(self.time(time_embedding(t)) + self.read(code))
 
 
@@ -82,7 +90,7 @@ class TemporalBlock(nn.Module):
         self.shortcut = nn.Conv1d(inner, outer, 1) if inner != outer else nn.Identity()
 
     def forward(
-        self, h: Float[Tensor, "batch channel frame"], embedding: Float[Tensor, "batch e"]
+        self, h: Sequences, embedding: Float[Tensor, "batch e"]
     ) -> Float[Tensor, "batch outer frame"]:
         return self.second(self.first(h) + self.embedding(embedding)[..., None]) + self.shortcut(h)
 
@@ -104,7 +112,7 @@ class UNet1d(nn.Module):
 
     def forward(
         self,
-        h: Float[Tensor, "batch channel frame"],
+        h: Sequences,
         embedding: Float[Tensor, "batch e"],
         added: list[Float[Tensor, "batch _ _"]] | None = None,
     ) -> list[Float[Tensor, "batch _ _"]]:
@@ -137,22 +145,12 @@ class SequenceDenoiser(nn.Module):
         self.noise = NoiseFromVelocity(schedule)
 
     def forward(
-        self,
-        x: Float[Tensor, "batch channel frame"],
-        t: Float[Tensor, "batch"],
-        condition: Float[Tensor, "batch condition"],
-        control: Float[Tensor, "batch control"] | Float[Tensor, "batch control frame"],
-        keep: Float[Tensor, "batch 1"],
-    ) -> Float[Tensor, "batch channel frame"]:
+        self, x: Sequences, t: Steps, condition: Conditions, control: Controls, keep: Keep
+    ) -> Sequences:
         return self.noise(x, self.velocity(x, t, condition, control, keep), t)
 
     def velocity(
-        self,
-        x: Float[Tensor, "batch channel frame"],
-        t: Float[Tensor, "batch"],
-        condition: Float[Tensor, "batch condition"],
-        control: Float[Tensor, "batch control"] | Float[Tensor, "batch control frame"],
-        keep: Float[Tensor, "batch 1"],
+        self, x: Sequences, t: Steps, condition: Conditions, control: Controls, keep: Keep
     ) -> Float[Tensor, "batch output frame"]:
         """Return the velocity (v-prediction) in x, then further outputs, if there are any; ``keep`` 0 drops
         the control.
@@ -185,12 +183,7 @@ class ControlUNet(SequenceDenoiser):
             nn.init.zeros_(parameter)
 
     def velocity(
-        self,
-        x: Float[Tensor, "batch channel frame"],
-        t: Float[Tensor, "batch"],
-        condition: Float[Tensor, "batch condition"],
-        control: Float[Tensor, "batch control"] | Float[Tensor, "batch control frame"],
-        keep: Float[Tensor, "batch 1"],
+        self, x: Sequences, t: Steps, condition: Conditions, control: Controls, keep: Keep
     ) -> Float[Tensor, "batch output frame"]:
         embedding = self.embedding(t, condition)
         control = control if control.ndim == 3 else control[..., None].expand(-1, -1, x.shape[-1])
@@ -198,12 +191,7 @@ class ControlUNet(SequenceDenoiser):
         added = [inject(h) * keep[..., None] for inject, h in zip(self.inject, side, strict=True)]
         return self.out(self.main(self.unet_input(x, t, condition), embedding, added)[-1])
 
-    def unet_input(
-        self,
-        x: Float[Tensor, "batch channel frame"],
-        t: Float[Tensor, "batch"],
-        condition: Float[Tensor, "batch condition"],
-    ) -> Float[Tensor, "batch channel frame"]:
+    def unet_input(self, x: Sequences, t: Steps, condition: Conditions) -> Sequences:
         """Return the input of the main branch: the noisy sequence."""
         del t, condition
         return x
@@ -229,12 +217,7 @@ class UncontrolledUNet(SequenceDenoiser):
         self.out = nn.Conv1d(widths[0], outputs or channels, 1)
 
     def velocity(
-        self,
-        x: Float[Tensor, "batch channel frame"],
-        t: Float[Tensor, "batch"],
-        condition: Float[Tensor, "batch condition"],
-        control: Float[Tensor, "batch control"] | Float[Tensor, "batch control frame"],
-        keep: Float[Tensor, "batch 1"],
+        self, x: Sequences, t: Steps, condition: Conditions, control: Controls, keep: Keep
     ) -> Float[Tensor, "batch output frame"]:
         del control, keep
         return self.out(self.main(x, self.embedding(t, condition))[-1])
@@ -261,12 +244,7 @@ class ConcatenationUNet(UncontrolledUNet):
         self.condition = condition
 
     def velocity(
-        self,
-        x: Float[Tensor, "batch channel frame"],
-        t: Float[Tensor, "batch"],
-        condition: Float[Tensor, "batch condition"],
-        control: Float[Tensor, "batch control"] | Float[Tensor, "batch control frame"],
-        keep: Float[Tensor, "batch 1"],
+        self, x: Sequences, t: Steps, condition: Conditions, control: Controls, keep: Keep
     ) -> Float[Tensor, "batch output frame"]:
         code = torch.cat([condition[:, -self.condition :], control.flatten(1) * keep, keep], dim=-1)
         return super().velocity(x, t, code, control, keep)

@@ -238,9 +238,9 @@ def _rules(plan: Plan, all_jobs: list[Job], after: Mapping[str, Sequence[str]]) 
 def _start_order(plan: Plan, all_jobs: Sequence[Job]) -> list[Job]:
     """Return the jobs in the order in which Make starts those that are ready.
 
-    Make goes through its targets, waits for a free core at the first one that is ready, and starts over only at
-    the end. What the templates are made from precedes the sessions, which wait for them. Flow of sessions comes
-    after masks, as whose dependency Make starts it. Long recordings precede short ones; of the built-in
+    Make goes through its targets, waits for a free core at the first one that is ready, and starts over only
+    at the end. What the templates are made from precedes the sessions, which wait for them. Flow of sessions
+    comes after masks, as whose dependency Make starts it. Long recordings precede short ones; of the built-in
     sessions, which have no files yet, the test session is the longest.
     """
     place = {node.artifact: i for i, node in enumerate(dag.FLOW)}
@@ -257,7 +257,7 @@ def _start_order(plan: Plan, all_jobs: Sequence[Job]) -> list[Job]:
             phase = {"masks": 3, "flow": 4}[job.artifact] if job.video in sessions else 1
         elif place[job.artifact] >= place["video_poses"]:
             phase = 5
-        return phase, place[job.artifact], -sizes.get(job.video, 0), job.video not in tests
+        return phase, place[job.artifact], -sizes.get(job.video or "", 0), job.video not in tests
 
     return sorted(all_jobs, key=key)
 

@@ -478,7 +478,9 @@ def test_make_starts_what_templates_need_first_and_long_recordings_before_short_
     listed = re.search(r"^toy: (.*)$", rules, re.MULTILINE)[1].replace("/.ok", "").split()
     order = [path.removeprefix("build/toy/") for path in listed]
     sessions = ["v003", "v004", "v002"]  # ids follow the names; b, c, a by size
-    assert [name for name in order if name.startswith("video_poses/")] == [f"video_poses/{v}" for v in sessions]
+    assert [name for name in order if name.startswith("video_poses/")] == [
+        f"video_poses/{v}" for v in sessions
+    ]
     place = {name: i for i, name in enumerate(order)}
     assert place["flow/v001"] < place["feature_basis"] < place["scene_localizer"] < place["masks/v003"]
     assert place["masks/v002"] < place["flow/v003"]
