@@ -49,6 +49,8 @@ def estimate(
     choice = movers.track(missing, time_s, animal)
     chosen = [group[index] if index >= 0 else None for group, index in zip(missing, choice, strict=True)]
     self_moving = movers.self_moving(chosen, time_s, animal)
-    missed_m2 = [each.area_m2 if each and own else 0 for each, own in zip(chosen, self_moving, strict=True)]
-    union = np.array(union_m2) + missed_m2
+    false_negative_m2 = [
+        each.area_m2 if each and own else 0 for each, own in zip(chosen, self_moving, strict=True)
+    ]
+    union = np.array(union_m2) + false_negative_m2
     return np.where(union < movers.MIN_AREA_M2, np.nan, np.array(intersection_m2) / np.maximum(union, 1e-9))

@@ -470,11 +470,11 @@ def test_session_without_depth_is_read_with_estimated_depth(small_checkout):
     assert {"frames/v000", "estimated_frames/v001", "estimated_frames/v002"} <= read["reconstruction"]
 
 
-def test_make_starts_what_templates_need_first_and_long_recordings_before_short_ones(house):
+def test_make_starts_what_templates_need_first_and_long_recordings_before_short_ones(small_checkout):
     for name, size in {"walkthrough": 1, "turnaround": 1, "a": 10, "b": 30, "c": 20}.items():
-        house.write(f"captures/toy/{name}.r3d", "x" * size)
-    assert house.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
-    rules = (house.folder / "build/toy/plan/rules.mk").read_text()
+        small_checkout.write(f"captures/toy/{name}.r3d", "x" * size)
+    assert small_checkout.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
+    rules = (small_checkout.folder / "build/toy/plan/rules.mk").read_text()
     listed = re.search(r"^toy: (.*)$", rules, re.MULTILINE)[1].replace("/.ok", "").split()
     order = [path.removeprefix("build/toy/") for path in listed]
     sessions = ["v003", "v004", "v002"]  # ids follow the names; b, c, a by size
