@@ -273,6 +273,8 @@ def _adjoint(a_from_b):
 
 def _solve(normal, gradient, free):
     index = np.flatnonzero(np.repeat(free, 6))
+    if not len(index):
+        return np.zeros((len(free), 6))
     part = sparse.csc_array(normal)[index][:, index]
     damping = DAMPING * (part.diagonal() + part.diagonal().mean()) + np.finfo(float).tiny
     step = np.zeros(len(gradient))

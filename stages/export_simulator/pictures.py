@@ -67,13 +67,10 @@ def _splatted(
 ) -> Float[np.ndarray, "height width"]:
     """Splat the values of visible points into the picture, keeping the maximum per pixel."""
     pixel, depth = cameras.project(rigid.apply(rigid.inverse(world_from_camera), points), intrinsics)
-    column, row = pixel.astype(int).T
-    height, width = behind.shape
-    inside = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    column, row, depth, values = column[inside], row[inside], depth[inside], values[inside]
-    open_to_view = depth < behind[row, column] + _CELL_M
+    visible = depth < cameras.sample_nearest(behind, pixel) + _CELL_M
+    visible &= cameras.in_picture(pixel, depth, behind.shape)
     image = np.zeros(behind.shape)
-    np.maximum.at(image, (row[open_to_view], column[open_to_view]), values[open_to_view])
+    np.maximum.at(image, cameras.pixel_index(pixel[visible]), values[visible])
     return maximum_filter(image, 2 * radius_px - 1)
 
 
