@@ -198,8 +198,9 @@ class MapAttention(nn.Module):
         content = query[..., :MAP_KEY_CHANNELS] * MAP_KEY_CHANNELS**-0.5
         query = torch.cat([content, position], dim=-1)
         query = query.reshape(len(query), -1, draws * self.HEADS, query.shape[-1])
-        keys = torch.cat([key.transpose(-1, -2), cells.expand(*key.shape[:2], -1, -1)], dim=-1)
-        values = torch.cat([value.transpose(-1, -2), scaled.expand(*key.shape[:2], -1, -1)], dim=-1)
+        key, value = key.transpose(-1, -2), value.transpose(-1, -2)
+        zero = 0 * key[..., :1]  # broadcasts; exported to ONNX, `expand` keeps the example's batch
+        keys, values = torch.cat([key, cells + zero], dim=-1), torch.cat([value, scaled + zero], dim=-1)
         width = values.shape[-1]  # fused attention wants values as wide as keys
         values = nn.functional.pad(values, (0, keys.shape[-1] - width))
         read = nn.functional.scaled_dot_product_attention(query, keys, values, scale=1.0)[..., :width]
