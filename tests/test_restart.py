@@ -1,4 +1,7 @@
-"""Kill the toy build twenty times while stages write, without ground truth on disk; the artifacts are byte-identical."""
+"""Kill the toy build twenty times while stages write, without ground truth on disk; the artifacts are byte-identical.
+
+Artifacts that are never killed are copied from the toy.
+"""
 
 import contextlib
 import os
@@ -34,7 +37,7 @@ LIMIT_S = 3600
 
 @pytest.fixture(scope="module")
 def copy(toy, tmp_path_factory) -> Path:
-    """A working copy with the recordings of the toy, without ground truth."""
+    """A working copy with the toy's recordings, without ground truth, and its artifacts that are not rebuilt."""
     folder = tmp_path_factory.mktemp("restart")
     for name in ("pipeline", "stages", "agents", "envs"):
         shutil.copytree(
@@ -44,6 +47,8 @@ def copy(toy, tmp_path_factory) -> Path:
     (folder / ".venv").symlink_to(ROOT / ".venv")
     shutil.copytree(toy / "synthetic_capture", folder / "build/toy/synthetic_capture")
     shutil.rmtree(folder / "build/toy/synthetic_capture/truth")
+    for name in set(BUILT) - {"synthetic_capture", *KILLS, *FROM_TRUTH}:
+        shutil.copytree(toy / name, folder / "build/toy" / name)
     return folder
 
 

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from pipeline.data.clips import Clip, Masks
 from pipeline.data.motion import MotionTable, gaps_s
 from pipeline.fields.fields import ArticulatedBody, Field, FieldShape
 from pipeline.fields.fused_depth import FusedGeometry
@@ -26,7 +27,7 @@ from stages.reconstruct.problem import (
     frame_table,
     prior_precision,
 )
-from stages.reconstruct.rays import RaySource, RayStore, Views, join
+from stages.reconstruct.rays import RayStore, Views, join
 
 MIN_CONFIDENCE = 0.1
 """frames whose camera is less certain give no rays"""
@@ -77,8 +78,10 @@ class RegisteredVideo:
     has_scene: bool
     """False for the turnaround: its world is the agent"""
     store: RayStore
-    source: RaySource | None = None
+    clip: Clip | None = None
     """its frames; None if only the rays are needed"""
+    masks: Masks | None = None
+    """its masks; None if there is no agent"""
     agent_confidence: Float[np.ndarray, "frame"] | None = None
     """probability that the agent's root is correct, 0..1; None: certain"""
 

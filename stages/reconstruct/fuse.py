@@ -66,8 +66,8 @@ def _fused(volume: Volume, video: RegisteredVideo) -> Volume:
 
 def _integrate(volume: Volume, video: RegisteredVideo, frame: int) -> None:
     """Integrate the depth of one frame, without the agent."""
-    assert video.source is not None, f"{video.id} was read without its pictures"
-    clip, masks = video.source.clip, video.source.masks
+    clip, masks = video.clip, video.masks
+    assert clip is not None, f"{video.id} was read without its pictures"
     depth = trusted_depth(clip, frame)[0]
     if masks is not None:
         mask = masks[frame]

@@ -50,7 +50,7 @@ class _Reader:
         nowhere, certain = np.full_like(cameras, np.nan), np.ones(len(cameras))
         return RegisteredVideo(
             id, table.timestamp_s, cameras, nowhere, certain, np.zeros(len(cameras), bool),
-            camera_free=False, has_scene=True, store=self._rays(id, source), source=source,
+            camera_free=False, has_scene=True, store=self._rays(id, source), clip=source.clip,
         )  # fmt: skip
 
     def turnaround(self, id: str) -> RegisteredVideo:
@@ -72,7 +72,8 @@ class _Reader:
         return RegisteredVideo(
             id, table.timestamp_s, table.world_from_camera, table.world_from_agent,
             table.confidence, table.agent_visible, camera_free=True, has_scene=True,
-            store=self._rays(id, source), source=source, agent_confidence=table.agent_confidence,
+            store=self._rays(id, source), clip=source.clip, masks=source.masks,
+            agent_confidence=table.agent_confidence,
         )  # fmt: skip
 
     def _source(self, id: str, has_scene: bool = True, masked: bool = True) -> RaySource:
