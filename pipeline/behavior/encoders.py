@@ -18,6 +18,8 @@ APPROACH_SCALE = 1.5
 """scale of approach speeds (at most 2 m/s), which gives them the range of the encoded distance, +-3"""
 HEADS = 4
 """attention heads, each for its part of the code"""
+ATTENDED_CHANNELS = 3
+"""presence of the others that a head attends to, 0..1, and their mean horizontal position times presence"""
 MIN_WEIGHT = 1e-6
 """attention weight of others beyond the radius, so that weights can be normalised when nobody is near"""
 
@@ -60,15 +62,17 @@ class SetEncoder(nn.Module):
         kind: Float[Tensor, "batch other 1"],
         inside: Float[Tensor, "batch other 1"],
         keep: Float[Tensor, "batch"],
-    ) -> Float[Tensor, "batch code"]:
-        """Encode features that are zero where ``inside`` is 0; a set of one is not pooled."""
+    ) -> tuple[Float[Tensor, "batch code"], Float[Tensor, "batch other head"]]:
+        """Encode features that are zero where ``inside`` is 0, and return the attention; a set of one is not
+        pooled.
+        """
         present = keep[:, None, None]
         hidden = self.layers[0](features * present) + kind * inside * present * self.animal
         codes = self.layers[1:](hidden)
         if codes.shape[1] == 1:
-            return codes[:, 0]
+            return codes[:, 0], torch.ones_like(inside).expand(-1, -1, HEADS)
         weight = (codes @ self.attention.transpose(-1, -2) + (inside + MIN_WEIGHT).log()).softmax(1)
-        return (codes.unflatten(-1, (HEADS, -1)) * weight[..., None]).sum(1).flatten(1)
+        return (codes.unflatten(-1, (HEADS, -1)) * weight[..., None]).sum(1).flatten(1), weight
 
 
 class OthersEncoder(SetEncoder):
@@ -79,13 +83,16 @@ class OthersEncoder(SetEncoder):
     Beyond the radius all features are zero, so that far others and none at all have the same code.
     """
 
-    def __init__(self, frames: int, hidden: int, code: int, radius_m: float, rate_hz: float):
+    def __init__(
+        self, frames: int, hidden: int, code: int, radius_m: float, rate_hz: float, *, positions: bool = False
+    ):
         super().__init__(frames * 5 + 2, hidden, code)
-        self.frames, self.radius_m, self.rate_hz = frames, radius_m, rate_hz
+        self.frames, self.radius_m, self.rate_hz, self.positions = frames, radius_m, rate_hz, positions
 
     def forward(
         self, others: Float[Tensor, "batch other past_frame 10"], keep: Float[Tensor, "batch"]
-    ) -> Float[Tensor, "batch code"]:
+    ) -> Float[Tensor, "batch number"]:
+        """Return the code, then with ``positions`` `ATTENDED_CHANNELS` per head."""
         position = others[..., :3:2]
         distance = (position.square().sum(-1) + 1e-6).sqrt()
         nearness = (1 - distance / self.radius_m).clamp_min(0)
@@ -99,7 +106,13 @@ class OthersEncoder(SetEncoder):
         step = (position[..., 1:, :] - position[..., :-1, :]) * self.rate_hz
         coming = -(step * direction[..., 1:, :]).sum(-1).clamp(-2, 2) * (APPROACH_SCALE * inside[..., 1:])
         features = torch.cat([seen, moving.clamp(-2, 2), close, coming], dim=-1)
-        return self.code_of_set(features, others[..., -1, -1:], inside[..., -1:], keep)
+        inside = inside[..., -1:]
+        code, weight = self.code_of_set(features, others[..., -1, -1:], inside, keep)
+        if not self.positions:
+            return code
+        here = torch.cat([inside, inside * position[..., -1, :]], dim=-1)
+        attended = (weight[..., None] * here[:, :, None]).sum(1).flatten(1)
+        return torch.cat([code, attended * keep[:, None]], dim=-1)
 
 
 class OtherPosesEncoder(SetEncoder):
@@ -113,7 +126,7 @@ class OtherPosesEncoder(SetEncoder):
     ) -> Float[Tensor, "batch code"]:
         near = (others[..., :3].square().sum(-1) < MAX_PRESENT_M**2).all(-1, keepdim=True)
         features = torch.where(near, others[..., :POSE_CHANNELS].flatten(-2), 0)
-        return self.code_of_set(features, others[..., -1, -1:], near.to(features), keep)
+        return self.code_of_set(features, others[..., -1, -1:], near.to(features), keep)[0]
 
 
 class PastEncoder(nn.Module):

@@ -2,8 +2,8 @@
 
 A global scene code hardly retains where things are. `MapAttention` has heads that attend around the noisy
 goal, as far as its noise level allows, and heads that attend where the perception code directs them;
-`RestLikelihood` is the likelihood of the noisy goal if the animal rests, as it mostly does. Both were
-evaluated on two held-out homes of the behaviour benchmark, see `docs/behavior.md`.
+`GoalLikelihood` is the likelihood of the noisy goal if the animal rests, as it mostly does, or joins another.
+They were evaluated on held-out homes, see `docs/behavior.md`.
 """
 
 from itertools import pairwise
@@ -15,11 +15,14 @@ from torch import Tensor, nn
 from pipeline.behavior.config import MapLookup
 from pipeline.behavior.denoisers import TIME_CHANNELS, NoiseFromVelocity, time_embedding
 from pipeline.behavior.diffusion import STANDARD, Schedule
+from pipeline.behavior.encoders import ATTENDED_CHANNELS, MIN_WEIGHT
 from pipeline.behavior.path_encoding import GOAL_LENGTH_POWER, with_powered_length
 from pipeline.behavior.perception import GRID_CELL_M, GRID_SHAPE, MAP_KEY_CHANNELS
 from pipeline.behavior.pointwise import MapAtGoal
 
 HORIZON_CHANNELS = 8
+REST_STDS, BESIDE_STDS = (0.0, 0.05, 0.2, 0.6), (0.2, 0.5, 1.0)
+"""standard deviations of the goals of resting animals and of those beside others, in scaled units"""
 
 
 class GoalMLP(nn.Module):
@@ -33,19 +36,22 @@ class GoalMLP(nn.Module):
     def __init__(
         self, code: int, hidden: int = 128, layers: int = 6, schedule: Schedule = STANDARD, *,
         ensemble_size: int = 1,
-        map_cells: int = 0, map_lookup: MapLookup = "attention",
+        map_cells: int = 0, map_lookup: MapLookup = "attention", attended_channels: int = 0,
     ):  # fmt: skip
         super().__init__()
+        code += attended_channels
         self.noise, self.code, self.ensemble_size = NoiseFromVelocity(schedule), code, ensemble_size
+        self.others = OthersLikelihood(attended_channels) if attended_channels else None
         self.map_numbers = 2 * MAP_KEY_CHANNELS * map_cells**2
         code_channels = TIME_CHANNELS + HORIZON_CHANNELS + code
-        self.clean, self.staying = CleanGoalEstimate(schedule), RestLikelihood()
+        self.clean, self.staying = CleanGoalEstimate(schedule), GoalLikelihood(REST_STDS)
         self.map: MapAtGoal | MapAttention | None = None
         if map_cells and map_lookup == "pointwise":
             self.map = MapAtGoal()
         elif map_cells:
             self.map = MapAttention(map_cells, code_channels, ensemble_size)
-        inputs = 3 + code_channels + RestLikelihood.NUMBERS + (self.map.NUMBERS if self.map else 0)
+        inputs = 3 + code_channels + self.staying.numbers + (self.map.NUMBERS if self.map else 0)
+        inputs += self.others.numbers if self.others else 0
         sizes, inner = [inputs] + [hidden] * (layers - 1), []
         for narrow, wide in pairwise(sizes):
             inner += [EnsembleLinear(ensemble_size, narrow, wide), nn.SiLU()]
@@ -79,6 +85,8 @@ class GoalMLP(nn.Module):
         clean = self.clean(x, t)
         point = torch.cat([x, self.staying(*clean)], dim=-1)
         inputs = [point.expand(self.ensemble_size, -1, -1), code_channels]
+        if self.others is not None:
+            inputs.append(self.others(*clean, code[..., -self.others.channels :]))
         if self.map is not None:
             inputs.append(self.map(*clean, code_channels, maps, draws))
         return self.noise(x, self.layers(torch.cat(inputs, dim=-1)), t)
@@ -116,30 +124,59 @@ class CleanGoalEstimate(nn.Module):
         return x / self.sqrt_alpha_bar[step], self.variance[step]
 
 
-class RestLikelihood(nn.Module):
-    """Likelihood of a noisy goal under Gaussian priors of several deviations about the current position."""
+class GoalLikelihood(nn.Module):
+    """Likelihood of a noisy goal under Gaussian priors of several deviations about a position."""
 
-    REST_STDS = (0.0, 0.05, 0.2, 0.6)
-    """standard deviations of the goals of resting animals, in scaled units"""
-    NUMBERS = 5 * len(REST_STDS)
     MIN, MAX = -4.0, 5.0
     """bounds of its outputs"""
-    rest_variance: Tensor
+    prior_variance: Tensor
 
-    def __init__(self):
+    def __init__(self, stds: tuple[float, ...]):
         super().__init__()
-        self.register_buffer("rest_variance", torch.tensor(self.REST_STDS).square(), persistent=False)
+        self.numbers = 5 * len(stds)
+        self.register_buffer("prior_variance", torch.tensor(stds).square(), persistent=False)
 
     def forward(
-        self, mean: Float[Tensor, "batch 3"], variance: Float[Tensor, "batch 1"]
-    ) -> Float[Tensor, "batch 20"]:
-        """Return unnormalised likelihoods, their logarithms, and likelihood-weighted posterior means."""
-        total = variance + self.rest_variance
-        log_likelihood = -mean.square().sum(-1, keepdim=True) / (2 * total)
+        self, offset: Float[Tensor, "*batch 3"], variance: Float[Tensor, "*#batch 1"]
+    ) -> Float[Tensor, "*batch number"]:
+        """Return unnormalised likelihoods, their logarithms, and likelihood-weighted posterior means.
+
+        ``offset`` and ``variance`` are those of the clean goal given the noisy one, from the position.
+        """
+        total = variance + self.prior_variance
+        log_likelihood = -offset.square().sum(-1, keepdim=True) / (2 * total)
         likelihood = log_likelihood.exp()
-        shrunk = mean[:, None] * (likelihood * self.rest_variance / total)[..., None]
+        shrunk = offset[..., None, :] * (likelihood * self.prior_variance / total)[..., None]
         logarithm = (log_likelihood / 5).clamp_min(self.MIN)
-        return torch.cat([likelihood, logarithm, shrunk.flatten(1).clamp(-self.MAX, self.MAX)], dim=-1)
+        return torch.cat([likelihood, logarithm, shrunk.flatten(-2).clamp(-self.MAX, self.MAX)], dim=-1)
+
+
+class OthersLikelihood(nn.Module):
+    """Positions of the others that each head attends to, and `GoalLikelihood` about them.
+
+    A code hardly retains positions: without these, four times more steps bring goals no nearer to others.
+    """
+
+    goal_std: Tensor
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.channels, self.likelihood = channels, GoalLikelihood(BESIDE_STDS)
+        self.numbers = channels // ATTENDED_CHANNELS * (ATTENDED_CHANNELS + self.likelihood.numbers)
+        self.register_buffer("goal_std", torch.ones(3))
+
+    def forward(
+        self,
+        mean: Float[Tensor, "draw 3"],
+        variance: Float[Tensor, "draw 1"],
+        attended: Float[Tensor, "member draw attended"],
+    ) -> Float[Tensor, "member draw number"]:
+        """Return presence, and weighted by it the scaled position and the likelihoods, of each head."""
+        presence, x, z = attended.unflatten(-1, (-1, ATTENDED_CHANNELS)).split(1, dim=-1)
+        position = torch.cat([x, 0 * x, z], dim=-1) / (presence + MIN_WEIGHT)
+        position = with_powered_length(position, GOAL_LENGTH_POWER) / self.goal_std
+        read = [position[..., ::2], self.likelihood(mean[:, None] - position, variance[:, None])]
+        return torch.cat([presence, *(presence * each for each in read)], dim=-1).flatten(-2)
 
 
 class MapAttention(nn.Module):

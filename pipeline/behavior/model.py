@@ -40,6 +40,7 @@ from pipeline.behavior.denoisers import (
     UncontrolledUNet,
 )
 from pipeline.behavior.diffusion import SOLVER_STEPS, STANDARD, Schedule
+from pipeline.behavior.encoders import ATTENDED_CHANNELS, HEADS
 from pipeline.behavior.goal_denoiser import GoalMLP
 from pipeline.behavior.path_encoding import (
     GOAL_LENGTH_POWER,
@@ -82,6 +83,8 @@ class Architecture:
     hidden: int = 128
     code: int = 64
     observer_radius_m: float = 4.0
+    companions: bool = False
+    """whether it was recorded with companions; then goals read the positions of others"""
     ablated_input: AblatedInput = "nothing"
     body_components: int = 0
     """principal components of bones that the UNet of bodies corrects (`GaussianPrior`); 0: it
@@ -124,9 +127,18 @@ class Architecture:
         return GRID_SHAPE[0] // self.scene_block if self.scene == "pillars" else 0
 
     @property
+    def attended_channels(self) -> int:
+        """Channels of attended positions of others, per member."""
+        return ATTENDED_CHANNELS * HEADS if self.companions and self.observed_past == "positions" else 0
+
+    @property
     def code_length(self) -> int:
         """Length of the perception codes of all members, velocity and posture together."""
-        return 3 * self.code * self.ensemble_size + VELOCITY_CHANNELS + self.body_channels
+        return (
+            (3 * self.code + self.attended_channels) * self.ensemble_size
+            + VELOCITY_CHANNELS
+            + self.body_channels
+        )
 
     @property
     def condition_length(self) -> int:
@@ -203,6 +215,7 @@ class BehaviorNets(nn.Module):
             ensemble_size=a.ensemble_size,
             map_cells=a.map_cells,
             map_lookup=a.map_lookup,
+            attended_channels=a.attended_channels,
         )
         bones = 6 * a.bones
         gates = min(a.body_components, bones)

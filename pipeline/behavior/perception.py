@@ -104,8 +104,10 @@ def grid_points_ego(stride: int = 1) -> Float[np.ndarray, "width height length 3
 
 SceneEncoding = tuple[Float[Tensor, "batch map"], Float[Tensor, "batch code"]]
 """Flattened map channels over cells (z, then x; empty without a map), and a code"""
-PerceptionCode = tuple[Float[Tensor, "batch map"], Float[Tensor, "batch code_of_all"]]
-"""Flattened map, and the codes of scene, others and past concatenated"""
+PerceptionCode = tuple[
+    Float[Tensor, "batch map"], Float[Tensor, "batch code_of_all"], Float[Tensor, "batch attended"]
+]
+"""Flattened map, the codes of scene, others and past concatenated, and attended positions of others"""
 
 
 class PillarScene(nn.Module):
@@ -187,6 +189,7 @@ class PerceptionConfig:
     past_frames: int
     past_channels: int
     observer_radius_m: float
+    companions: bool
     rate_hz: float
     ablated_input: AblatedInput
 
@@ -210,12 +213,14 @@ class Perception(nn.Module):
         sizes = size.past_frames, size.hidden, size.code
         match size.observed_past:
             case "positions":
-                self.others = OthersEncoder(*sizes, size.observer_radius_m, size.rate_hz)
+                self.others = OthersEncoder(
+                    *sizes, size.observer_radius_m, size.rate_hz, positions=size.companions
+                )
             case "poses":
                 self.others = OtherPosesEncoder(*sizes)
             case _:
                 assert_never(size.observed_past)
-        self.rate_hz = size.rate_hz
+        self.rate_hz, self.code = size.rate_hz, size.code
         self.past = PastEncoder(size.past_frames, size.past_channels, size.hidden, size.code)
         condition_mask = torch.tensor([float(condition != size.ablated_input) for condition in CONDITIONS])
         self.register_buffer("condition_mask", condition_mask, persistent=False)
@@ -254,9 +259,10 @@ class Perception(nn.Module):
         scene_map, scene = scene_encoding
         keep = keep * self.condition_mask
         set_code = self.others(others, keep[:, 1])
+        set_code, attended = set_code[:, : self.code], set_code[:, self.code :]
         scene = torch.where(keep[:, :1] > 0.5, scene, self.scene_null)
         past = torch.where(keep[:, 2:] > 0.5, past, self.past_null)
-        return scene_map * keep[:, :1], torch.cat([scene, set_code, past], dim=-1)
+        return scene_map * keep[:, :1], torch.cat([scene, set_code, past], dim=-1), attended
 
 
 class PerceptionEnsemble(nn.Module):
@@ -293,7 +299,8 @@ class PerceptionEnsemble(nn.Module):
         self, encodings: list[PerceptionCode], now: Float[Tensor, "batch state"]
     ) -> Float[Tensor, "batch condition"]:
         """Concatenate the encodings of all members and the current state (omega, Eq. 11-13)."""
-        maps, codes = zip(*encodings, strict=True)
+        maps = [scene_map for scene_map, _, _ in encodings]
+        codes = [part for _, *parts in encodings for part in parts]
         return torch.cat([*maps, *codes, now], dim=-1)
 
     def now(

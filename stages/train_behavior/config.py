@@ -121,7 +121,7 @@ class Config:
     ablated_input: AblatedInput = "nothing"
     """Ablation: an input that the model never perceives."""
     observer_radius_m: float = 4.0
-    """Horizontal distance in metres beyond which an observer is not perceived."""
+    """Horizontal distance in metres beyond which others are not perceived; at least 8 with companions."""
     unet_width: int = 16
     """Channels of the UNets' finest level; the next two have 2 and 4 times as many."""
     map_lookup: MapLookup = "attention"

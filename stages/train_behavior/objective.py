@@ -125,7 +125,9 @@ def perceive(
         for member in nets.perception
     ]
     dropout = objective.code_dropout
-    encodings = [(scene_map, nn.functional.dropout(code, dropout)) for scene_map, code in encodings]
+    encodings = [
+        (scene_map, nn.functional.dropout(code, dropout), attended) for scene_map, code, attended in encodings
+    ]
     return nets.perception.condition(encodings, nets.perception.now(batch.held, keep[:, 2]))
 
 

@@ -20,6 +20,9 @@ from stages.train_behavior.training import TrainedBehavior
 
 SCENE_CHANNELS: dict[SceneEncoder, int] = {"pillars": 32, "volume": 128, "none": 0}
 """Width of the scene encoder: 32 suffices for minutes of video, 128 is the paper's (appendix A.2)."""
+COMPANIONS_RADIUS_M = 8.0
+"""Radius of perception with companions, about a room: in unseen homes the energy score of goals beside a cat
+is 0.79 m, with 4 m 0.83 m. An animal that knows only the person learns less from 8 m than from 4 m."""
 BODY_COMPONENTS = 24
 """Principal components of bones that the UNet of bodies corrects: 93 % of the variance of a cat's bones."""
 
@@ -42,7 +45,8 @@ def architecture_for(config: Config, data: BehaviorData, scenes: Scenes) -> Arch
         observed_past=config.observed_past,
         scene_width=SCENE_CHANNELS[config.scene],
         scene_channels=scenes.channels,
-        observer_radius_m=config.observer_radius_m,
+        observer_radius_m=max(config.observer_radius_m, COMPANIONS_RADIUS_M * data.accompanied),
+        companions=data.accompanied,
         ablated_input=config.ablated_input,
         body_components=BODY_COMPONENTS if preconditioned(config) else 0,
         unet_width=config.unet_width,

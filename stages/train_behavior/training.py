@@ -160,6 +160,8 @@ def initial_nets(
     body.rotation_std[:] = torch.from_numpy(scaling.body_std[:ROOT_CHANNELS])
     if nets.goal.map is not None:
         nets.goal.map.goal_std[:] = torch.from_numpy(scaling.goal_std)
+    if nets.goal.others is not None:
+        nets.goal.others.goal_std[:] = torch.from_numpy(scaling.goal_std)
     for net in (nets.path, nets.body):
         if isinstance(net, WaypointUNet | OneStageDenoiser):
             net.velocity_std[:] = torch.from_numpy(scaling.velocity_std)

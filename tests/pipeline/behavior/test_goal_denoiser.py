@@ -3,7 +3,9 @@
 import torch
 
 from pipeline.behavior.diffusion import STANDARD, noised, sample
+from pipeline.behavior.encoders import ATTENDED_CHANNELS
 from pipeline.behavior.goal_denoiser import GoalMLP, MapAttention
+from pipeline.behavior.path_encoding import GOAL_LENGTH_POWER
 from pipeline.behavior.perception import MAP_KEY_CHANNELS
 
 CELLS = 4
@@ -46,6 +48,25 @@ def test_goal_network_learns_the_distribution():
     net = trained(GoalMLP(code=2, hidden=32), draw, 400)
     found = goals(net, torch.tensor([[1.0, -1.0]]), 200)
     assert (found.mean((0, 1)) - torch.tensor([1.0, -1.0, 1.0])).abs().max() < 0.25
+
+
+def test_goals_are_beside_the_attended_other():
+    torch.manual_seed(0)
+    net = GoalMLP(code=1, hidden=32, attended_channels=ATTENDED_CHANNELS)
+
+    def draw(size):
+        position = torch.randn(size, 2) * 2
+        distance = position.norm(dim=-1, keepdim=True)
+        scaled = position / distance * distance**GOAL_LENGTH_POWER
+        goal = torch.stack([scaled[:, 0], torch.zeros(size), scaled[:, 1]], dim=-1)
+        code = torch.cat([torch.zeros(size, 1), torch.ones(size, 1), position], dim=-1)
+        return goal + 0.1 * torch.randn(size, 3), code
+
+    net = trained(net, draw, 300)
+    clean, code = draw(20)
+    assert (goals(net, code, 20) - clean[:, None]).norm(dim=-1).mean() < 0.35
+    code[:, 1:] = 0
+    assert (goals(net, code, 20) - clean[:, None]).norm(dim=-1).mean() > 0.7
 
 
 def test_goals_follow_the_map():

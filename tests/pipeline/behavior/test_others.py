@@ -8,7 +8,7 @@ import torch
 
 from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
 from pipeline.behavior.diffusion import Schedule, guided
-from pipeline.behavior.encoders import OthersEncoder
+from pipeline.behavior.encoders import ATTENDED_CHANNELS, HEADS, OthersEncoder
 from pipeline.behavior.model import BehaviorNets
 from pipeline.behavior.planning import Sampler, TorchNetworks, observe
 from pipeline.behavior.scenes import Scenes
@@ -43,6 +43,20 @@ def test_code_is_permutation_invariant_and_depends_on_each_companion(encoder):
     for gone in range(4):
         left = [number for number in range(4) if number != gone]
         assert (encoder(set_of_four[:, left], keep) - code).abs().max() > 1e-3
+
+
+def test_positions_are_those_of_the_attended():
+    net = OthersEncoder(8, 16, 8, 4.0, 10.0, positions=True).eval()
+    one, keep = companions_nearby(1), torch.ones(2)
+    code = net(one, keep)
+    presence, x, z = code[:, 8:].unflatten(1, (HEADS, ATTENDED_CHANNELS)).unbind(-1)
+    torch.testing.assert_close(presence, torch.ones(2, HEADS))
+    torch.testing.assert_close(torch.stack([x, z], -1), one[:, :, -1, :3:2].expand(-1, HEADS, -1))
+    absent = torch.zeros_like(one)
+    absent[..., 0] = ABSENT_M
+    torch.testing.assert_close(net(torch.cat([one, absent], 1), keep), code)
+    for gone in (net(absent, keep), net(one, torch.zeros(2))):
+        assert (gone[:, 8:] == 0).all()
 
 
 def test_absent_companions_do_not_change_the_code(encoder):

@@ -106,15 +106,21 @@ def test_observer_without_rotation_faces_the_agent():
     assert (pose[..., 1, 1] < 0).all(), "the camera's y axis points down"
 
 
+ACCOMPANIED = replace(ARCHITECTURE, companions=True)
+
+
 def equal_codes(code: torch.Tensor) -> list[bool]:
     """Return whether the codes of two agents agree in scene, observer and past; speed and posture agree where
     the past does.
     """
-    now = VELOCITY_CHANNELS + ARCHITECTURE.body_channels
-    maps = ARCHITECTURE.condition_length - ARCHITECTURE.code_length
-    charts, ensemble_size, posture = code.split([maps, ARCHITECTURE.code_length - now, now], dim=1)
-    parts = ensemble_size.unflatten(1, (ARCHITECTURE.ensemble_size, 3, -1))
+    now = VELOCITY_CHANNELS + ACCOMPANIED.body_channels
+    maps = ACCOMPANIED.condition_length - ACCOMPANIED.code_length
+    charts, codes, posture = code.split([maps, ACCOMPANIED.code_length - now, now], dim=1)
+    members = codes.unflatten(1, (ACCOMPANIED.ensemble_size, -1))
+    parts = members[..., : 3 * ACCOMPANIED.code].unflatten(-1, (3, -1))
+    attended = members[..., 3 * ACCOMPANIED.code :]
     same = ((parts[0] - parts[1]).abs().amax((0, 2)) < 1e-7).tolist()
+    assert bool((attended[0] == attended[1]).all()) == same[1]
     assert bool((charts[0] == charts[1]).all()) == same[0]
     assert bool((posture[0] == posture[1]).all()) == same[2]
     return same
@@ -128,12 +134,12 @@ def test_ablated_input_does_not_reach_the_code():
         torch.ones(2, 3),
     ]
     for number, blind in enumerate(("scene", "observer", "past")):
-        whole = BehaviorNets(replace(ARCHITECTURE, ablated_input=blind)).perception(*inputs)
+        whole = BehaviorNets(replace(ACCOMPANIED, ablated_input=blind)).perception(*inputs)
         assert equal_codes(whole) == [k == number for k in range(3)]
 
 
 def test_dropped_conditions_do_not_reach_the_code():
-    nets = BehaviorNets(ARCHITECTURE).eval()
+    nets = BehaviorNets(ACCOMPANIED).eval()
     inputs = [torch.randn(2, 16, 64, 8, 64), torch.rand(2, 1, 8, 10), torch.randn(2, 8 * (9 + 18))]
     nothing = nets.perception(*inputs, torch.zeros(2, 3))
     torch.testing.assert_close(nothing[0], nothing[1])

@@ -148,9 +148,9 @@ def networks_that_flee(architecture: Architecture, steps: int = 250) -> tuple[Be
         goal = goal + 0.3 * torch.randn(128, 3) * torch.tensor([1.0, 0.1, 1.0])
         elsewhere = torch.randn(2, 128, architecture.code)  # independent of room and past
         chart = torch.randn(128, architecture.condition_length - architecture.code_length)
-        condition = torch.cat(
-            [chart, elsewhere[0], mind.others(person[:, None], torch.ones(128)), elsewhere[1]], dim=-1
-        )
+        others = mind.others(person[:, None], torch.ones(128))
+        code, attended = others[:, : architecture.code], others[:, architecture.code :]
+        condition = torch.cat([chart, elsewhere[0], code, elsewhere[1], attended], dim=-1)
         t = torch.randint(schedule.steps, (128,))
         noise = torch.randn(128, 3)
         loss = (
@@ -236,6 +236,7 @@ def write(build: Path, *, accompanied: bool = False) -> None:
         unet_multipliers=(1,),
         goal_hidden=64,
         ensemble_size=1,
+        companions=accompanied,
     )
     nets, scaling = networks_that_flee(architecture)
     shape = (architecture, scaling, Schedule(), rest())

@@ -332,9 +332,10 @@ def test_mixed_precision_is_accurate_and_keeps_float32_weights(data):
     [
         replace(ARCHITECTURE, map_lookup="pointwise"),
         replace(ARCHITECTURE, control="concatenation"),
+        replace(ARCHITECTURE, companions=True),
         replace(ARCHITECTURE, scene="volume", observed_past="poses", body_components=0),
     ],
-    ids=["pointwise", "concatenation", "paper"],
+    ids=["pointwise", "concatenation", "companions", "paper"],
 )
 def test_models_of_other_architectures_are_written_and_read(data, tmp_path, shape):
     settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=2, goal_steps=1, batch=8))
@@ -586,15 +587,16 @@ def test_impossible_configurations_are_refused(data, settings, code):
 @pytest.mark.slow
 def test_exported_network_accepts_any_number_of_companions(tmp_path):
     torch.manual_seed(0)
-    nets = model.BehaviorNets(ARCHITECTURE, Schedule()).eval()
-    inputs, output = signature("perception", ARCHITECTURE, accompanied=True)
+    shape = replace(ARCHITECTURE, companions=True)
+    nets = model.BehaviorNets(shape, Schedule()).eval()
+    inputs, output = signature("perception", shape, accompanied=True)
     export_network(nets.perception, tmp_path / "perception.onnx", inputs, output)
     assert difference(nets.perception, tmp_path / "perception.onnx", inputs) < 1e-4
     session = onnxruntime.InferenceSession(tmp_path / "perception.onnx")
     rng = np.random.default_rng(0)
     for count in (1, 2, 4):
-        shapes = inputs | {"others": (count, *inputs["others"][1:])}
-        drawn = {name: rng.standard_normal((3, *shape), dtype=np.float32) for name, shape in shapes.items()}
+        sizes = inputs | {"others": (count, *inputs["others"][1:])}
+        drawn = {name: rng.standard_normal((3, *size), dtype=np.float32) for name, size in sizes.items()}
         with torch.inference_mode():
             expected = nets.perception(*map(torch.from_numpy, drawn.values())).numpy()
         np.testing.assert_allclose(session.run(None, drawn)[0], expected, atol=1e-4)
