@@ -62,11 +62,8 @@ class Gaussians(nn.Module):
     ):
         """``opacity`` and ``color`` lie in 0..1; rotations are quaternions wxyz."""
         super().__init__()
-        self.means, self.rotation, self.log_scale = (
-            nn.Parameter(means),
-            nn.Parameter(rotation),
-            nn.Parameter(log_scale),
-        )
+        self.means, self.rotation = nn.Parameter(means), nn.Parameter(rotation)
+        self.log_scale = nn.Parameter(log_scale)
         self.opacity_logit = nn.Parameter(torch.logit(opacity.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)))
         self.band0 = nn.Parameter((color - 0.5) / BAND0)
 
