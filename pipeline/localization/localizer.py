@@ -203,7 +203,7 @@ def load(folder: Path, device: str = "cpu") -> Localizer:
     kind: Kind = metadata["kind"]
     match kind:
         case "bank":
-            model = PatchBank.from_arrays(arrays)
+            model = PatchBank(**arrays | {"descriptors": arrays["descriptors"].astype(np.float32)})
         case "regression":
             model = PoseRegressor(**metadata["arguments"])
             model.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
