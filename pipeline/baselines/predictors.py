@@ -155,7 +155,7 @@ class Ats:
         """Draw goals only, at a hundredth of the cost of plans."""
         goals = []
         for chunk in _chunks(context):
-            codes = self.sampler.codes(self._observe(chunk), self.sampling, count)
+            codes = self.sampler.codes(self.observe(chunk), self.sampling, count)
             goal = self.sampler.goals(codes, self.sampling, rng).reshape(len(chunk), count, 3)
             goals.append(rigid.apply(world_from_ego(chunk.world_from_agent[:, -1], self.ego), goal))
         return Samples(np.concatenate(goals))
@@ -168,9 +168,8 @@ class Ats:
         ``at_once`` windows are encoded together: without a scene thousands fit into memory.
         """
         parts = []
-        for start in range(0, len(context), at_once):
-            chunk = context[start : start + at_once]
-            path = self.sampler.plan_paths(self._observe(chunk), self.sampling, rng, count=count)
+        for chunk in _chunks(context, at_once):
+            path = self.sampler.plan_paths(self.observe(chunk), self.sampling, rng, count=count)
             frame = np.repeat(world_from_ego(chunk.world_from_agent[:, -1], self.ego), count, axis=0)
             path = rigid.apply(frame, path)
             parts.append(path.reshape(len(chunk), count, *path.shape[1:]))
@@ -178,7 +177,7 @@ class Ats:
         return Samples(path[:, :, -1], path)
 
     def _plans(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
-        plan = self.sampler.plan(self._observe(context), self.sampling, rng, count=count)
+        plan = self.sampler.plan(self.observe(context), self.sampling, rng, count=count)
         frame = np.repeat(world_from_ego(context.world_from_agent[:, -1], self.ego), count, axis=0)
         root = plan.world_from_agent(frame)
         bones = bones_from_channels(plan.body[..., ROOT_CHANNELS:], self.agent_from_bone_rest)
@@ -191,9 +190,10 @@ class Ats:
         """The scenes; a single map is shared by all recordings."""
         return self.volume if isinstance(self.volume, Scenes) else Scenes.of(self.volume)
 
-    def _observe(self, context: Context) -> Observation:
+    def observe(self, context: Context) -> Observation:
+        """Return what the model perceives in each window."""
         return observe(context, self.scenes, self.agent_from_bone_rest, self.ego)
 
 
-def _chunks(context: Context) -> list[Context]:
-    return [context[start : start + WINDOWS_AT_ONCE] for start in range(0, len(context), WINDOWS_AT_ONCE)]
+def _chunks(context: Context, at_once: int = WINDOWS_AT_ONCE) -> list[Context]:
+    return [context[start : start + at_once] for start in range(0, len(context), at_once)]
