@@ -7,7 +7,7 @@ noise fitted to the training windows.
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -78,39 +78,35 @@ class StandStill:
     std: Float[np.ndarray, "frame 3"]
 
     @classmethod
-    def fit(cls, context: Context, future: Future) -> "StandStill":
-        """Fit the noise to the displacements of training windows."""
-        return cls(_rms(future.path_world - _repeat_last(context, future.path_world.shape[1])))
-
-    def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
-        """Draw one deviation per sample and let it grow with time."""
-        return _gaussian_samples(context, _repeat_last(context, len(self.std)), self.std, count, rng)
-
-
-@dataclass(frozen=True)
-class ConstantVelocity:
-    """The animal keeps velocity and posture, up to Gaussian noise that grows with time."""
-
-    std: Float[np.ndarray, "frame 3"]
+    def fit(cls, context: Context, future: Future) -> Self:
+        """Fit the noise to the residuals of training windows."""
+        return cls(_rms(future.path_world - cls.mean(context, future.path_world.shape[1])))
 
     @classmethod
-    def fit(cls, context: Context, future: Future) -> "ConstantVelocity":
-        """Fit the noise to the residuals of training windows."""
-        return cls(_rms(future.path_world - _extrapolate(context, future.path_world.shape[1])))
+    def mean(cls, context: Context, frames: int) -> Float[np.ndarray, "window frame 3"]:
+        """Return the path without noise."""
+        return np.repeat(context.world_from_agent[:, -1:, :3, 3], frames, axis=1)
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw one deviation per sample and let it grow with time."""
-        return _gaussian_samples(context, _extrapolate(context, len(self.std)), self.std, count, rng)
+        mean = self.mean(context, len(self.std))
+        path = mean[:, None] + rng.standard_normal((len(context), count, 1, 3)) * self.std
+        shape = (len(context), count, mean.shape[1])
+        rotation = np.broadcast_to(context.world_from_agent[:, -1, :3, :3][:, None, None], (*shape, 3, 3))
+        bones = context.agent_from_bone[:, -1]
+        bones = np.broadcast_to(bones[:, None, None], (*shape, *bones.shape[1:]))
+        return Samples(path[:, :, -1], path, rotation, bones)
 
 
-def _repeat_last(context: Context, frames: int) -> Float[np.ndarray, "window frame 3"]:
-    return np.repeat(context.world_from_agent[:, -1:, :3, 3], frames, axis=1)
+class ConstantVelocity(StandStill):
+    """The animal keeps velocity and posture, up to Gaussian noise that grows with time."""
 
-
-def _extrapolate(context: Context, frames: int) -> Float[np.ndarray, "window frame 3"]:
-    position = context.world_from_agent[..., :3, 3]
-    step = (position[:, -1] - position[:, 0]) / (position.shape[1] - 1)
-    return _repeat_last(context, frames) + step[:, None] * np.arange(1, frames + 1)[:, None]
+    @classmethod
+    def mean(cls, context: Context, frames: int) -> Float[np.ndarray, "window frame 3"]:
+        """Return the path without noise."""
+        position = context.world_from_agent[..., :3, 3]
+        step = (position[:, -1] - position[:, 0]) / (position.shape[1] - 1)
+        return super().mean(context, frames) + step[:, None] * np.arange(1, frames + 1)[:, None]
 
 
 def _rms(residual: Float[np.ndarray, "window frame 3"]) -> Float[np.ndarray, "frame 3"]:
@@ -119,19 +115,12 @@ def _rms(residual: Float[np.ndarray, "window frame 3"]) -> Float[np.ndarray, "fr
     return np.stack([level, np.sqrt((residual[..., 1] ** 2).mean(0)), level], axis=-1)
 
 
-def _gaussian_samples(
-    context: Context,
-    mean: Float[np.ndarray, "window frame 3"],
-    std: Float[np.ndarray, "frame 3"],
-    count: int,
-    rng: np.random.Generator,
-) -> Samples:
-    path = mean[:, None] + rng.standard_normal((len(context), count, 1, 3)) * std
-    shape = (len(context), count, mean.shape[1])
-    rotation = np.broadcast_to(context.world_from_agent[:, -1, :3, :3][:, None, None], (*shape, 3, 3))
-    bones = context.agent_from_bone[:, -1]
-    bones = np.broadcast_to(bones[:, None, None], (*shape, *bones.shape[1:]))
-    return Samples(path[:, :, -1], path, rotation, bones)
+BASELINES = {
+    "location_prior": LocationPrior,
+    "stand_still": StandStill,
+    "constant_velocity": ConstantVelocity,
+}
+"""The simple baselines by the names of their metrics."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +155,7 @@ class Ats:
         """Draw goals only, at a hundredth of the cost of plans."""
         goals = []
         for chunk in _chunks(context):
-            codes = self.sampler.codes(self._observe(chunk), self.sampling, count)
+            codes = self.sampler.codes(self.observe(chunk), self.sampling, count)
             goal = self.sampler.goals(codes, self.sampling, rng).reshape(len(chunk), count, 3)
             goals.append(rigid.apply(world_from_ego(chunk.world_from_agent[:, -1], self.ego), goal))
         return Samples(np.concatenate(goals))
@@ -179,9 +168,8 @@ class Ats:
         ``at_once`` windows are encoded together: without a scene thousands fit into memory.
         """
         parts = []
-        for start in range(0, len(context), at_once):
-            chunk = context[start : start + at_once]
-            path = self.sampler.plan_paths(self._observe(chunk), self.sampling, rng, count=count)
+        for chunk in _chunks(context, at_once):
+            path = self.sampler.plan_paths(self.observe(chunk), self.sampling, rng, count=count)
             frame = np.repeat(world_from_ego(chunk.world_from_agent[:, -1], self.ego), count, axis=0)
             path = rigid.apply(frame, path)
             parts.append(path.reshape(len(chunk), count, *path.shape[1:]))
@@ -189,7 +177,7 @@ class Ats:
         return Samples(path[:, :, -1], path)
 
     def _plans(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
-        plan = self.sampler.plan(self._observe(context), self.sampling, rng, count=count)
+        plan = self.sampler.plan(self.observe(context), self.sampling, rng, count=count)
         frame = np.repeat(world_from_ego(context.world_from_agent[:, -1], self.ego), count, axis=0)
         root = plan.world_from_agent(frame)
         bones = bones_from_channels(plan.body[..., ROOT_CHANNELS:], self.agent_from_bone_rest)
@@ -202,9 +190,10 @@ class Ats:
         """The scenes; a single map is shared by all recordings."""
         return self.volume if isinstance(self.volume, Scenes) else Scenes.of(self.volume)
 
-    def _observe(self, context: Context) -> Observation:
+    def observe(self, context: Context) -> Observation:
+        """Return what the model perceives in each window."""
         return observe(context, self.scenes, self.agent_from_bone_rest, self.ego)
 
 
-def _chunks(context: Context) -> list[Context]:
-    return [context[start : start + WINDOWS_AT_ONCE] for start in range(0, len(context), WINDOWS_AT_ONCE)]
+def _chunks(context: Context, at_once: int = WINDOWS_AT_ONCE) -> list[Context]:
+    return [context[start : start + at_once] for start in range(0, len(context), at_once)]

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from pipeline.data import npz
 from pipeline.data.schema import FileSchema
@@ -31,10 +31,3 @@ def writer(folder: Path, frames: int, color_size: tuple[int, int]) -> npz.Rows:
     """Begin `features.npz` for ``frames`` pictures of (height, width) ``color_size``; rows are appended."""
     shape = (frames, *(side // STRIDE_PX for side in color_size), CHANNELS)
     return npz.Rows(folder / "features.npz", features=(shape, np.float16))
-
-
-def cell_of(
-    pixel: Int[np.ndarray, "*batch"] | Float[np.ndarray, "*batch"], cells: int
-) -> Int[np.ndarray, "*batch"]:
-    """Return the cell along one axis that holds each colour pixel, of ``cells``; the last takes the rest."""
-    return np.minimum(np.asarray(pixel).astype(np.int64) // STRIDE_PX, cells - 1)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 
 from pipeline.data import npz
 from pipeline.data.schema import FileSchema
@@ -38,10 +38,3 @@ def writer(folder: Path, gap: int, frames: int, size: tuple[int, int], *, backwa
     """Start the file of one gap for ``frames`` rows of (height, width) ``size`` in cells."""
     path, shape = path_of(folder, gap, backward=backward), (frames, *size)
     return npz.Rows(path, flow=((*shape, 2), np.float16), confidence=(shape, np.uint8))
-
-
-def cell_of(
-    pixel: Int[np.ndarray, "*batch"] | Float[np.ndarray, "*batch"], cells: int
-) -> Int[np.ndarray, "*batch"]:
-    """Return the cell along one axis that holds each colour pixel, of ``cells``; the last takes the rest."""
-    return np.minimum(np.asarray(pixel).astype(np.int64) // STRIDE_PX, cells - 1)

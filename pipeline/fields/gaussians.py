@@ -62,11 +62,8 @@ class Gaussians(nn.Module):
     ):
         """``opacity`` and ``color`` lie in 0..1; rotations are quaternions wxyz."""
         super().__init__()
-        self.means, self.rotation, self.log_scale = (
-            nn.Parameter(means),
-            nn.Parameter(rotation),
-            nn.Parameter(log_scale),
-        )
+        self.means, self.rotation = nn.Parameter(means), nn.Parameter(rotation)
+        self.log_scale = nn.Parameter(log_scale)
         self.opacity_logit = nn.Parameter(torch.logit(opacity.clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)))
         self.band0 = nn.Parameter((color - 0.5) / BAND0)
 
@@ -287,13 +284,8 @@ def save_ply(path: Path, gaussians: Gaussians, which: Bool[Tensor, "point"]) -> 
 @torch.no_grad()
 def drawable(gaussians: Gaussians) -> Bool[Tensor, "point"]:
     """Return which Gaussians are finite and have an opacity of at least 1/255."""
-    finite = torch.stack(
-        [
-            getattr(gaussians, name).reshape(len(gaussians), -1).isfinite().all(-1)
-            for name in ("means", "rotation", "log_scale", "opacity_logit", "band0")
-        ]
-    ).all(0)
-    return finite & (gaussians.opacity >= 1 / 255)
+    columns = torch.cat([each.reshape(len(gaussians), -1) for each in gaussians.parameters()], dim=-1)
+    return columns.isfinite().all(-1) & (gaussians.opacity >= 1 / 255)
 
 
 def load_ply(path: Path) -> Gaussians:

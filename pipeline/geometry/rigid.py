@@ -4,6 +4,8 @@ Build them with `make` or `exp`, chain them with ``@``, move points with `apply`
 Quaternions are wxyz with w >= 0; this file owns that order. Angles are radians, lengths metres.
 """
 
+import itertools
+
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
@@ -67,10 +69,8 @@ def accumulate(
     steps: Float[np.ndarray, "step 4 4"], start: Float[np.ndarray, "4 4"] | None = None
 ) -> Float[np.ndarray, "pose 4 4"]:
     """Chain motions ``first_from_second`` to poses in the start's frame (default: the first one's)."""
-    poses = [np.eye(4) if start is None else start]
-    for step in steps:
-        poses.append(poses[-1] @ step)
-    return np.stack(poses)
+    first = np.eye(4) if start is None else start
+    return np.stack(list(itertools.accumulate(steps, np.matmul, initial=first)))
 
 
 def yaw(a_from_b: Float[np.ndarray, "*batch _ _"]) -> Float[np.ndarray, "*batch"]:

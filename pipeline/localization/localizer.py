@@ -124,7 +124,7 @@ class Localizer:
                     if sector is None or len(sector) >= MIN_SECTOR_PATCHES
                 ]
             case PoseRegressor() as net:
-                poses = [self._regress(patches, *net.regress(query, patches.cell, self._anchor(patches)))]
+                poses = [self._regress(net, query, patches)]
             case _:
                 assert_never(self.model)
         found = [pose for pose in poses if pose is not None]
@@ -146,12 +146,12 @@ class Localizer:
         ratio, points_camera = float(inlier.mean()), patches.points_camera[inlier]
         return self._hypothesis(map_from_camera, ratio, matched[inlier], points_camera)
 
-    def _anchor(self, patches) -> Float[np.ndarray, "3"]:
-        """Return the point whose map position is regressed, camera frame: camera centre or animal centre."""
-        return np.zeros(3) if self.sampling.target == "scene" else np.median(patches.points_camera, axis=0)
-
-    def _regress(self, patches, map_from_camera, certainty) -> PoseHypothesis:
-        subset = patches.points_camera[:: max(1, len(patches.points_camera) // MAX_REGRESSED_POINTS)]
+    def _regress(self, net, query, patches) -> PoseHypothesis:
+        """Regress the map position of the camera's centre, or of the animal's."""
+        points = patches.points_camera
+        anchor = np.zeros(3) if self.sampling.target == "scene" else np.median(points, axis=0)
+        map_from_camera, certainty = net.regress(query, patches.cell, anchor)
+        subset = points[:: max(1, len(points) // MAX_REGRESSED_POINTS)]
         return self._hypothesis(map_from_camera, certainty, rigid.apply(map_from_camera, subset), subset)
 
     def _hypothesis(self, map_from_camera, ratio, points_map, points_camera) -> PoseHypothesis:
@@ -203,7 +203,7 @@ def load(folder: Path, device: str = "cpu") -> Localizer:
     kind: Kind = metadata["kind"]
     match kind:
         case "bank":
-            model = PatchBank.from_arrays(arrays)
+            model = PatchBank(**arrays | {"descriptors": arrays["descriptors"].astype(np.float32)})
         case "regression":
             model = PoseRegressor(**metadata["arguments"])
             model.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})

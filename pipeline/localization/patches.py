@@ -123,11 +123,6 @@ class PatchBank:
         """Return the arrays to store."""
         return vars(self) | {"descriptors": self.descriptors.astype(np.float16)}
 
-    @staticmethod
-    def from_arrays(arrays: dict[str, Shaped[np.ndarray, "..."]]) -> "PatchBank":
-        """Rebuild a bank from stored arrays."""
-        return PatchBank(**arrays | {"descriptors": arrays["descriptors"].astype(np.float32)})
-
 
 def describe_daisy(
     picture: UInt8[np.ndarray, "height width 3"], sampling: PatchSampling

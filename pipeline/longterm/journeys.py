@@ -60,7 +60,7 @@ def travel(
     rng: np.random.Generator,
 ) -> Journey:
     """Synthesize motion through sub-goals; with ``settings`` None it is not optimised."""
-    waypoints = plan_waypoints(None, subgoals, world.scene, world.model.motion_prior)
+    waypoints = plan_waypoints(subgoals, world.scene, world.model.motion_prior)
     roots, stops = waypoints.world_from_agent, waypoints.subgoal
     raw, _ = world.model.long_motion(roots, world.body, world.scene, rng, stops=stops)
     journey = refine_motion(world, raw, settings)

@@ -177,24 +177,17 @@ class WalkableFloor:
         return gaussian_filter1d(path, PATH_SMOOTHING_CELLS, axis=0, mode="nearest")
 
 
-def plan_waypoints(
-    start: Float[np.ndarray, "4 4"] | None,
-    subgoals: list[Subgoal],
-    scene: MotionScene,
-    motion_prior: MotionPrior,
-) -> Waypoints:
-    """Return waypoints two seconds apart through all sub-goals, from ``start`` or the first sub-goal."""
-    if len(subgoals) < (1 if start is not None else 2):
-        remedy = "give at least two, or a start and one"
-        raise InputError("SIM-001", "too few sub-goals", f"{len(subgoals)}", remedy)
+def plan_waypoints(subgoals: list[Subgoal], scene: MotionScene, motion_prior: MotionPrior) -> Waypoints:
+    """Return waypoints two seconds apart through all sub-goals, from the first one."""
+    if len(subgoals) < 2:
+        raise InputError("SIM-001", "too few sub-goals", f"{len(subgoals)}", "give at least two")
     floor = WalkableFloor.of(scene, motion_prior)
     for goal in subgoals:
         floor.refuse_outside(goal.position_world)
     root_m = floor.height_m + motion_prior.clearance_m
     stand = [_standing(floor, scene, goal.position_world, motion_prior.clearance_m) for goal in subgoals]
-    points = [stand.pop(0) if start is None else _grounded(start[:3, 3], root_m)]
-    headings, marks, clock = [subgoals[0].heading_rad if start is None else float(rigid.yaw(start))], [0], 0.0
-    for goal, place in zip(subgoals[-len(stand) :], stand, strict=True):
+    points, headings, marks, clock = [stand[0]], [subgoals[0].heading_rad], [0], 0.0
+    for goal, place in zip(subgoals[1:], stand[1:], strict=True):
         added = _leg_ends(floor, points[-1], place, root_m, LEG_LENGTH_SLACK * motion_prior.pace_m)
         count = len(added)
         spare = 0 if goal.time_s is None else max(0, round((goal.time_s - clock) / LEG_S) - count)
@@ -202,7 +195,6 @@ def plan_waypoints(
         headings += [None] * (count - 1) + [goal.heading_rad] * (1 + spare)
         clock += (count + spare) * LEG_S
         marks.append(len(points) - 1)
-    marks = marks if start is None else marks[1:]
     return Waypoints(_poses_along_path(np.array(points), headings), np.array(marks))
 
 

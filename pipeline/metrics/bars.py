@@ -3,10 +3,11 @@
 A bar is a limit, or another metric to beat. Metrics that were not measured have a reason.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
+
+from pipeline.metrics.intervals import finite
 
 Verdict = Literal["ok", "fail", "none"]
 BASELINES = (
@@ -80,9 +81,9 @@ def judge(metrics: Mapping[str, float | None], reasons: Mapping[str, str]) -> li
 
 
 def _judged(bar: Bar, metrics: Mapping[str, float | None], reasons: Mapping[str, str]) -> Judged:
-    value, limit = _known(metrics.get(bar.metric)), bar.limit
+    value, limit = finite(metrics.get(bar.metric)), bar.limit
     if isinstance(limit, str):
-        other = _known(metrics.get(limit))
+        other = finite(metrics.get(limit))
         limit = None if other is None else bar.factor * other
     if value is None or limit is None:
         missing = bar.metric if value is None else str(bar.limit)
@@ -101,9 +102,5 @@ def grouped(metrics: Mapping[str, float | None]) -> dict[str, dict[str, float | 
     groups: dict[str, dict[str, float | None]] = {}
     for name, value in sorted(metrics.items()):
         group, _, rest = name.partition("/")
-        groups.setdefault(group, {})[rest or name] = _known(value)
+        groups.setdefault(group, {})[rest or name] = finite(value)
     return groups
-
-
-def _known(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None

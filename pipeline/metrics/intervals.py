@@ -1,5 +1,6 @@
 """Bootstrap intervals for means and medians over overlapping windows: whole episodes are resampled."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -20,11 +21,13 @@ class Interval:
 
     def as_figures(self, name: str) -> dict[str, float | None]:
         """Return mean and bounds as entries of a table; None if not finite."""
-        values = (self.mean, self.low, self.high)
-        return {
-            each: value if np.isfinite(value) else None
-            for each, value in zip(names_of(name), values, strict=True)
-        }
+        values = map(finite, (self.mean, self.low, self.high))
+        return dict(zip(names_of(name), values, strict=True))
+
+
+def finite(value: float | None) -> float | None:
+    """Return a figure as a table holds it; None if it is not finite."""
+    return value if value is not None and math.isfinite(value) else None
 
 
 def names_of(name: str) -> tuple[str, str, str]:

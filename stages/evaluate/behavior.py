@@ -10,15 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.baselines.predictors import (
-    WINDOWS_AT_ONCE,
-    Ats,
-    ConstantVelocity,
-    LocationPrior,
-    Predictor,
-    Samples,
-    StandStill,
-)
+from pipeline.baselines.predictors import BASELINES, WINDOWS_AT_ONCE, Ats, LocationPrior, Predictor, Samples
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData
 from pipeline.geometry import subsampling
 from pipeline.metrics.intervals import Interval, bootstrapped, episodes
@@ -27,7 +19,6 @@ from pipeline.metrics.scores import GOAL_SCORES, PLAN_SCORES, SCORES
 from stages.evaluate.config import Config
 
 OURS = "ats"
-BASELINES = ("location_prior", "stand_still", "constant_velocity")
 MOVING_M = 0.1
 """Displacement in 5.6 s above which an animal moves."""
 Scores = dict[str, Float[np.ndarray, "window"]]
@@ -37,8 +28,7 @@ Scores = dict[str, Float[np.ndarray, "window"]]
 def baselines(data: BehaviorData) -> dict[str, Predictor]:
     """Fit the simple baselines to the training windows."""
     context, future = data.windows(data.indices(TRAIN), bones=False)
-    methods = (LocationPrior, StandStill, ConstantVelocity)
-    return {name: method.fit(context, future) for name, method in zip(BASELINES, methods, strict=True)}
+    return {name: method.fit(context, future) for name, method in BASELINES.items()}
 
 
 def behavior_metrics(data: BehaviorData, ours: Predictor, config: Config) -> Metrics:

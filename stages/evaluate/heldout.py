@@ -84,17 +84,18 @@ def view_metrics(views: Sequence[HeldoutView], lpips: Lpips | None = None) -> Me
     if lpips is None:
         metrics.skip(names, NO_LPIPS)
     else:
-        rows = np.array([learned_distances(lpips, view) for view in views])
+        rows = np.array([_per_part(lpips.distance(*compared_colors(view)), view) for view in views])
         for name, column in zip(names, rows.T, strict=True):
             metrics.put(name, mean(column[np.isfinite(column)]), UNMEASURED_LPIPS)
     return metrics
 
 
 def depth_metrics(name: str, views: Sequence[HeldoutView]) -> Metrics:
-    """Average over all pixels whether depth is right (DepthAcc@0.1m)."""
+    """Average over all pixels whether depth is right (DepthAcc@0.1m); holes are wrong."""
     metrics = Metrics()
     known = np.concatenate([((view.true.depth > 0) & (view.true.depth <= RANGE_M)).ravel() for view in views])
-    right = np.concatenate([depth_is_right(view).ravel() for view in views])
+    errors = (np.where(view.depth > 0, np.abs(view.depth - view.true.depth), np.inf) for view in views)
+    right = np.concatenate([(error <= TOLERANCE_M).ravel() for error in errors])
     agent = np.concatenate([view.true.agent.ravel() for view in views])
     for part, chosen in (("all", known), ("agent", known & agent), ("scene", known & ~agent)):
         metrics.put(f"{name}_{part}", mean(right[chosen]), "not in view of the held-out phone")
@@ -147,11 +148,6 @@ def _gray(depth: Float[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height
     return np.repeat(near.astype(np.uint8)[..., None], 3, axis=-1)
 
 
-def depth_is_right(view: HeldoutView) -> Bool[np.ndarray, "height width"]:
-    """Return which pixels are within 0.1 m of truth; holes are wrong."""
-    return (view.depth > 0) & (np.abs(view.depth - view.true.depth) <= TOLERANCE_M)
-
-
 def picture_quality(view: HeldoutView) -> list[float]:
     """Return PSNR (all, agent, scene) in dB, then SSIM; NaN for a part that is not in the picture."""
     ours, true = compared_colors(view)
@@ -159,11 +155,6 @@ def picture_quality(view: HeldoutView) -> list[float]:
     similar = structural_similarity(true, ours, channel_axis=-1, data_range=1.0, full=True)[1].mean(-1)
     psnr = [-10 * np.log10(max(error, 1e-10)) for error in _per_part(squared, view)]
     return psnr + _per_part(similar, view)
-
-
-def learned_distances(lpips: Lpips, view: HeldoutView) -> list[float]:
-    """Return LPIPS (all, agent, scene); NaN for a part that is not in the picture."""
-    return _per_part(lpips.distance(*compared_colors(view)), view)
 
 
 def compared_colors(
@@ -175,6 +166,7 @@ def compared_colors(
 
 
 def _per_part(values: Float[np.ndarray, "height width"], view: HeldoutView) -> list[float]:
+    """Average over all pixels, the agent's and the scene's; NaN for a part that is not in the picture."""
     parts = (np.ones_like(view.true.agent), view.true.agent, ~view.true.agent)
     return [mean(values[part]) for part in parts]
 

@@ -5,19 +5,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from pipeline.fields.gaussians import BAND0, OPACITY, ROTATION, SCALE
 from pipeline.geometry.meshes import Mesh, area_normals
 
 _SPLAT_ROW = np.dtype(
     [("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
 )
-_POSITION, _DC, _LOGIT, _LOG_SCALE, _QUATERNION = (slice(0, 3), slice(6, 9), 54, slice(55, 58), slice(58, 62))
-"""Columns of a Gaussian as PLY files of splats order them: position, normal, spherical harmonics, ..."""
 _LEVEL_M, _UPRIGHT = 0.02, 0.9
 """Thickness of the layers among which the floor is sought; least upward part of a floor's normal."""
 _NEAR_LEVELS = 1.5
 """The floor is averaged over the lowest level and those that touch it, half thicknesses."""
 _STEPS = 8192.0  # places and sizes are rounded to 0.06 mm: finer digits do not compress
-_BAND_0 = 0.28209479177387814  # the constant spherical harmonic
 
 
 @dataclass(frozen=True)
@@ -90,7 +88,7 @@ def skinned_splats(
 
 def _weightiest(gaussians: Float[np.ndarray, "point 62"], max_points: int) -> Int[np.ndarray, " selected"]:
     """Choose the valid Gaussians with the largest opacity times area, in descending order."""
-    opacity, size = _opacity(gaussians), np.exp(gaussians[:, _LOG_SCALE].astype(np.float64))
+    opacity, size = _opacity(gaussians), np.exp(gaussians[:, SCALE].astype(np.float64))
     sound = np.isfinite(gaussians).all(1) & (opacity >= 1 / 255)
     weight = np.where(sound, opacity * np.sort(size, axis=1)[:, 1:].prod(1), -1)
     return np.argsort(-weight, kind="stable")[: min(max_points, int(sound.sum()))]
@@ -98,18 +96,18 @@ def _weightiest(gaussians: Float[np.ndarray, "point 62"], max_points: int) -> In
 
 def _packed(gaussians: Float[np.ndarray, "point 62"]) -> bytes:
     rows = np.zeros(len(gaussians), _SPLAT_ROW)
-    rows["position"] = np.rint(gaussians[:, _POSITION] * _STEPS) / _STEPS
-    scale = np.exp(gaussians[:, _LOG_SCALE].astype(np.float64))
+    rows["position"] = np.rint(gaussians[:, :3] * _STEPS) / _STEPS
+    scale = np.exp(gaussians[:, SCALE].astype(np.float64))
     rows["scale"] = np.maximum(np.rint(scale * _STEPS), 1) / _STEPS
-    color = gaussians[:, _DC] * _BAND_0 + 0.5
+    color = gaussians[:, 6:9] * BAND0 + 0.5
     rows["color"] = _bytes(np.concatenate([color, _opacity(gaussians)[:, None]], 1) * 255)
-    rotation = gaussians[:, _QUATERNION] / np.linalg.norm(gaussians[:, _QUATERNION], axis=1, keepdims=True)
+    rotation = gaussians[:, ROTATION] / np.linalg.norm(gaussians[:, ROTATION], axis=1, keepdims=True)
     rows["rotation"] = _bytes(rotation * 128 + 128)
     return rows.tobytes()
 
 
 def _opacity(gaussians: Float[np.ndarray, "point 62"]) -> Float[np.ndarray, " point"]:
-    return 1 / (1 + np.exp(-gaussians[:, _LOGIT].astype(np.float64)))
+    return 1 / (1 + np.exp(-gaussians[:, OPACITY].astype(np.float64)))
 
 
 def _bytes(values: np.ndarray) -> UInt8[np.ndarray, "*any"]:

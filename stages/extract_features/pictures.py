@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from pipeline.data import plots, qa
 from pipeline.data.clips import Clip
@@ -17,7 +17,8 @@ def report_quality(folder: Path, clip: Clip, features: Float[np.ndarray, "frame 
     """Write the stage's own judgement."""
     shown = subsampling.evenly(len(clip), SHOWN_FRAMES)
     size = (HEIGHT_PX, max(round(clip.color_size[1] * HEIGHT_PX / clip.color_size[0]), 1))
-    images = [clip.color(int(i)) for i in shown] + [as_colors(features[i]) for i in shown]
+    colors = np.clip(128 + 220 * features[shown][..., :3].astype(np.float32), 0, 255).astype(np.uint8)
+    images = [*(clip.color(int(i)) for i in shown), *colors]
     sheet = plots.grid([plots.resized(image, size) for image in images], len(shown))
     pairs = (features[i : i + 2].astype(np.float32) for i in range(len(features) - 1))
     steady = [np.einsum("hwc,hwc->hw", *pair) for pair in pairs]
@@ -29,8 +30,3 @@ def report_quality(folder: Path, clip: Clip, features: Float[np.ndarray, "frame 
         checks=[qa.Check("cosine similarity of neighbouring frames", similarity, "", 0.5, None, "higher")],
         pictures=[qa.Picture("features", sheet, "frames and their first three channels")],
     )
-
-
-def as_colors(features: Float[np.ndarray, "height width 16"]) -> UInt8[np.ndarray, "height width 3"]:
-    """Show the first three channels; the same mapping for all recordings of an agent."""
-    return np.clip(128 + 220 * features[..., :3].astype(np.float32), 0, 255).astype(np.uint8)

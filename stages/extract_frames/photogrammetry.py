@@ -62,7 +62,7 @@ def map_pictures(
     pictures = [_undistorted(workspace / "pictures" / f"{row:06d}.jpg", solved) for row in sparse.frame]
     views = [_view(picture, solved, key, config) for key, picture in enumerate(pictures)]
     depth, confidence = _depths(views, sparse, config)
-    unit_m, scale = _unit_m(solved, pictures, views, depth, measured, config)
+    unit_m, scale = _unit_m(solved, pictures, views, depth, measured)
     depth = [np.where(each * unit_m < max_depth_m, each * unit_m, 0).astype(np.float32) for each in depth]
     world_from_camera = sparse.model_from_camera.copy()
     world_from_camera[:, :3, 3] *= unit_m
@@ -165,7 +165,6 @@ def _unit_m(
     views: list[SweepView],
     depth: list[np.ndarray],
     measured: Mapping[str, Recording],
-    config: PhotogrammetryConfig,
 ) -> tuple[float, str]:
     """Return metres per unit of the model, and the id of the recording that gave them, or `relative`."""
     gray = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]

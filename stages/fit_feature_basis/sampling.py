@@ -18,10 +18,6 @@ other."""
 
 def sample_descriptors(clips: Iterable[Clip], describe: Describe) -> Float[np.ndarray, "sample channel"]:
     """Describe `FRAMES_PER_RECORDING` frames of each recording, evenly spread in time."""
-    return np.concatenate([_of_clip(clip, describe) for clip in clips])
-
-
-def _of_clip(clip: Clip, describe: Describe) -> Float[np.ndarray, "sample channel"]:
-    chosen = evenly(len(clip), FRAMES_PER_RECORDING, rounded=True)
-    described = (describe(clip.color(int(frame)), STRIDE_PX) for frame in chosen)
+    shown = ((clip, evenly(len(clip), FRAMES_PER_RECORDING, rounded=True)) for clip in clips)
+    described = (describe(clip.color(int(frame)), STRIDE_PX) for clip, frames in shown for frame in frames)
     return np.concatenate([raw.reshape(-1, raw.shape[-1]) for raw in described])

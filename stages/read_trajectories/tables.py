@@ -8,7 +8,7 @@ from jaxtyping import Float, Int, Shaped
 
 from pipeline.behavior.trajectories import ABSENT_M, KINDS, UP
 from pipeline.core.errors import InputError
-from pipeline.geometry import rigid
+from pipeline.geometry import rigid, subsampling
 from stages.read_trajectories.motion import CLIP_GAP_S, absent_observer, concatenated_times
 
 REQUIRED_COLUMNS = ("time", "x", "y", "z", "heading")
@@ -175,11 +175,8 @@ def interpolated(
     time: Float[np.ndarray, "known"], beings: Float[np.ndarray, "known 4"], query: Float[np.ndarray, "frame"]
 ) -> Float[np.ndarray, "frame 4"]:
     """Interpolate rows between known ones at most `MAX_STEP_S` apart; NaN elsewhere."""
-    after = np.searchsorted(time, query).clip(0, len(time) - 1)
-    before = (np.searchsorted(time, query, side="right") - 1).clip(0)
-    within = (time[before] <= query) & (query <= time[after]) & (time[after] - time[before] <= MAX_STEP_S)
     found = np.stack([np.interp(query, time, column) for column in beings.T], axis=-1)
-    found[~within] = np.nan
+    found[~subsampling.within_short_gaps(time, query, MAX_STEP_S)] = np.nan
     return found
 
 

@@ -21,8 +21,8 @@ from torch.nn import functional
 
 from pipeline.data import npz
 from pipeline.data.clips import Clip, Masks, usable_depth
-from pipeline.data.features import cell_of as feature_cell
-from pipeline.data.flow import cell_of as flow_cell
+from pipeline.data.features import STRIDE_PX as FEATURE_STRIDE_PX
+from pipeline.data.flow import STRIDE_PX as FLOW_STRIDE_PX
 from pipeline.geometry import cameras
 from pipeline.geometry.flying_pixels import supported
 from stages.reconstruct.config import PixelSampling
@@ -275,7 +275,7 @@ def _read(source: RaySource, frame: int, mask, depth, slope, place, rng: Generat
     direction = cameras.unproject(pixel, clip.intrinsics[frame])
     at_depth = cameras.project(direction, clip.depth_intrinsics[frame])[0].astype(int)
     x, y = np.clip(at_depth, 0, np.array(depth.shape[::-1]) - 1).T
-    cell = feature_cell(row, features.shape[1]), feature_cell(column, features.shape[2])
+    cell = _cells(place, FEATURE_STRIDE_PX, features[frame])
     feature = np.rint(np.asarray(features[frame])[cell].astype(np.float32) * 127).astype(np.int8)
     flow, confidence, gap = _read_flow(source, frame, place, rng)
     measured = (
@@ -296,6 +296,11 @@ def _read_flow(source: RaySource, frame: int, place, rng: Generator):
     if not possible:
         return np.zeros((len(place), 2)), np.zeros(len(place), np.uint8), np.ones(len(place), np.int8)
     gap, forward, confidence = possible[rng.integers(len(possible))]
-    cell = flow_cell(place[:, 0], forward.shape[1]), flow_cell(place[:, 1], forward.shape[2])
+    cell = _cells(place, FLOW_STRIDE_PX, forward[frame])
     found = np.asarray(forward[frame])[cell].astype(np.float64)
     return found, np.asarray(confidence[frame])[cell], np.full(len(place), gap, np.int8)
+
+
+def _cells(place, stride_px: int, grid) -> tuple[Int[np.ndarray, "pixel"], ...]:
+    """Return the cells of a grid that hold pixels (row, column); the last ones take the rest."""
+    return tuple(np.minimum(place // stride_px, np.array(grid.shape[:2]) - 1).T)

@@ -107,11 +107,6 @@ def scene_surface(problem: Problem) -> Mesh:
     return marching_cubes.keep_vertices(mesh, np.isfinite(near))
 
 
-def agent_surface(problem: Problem, step_m: float = AGENT_STEP_M) -> Mesh:
-    """Return the agent's closed surface at rest, agent frame, metres, at a resolution of ``step_m``."""
-    return marching_cubes.extract_agent(problem.agent, step_m)
-
-
 @torch.no_grad()
 def measured_points(problem: Problem) -> Float[np.ndarray, "point 3"]:
     """Return a subsample of the measured points of the scene, world, metres."""
@@ -193,7 +188,7 @@ def write(
         path = folder / id / "motion.npz" if id in sessions else folder / "templates" / f"{id}.npz"
         path.parent.mkdir(exist_ok=True)
         motion.save(path, of_video)
-    agent = agent_surface(problem)
+    agent = marching_cubes.extract_agent(problem.agent, AGENT_STEP_M)
     ply.write_ply(folder / "scene.ply", scene_surface(problem))
     ply.write_ply(folder / "agent.ply", agent)
     body, skin = reconstruction.body, skin_weights(problem, agent)

@@ -10,6 +10,7 @@ from pipeline.data.qa import Check, Picture, captioned
 from pipeline.geometry import rigid, views
 from pipeline.geometry.meshes import RayCaster, render_view
 from pipeline.mapping.picture_agreement import MIN_PAIRS
+from pipeline.metrics.intervals import finite
 from stages.register_videos.comparison import AnimalSize
 from stages.register_videos.registration import Maps, Registered, Rejected
 
@@ -44,19 +45,14 @@ def status(
     placed = result.agent_confidence[result.roots.visible]
     figures |= {
         "votes_agreeing": int(result.inliers.sum()),
-        "depth_gap_m": _finite(result.aligned.median_gap_m),
-        "depth_fit": _finite(result.aligned.median_fit),
+        "depth_gap_m": finite(result.aligned.median_gap_m),
+        "depth_fit": finite(result.aligned.median_fit),
         "appearance": result.appearance,
         "confidence": float(result.confidence.mean()),
         "agent_frames": len(placed),
         "agent_confidence": float(placed.mean()) if len(placed) else 0.0,
     }
     return {"registered": True, "reason": None, "nearest_view": nearest, "figures": figures}
-
-
-def _finite(figure):
-    """Return a JSON value, None for NaN."""
-    return figure if np.isfinite(figure) else None
 
 
 def nearest_frame(walk: Float[np.ndarray, "walk 4 4"], world_from_camera: Float[np.ndarray, "4 4"]) -> int:
@@ -71,12 +67,12 @@ def checks(result: Registered | Rejected) -> list[Check]:
         return [Check("registered", 0.0, "", 0.5, 0.5, "higher")]
     agreeing = float(result.inliers.mean()) if len(result.inliers) else None
     roots = result.roots.world_from_agent
-    gap_cm = _finite(result.aligned.median_gap_m * 100)
+    gap_cm = finite(result.aligned.median_gap_m * 100)
     return [
         Check("registered", 1.0, "", 0.5, 0.5, "higher"),
         Check("frame votes that agree", agreeing, "share", 0.5, 0.25, "higher"),
         Check("depth against the template", gap_cm, "cm, median", 2.5, 6.0),
-        Check("static depth within 5 cm", _finite(result.aligned.median_fit), "share", 0.6, 0.35, "higher"),
+        Check("static depth within 5 cm", finite(result.aligned.median_fit), "share", 0.6, 0.35, "higher"),
         Check("appearance of frames and renderings", result.appearance, "share", 0.5, None, "higher"),
         Check("camera confidence", float(result.confidence.mean()), "mean probability", 0.6, 0.2, "higher"),
         Check("animal placed", float(result.roots.visible.mean()), "share of frames", 0.4, None, "higher"),

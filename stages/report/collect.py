@@ -5,7 +5,7 @@
 
 import base64
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
@@ -128,10 +128,14 @@ def read_chapter(
     def blurred(file: str) -> bool:
         return safe and not any(fnmatch(Path(file).stem, name) for name in chapter.nobody_in)
 
-    notes = [
-        _note(video, labels.get(video or "", RecordingLabel()), folders[video], qa, shrink, blurred)
-        for video, qa in raw.items()
-    ]
+    notes = []
+    for video, qa in raw.items():
+        pictures = [
+            _picture(folders[video] / entry["file"], entry["caption"], shrink, blurred(entry["file"]))
+            for entry in qa["pictures"]
+        ]
+        label = labels.get(video or "", RecordingLabel())
+        notes.append(Note(video, label, qa["status"], qa["good"], qa["bad"], qa["checks"], pictures))
     depends_on = frozenset(name.partition("/")[0] for manifest in manifests for name in manifest["inputs"])
     return ChapterReport(chapter, notes, dict(manifests[0]["config"]) if manifests else {}, depends_on)
 
@@ -164,21 +168,6 @@ def _read(folder: Path) -> dict[str, Any]:
     if path.exists():
         return json.loads(path.read_bytes())
     return {"status": "none", "good": "", "bad": "", "checks": [], "pictures": []}
-
-
-def _note(
-    video: str | None,
-    label: RecordingLabel,
-    folder: Path,
-    qa: dict[str, Any],
-    shrink: float,
-    blurred: Callable[[str], bool],
-) -> Note:
-    pictures = [
-        _picture(folder / entry["file"], entry["caption"], shrink, blurred(entry["file"]))
-        for entry in qa["pictures"]
-    ]
-    return Note(video, label, qa["status"], qa["good"], qa["bad"], qa["checks"], pictures)
 
 
 def _picture(path: Path, caption: str, shrink: float, blurred: bool) -> EmbeddedPicture:

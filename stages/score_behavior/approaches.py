@@ -10,15 +10,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.baselines.predictors import WINDOWS_AT_ONCE, Ats
-from pipeline.behavior.config import PlanSamplingConfig
-from pipeline.behavior.perception import FeatureVolume, world_from_ego
-from pipeline.behavior.planning import observe
+from pipeline.baselines.predictors import Ats
+from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import RATE_HZ, BehaviorData, Context
 from pipeline.core.errors import InputError
 from pipeline.data import npz
-from pipeline.geometry import rigid
 from pipeline.metrics.flight import flees
 
 TRUE = ("true", "true_standing")
@@ -68,28 +65,11 @@ def flight_shares(
         context = Context(
             recorded.world_from_agent[twin, :, :past], recorded.agent_from_bone[twin], recorded.observer[twin]
         )
-        fled = _flight_shares(ats, context, samplings, count, seed)
-        root = recorded.world_from_agent[twin, :, :, :3, 3]
-        true = flees(root[:, past:], root[:, past - 1], recorded.observer[twin, :, -1]).astype(float)
-        found |= {f"flees/{name}": share for name, share in fled.items()} | {f"flees/{TRUE[twin]}": true}
+        root, person = recorded.world_from_agent[twin, :, :, :3, 3], recorded.observer[twin, :, -1]
+        for name, sampling in samplings.items():  # with the same noise
+            path = replace(ats, sampling=sampling).paths(context, count, np.random.default_rng(seed)).path
+            assert path is not None, "a behaviour model samples paths"
+            now, seen = (np.repeat(each[:, None], count, axis=1) for each in (root[:, past - 1], person))
+            found[f"flees/{name}"] = flees(path, now, seen).mean(1)
+        found[f"flees/{TRUE[twin]}"] = flees(root[:, past:], root[:, past - 1], person).astype(float)
     return found
-
-
-def _flight_shares(
-    ats: Ats, context: Context, samplings: dict[str, PlanSamplingConfig], count: int, seed: int
-) -> dict[str, Float[np.ndarray, "approach"]]:
-    """Return per approach the share of plans that flee, by sampling settings, with the same noise."""
-    rngs = {name: np.random.default_rng(seed) for name in samplings}
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in samplings}
-    for begin in range(0, len(context), WINDOWS_AT_ONCE):
-        some = context[begin : begin + WINDOWS_AT_ONCE]
-        observation = observe(some, ats.volume, ats.agent_from_bone_rest, ats.ego)
-        frame = np.repeat(world_from_ego(some.world_from_agent[:, -1], ats.ego), count, axis=0)
-        now, person = some.world_from_agent[:, -1:, :3, 3], some.observer_world[:, -1:]
-        for name, sampling in samplings.items():
-            sampled = ats.sampler.plan_paths(observation, sampling, rngs[name], count=count)
-            path = rigid.apply(frame, sampled).reshape(len(some), count, -1, 3)
-            parts[name].append(
-                flees(path, np.repeat(now, count, axis=1), np.repeat(person, count, axis=1)).mean(1)
-            )
-    return {name: np.concatenate(each) for name, each in parts.items()}

@@ -13,7 +13,6 @@ from jaxtyping import Float, Int, Shaped
 from pipeline.baselines.predictors import Ats, Samples
 from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
 from pipeline.behavior.perception import world_from_ego
-from pipeline.behavior.planning import observe
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import TEST, BehaviorData, Context, Future
 from pipeline.geometry import rigid
@@ -86,9 +85,7 @@ def _fed(
 ) -> Samples:
     frame = world_from_ego(context.world_from_agent[:, -1], ats.ego)
     true = rigid.apply(rigid.inverse(frame), path_world)
-    codes = ats.sampler.codes(
-        observe(context, ats.volume, ats.agent_from_bone_rest, ats.ego), ats.sampling, count
-    )
+    codes = ats.sampler.codes(ats.observe(context), ats.sampling, count)
     world = np.repeat(frame, count, axis=0)
     paths = ats.sampler.paths(codes, np.repeat(true[:, -1], count, axis=0), ats.sampling, rng)
     bodies = ats.sampler.bodies(codes, np.repeat(true, count, axis=0), ats.sampling, rng)

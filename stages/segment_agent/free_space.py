@@ -32,7 +32,7 @@ MAX_NOISE_M = 0.15
 MIN_PAIRS, MAD_TO_SIGMA, MIN_NOISE_M = 200, 1.48, 0.002
 """differences required per range bin, MAD to sigma, and the least deviation of any sensor"""
 BLUR_PX = 1.2
-"""standard deviation of the blur before colours are compared"""
+"""standard deviation of the blur before colours are compared, so that small pose errors are tolerated"""
 INNER_WIDTH_PX = 320
 """picture width per pixel of window radius for `interior_depth`; narrower pictures are phones', whose
 confidence marks steps"""
@@ -130,7 +130,9 @@ def gather(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], count:
     """Read the ``count`` depth pictures that vote."""
     frames = subsampling.evenly(len(clip), count, rounded=True)
     depth = np.stack([clean_depth(clip, frame) for frame in frames])
-    color = np.stack([blurred_color(clip.color(frame), clip.depth_size) for frame in frames])
+    size = clip.depth_size[::-1]
+    small = (cv2.resize(clip.color(frame), size, interpolation=cv2.INTER_AREA) for frame in frames)
+    color = np.stack([cv2.GaussianBlur(each, (5, 5), BLUR_PX) for each in small])
     camera_from_world, pinhole = rigid.inverse(world_from_camera[frames]), clip.depth_intrinsics[frames]
     noise = measure_noise(depth, camera_from_world, pinhole)
     return References(camera_from_world, pinhole, depth, _min_filter(depth, pinhole), color, frames, noise)
@@ -184,13 +186,6 @@ def masked(references: References, hidden: Callable[[int], Bool[np.ndarray, "hei
         forgotten = cv2.resize(hidden(int(frame)).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         picture[forgotten > 0] = 0
     return replace(references, depth=depth, nearest=_min_filter(depth, references.intrinsics))
-
-
-def blurred_color(
-    color: UInt8[np.ndarray, "height width 3"], size: tuple[int, int]
-) -> UInt8[np.ndarray, "new_height new_width 3"]:
-    """Resize to (height, width) and blur, so that colour comparison tolerates small pose errors."""
-    return cv2.GaussianBlur(cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA), (5, 5), BLUR_PX)
 
 
 def vote(

@@ -1,7 +1,6 @@
 """Files of a long-term take: motion, animated surface, frames for a video, plausibility metrics."""
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from pipeline.longterm.contacts import motion_tensors
 from pipeline.longterm.journeys import Journey
 from pipeline.longterm.plausibility import Plausibility
 from pipeline.longterm.short_motions import RATE_HZ, BodyMotion
+from pipeline.metrics.intervals import finite
 
 FOCAL = 0.9
 """Focal length of the frames in units of their width."""
@@ -61,7 +61,10 @@ def write_journey(folder: Path, journey: Journey, body: SkinnedBody) -> None:
 
 def write_metrics(folder: Path, before: Plausibility, after: Plausibility, **about: object) -> None:
     """Write `take.json`: a description of the take, and its plausibility before and after optimisation."""
-    metrics = {"before": _finite(before), "after": _finite(after)}
+    metrics = {
+        when: {name: finite(value) for name, value in vars(each).items()}
+        for when, each in (("before", before), ("after", after))
+    }
     (folder / "take.json").write_text(json.dumps({**about, **metrics}, indent=1, allow_nan=False) + "\n")
 
 
@@ -126,7 +129,3 @@ def fit_skin(body: SkinnedBody, agent_from_bone: Float[np.ndarray, "frame bone 4
     poses = weight_refit.Poses(some @ rigid.inverse(rest), posed)
     shape = SkinnedShape(np.asarray(body.mesh.vertices, np.float64), body.weights, rest)
     return weight_refit.refit_weights(shape, poses)
-
-
-def _finite(metrics: Plausibility) -> dict[str, float | None]:
-    return {name: value if np.isfinite(value) else None for name, value in asdict(metrics).items()}

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from pipeline.data import plots
 from pipeline.data.qa import Check, Picture
@@ -13,19 +13,12 @@ PLATEAU_SLOPE = 0.05
 
 
 def pictures(curves: Mapping[str, Mapping[str, Float[np.ndarray, "seed step"]]]) -> list[Picture]:
-    """Draw the losses of all trials."""
+    """Draw the losses of all trials: one panel per network, one colour per method, one line per seed."""
     caption = (
         "Losses of all trials, smoothed over a fiftieth; the Gaussian's are likelihoods and lie elsewhere."
     )
-    return [Picture("learning_curves", learning_curves(curves), caption)]
-
-
-def learning_curves(
-    curves: Mapping[str, Mapping[str, Float[np.ndarray, "seed step"]]],
-) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw one panel per network, one colour per method, one line per seed."""
     of_term = {term: {name: terms[term] for name, terms in curves.items() if term in terms} for term in TERMS}
-    return plots.loss_curves(of_term, width_in=12, log=False)
+    return [Picture("learning_curves", plots.loss_curves(of_term, width_in=12, log=False), caption)]
 
 
 def checks(figures: Mapping[str, float | None], ours: str) -> list[Check]:

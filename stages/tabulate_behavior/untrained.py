@@ -2,16 +2,10 @@
 
 import numpy as np
 
-from pipeline.baselines.predictors import ConstantVelocity, LocationPrior, StandStill
+from pipeline.baselines.predictors import BASELINES, Predictor
 from pipeline.behavior.trajectories import TRAIN, BehaviorData
 from pipeline.metrics.scores import GOAL_SCORES, PLAN_SCORES, SCORES
 from stages.tabulate_behavior.reading import MethodScores
-
-BASELINES = {
-    "location_prior": LocationPrior,
-    "stand_still": StandStill,
-    "constant_velocity": ConstantVelocity,
-}
 
 SAMPLES = 16
 """Samples per window (K), as many as `score_behavior` draws."""
@@ -33,12 +27,7 @@ def scores(
 
 
 def _scores(
-    method: LocationPrior | StandStill | ConstantVelocity,
-    data: BehaviorData,
-    like: MethodScores,
-    samples: int,
-    trials: int,
-    seed: int,
+    method: Predictor, data: BehaviorData, like: MethodScores, samples: int, trials: int, seed: int
 ) -> MethodScores:
     rng, found = np.random.default_rng(seed), {}
     for windows, names in ((like.goal_window, GOAL_SCORES), (like.plan_window, PLAN_SCORES)):

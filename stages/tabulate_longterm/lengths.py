@@ -9,6 +9,7 @@ from pipeline.longterm.contacts import motion_tensors
 from pipeline.longterm.journeys import travel
 from pipeline.longterm.short_motions import RATE_HZ
 from pipeline.longterm.subgoals import sample_visited_subgoals
+from pipeline.metrics.intervals import finite
 from stages.tabulate_longterm.config import Config
 from stages.tabulate_longterm.reading import MotionSource
 
@@ -52,6 +53,4 @@ def figures(source: MotionSource, config: Config) -> dict[str, float | None]:
         "slide_before_m_s": made.before.slide_m_s,
         "subgoal_error_m": float(subgoal_error.max()),
     }
-    return {
-        f"longterm_minutes/{name}": value if np.isfinite(value) else None for name, value in found.items()
-    }
+    return {f"longterm_minutes/{name}": finite(value) for name, value in found.items()}

@@ -7,7 +7,6 @@ from torch import Tensor
 from pipeline.geometry import rigid_torch
 from pipeline.geometry.signed_distance import SignedDistance
 from pipeline.longterm.bodies import LEVER_M, PosedSurface, PoseSpace
-from pipeline.longterm.contacts import ContactVertices
 from pipeline.longterm.motion_optimization import collision_error, contact_error
 from pipeline.longterm.networks import ROOT_CHANNELS
 
@@ -60,7 +59,6 @@ def scene_errors(
     vertices: Float[Tensor, "batch vertex 3"],
     scene: Int[Tensor, "batch"],
     scenes: list[SignedDistance],
-    contacts: ContactVertices,
     count: int,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """Return mean collision error (metres) and contact error of bodies; ``scene`` is the scene index of each.

@@ -54,11 +54,6 @@ class PersonRecording:
     world_from_scan: Float[np.ndarray, "4 4"]
 
 
-def is_prox(folder: Path) -> bool:
-    """Return whether a folder is laid out as PROX."""
-    return (folder / FITS).is_dir()
-
-
 def read(model: Path, folder: Path) -> tuple[Person, list[PersonRecording], dict[str, MotionScene]]:
     """Read all recordings and their scenes; the first person's shape is used for everyone.
 

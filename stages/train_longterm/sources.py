@@ -35,7 +35,7 @@ def people(model: Path, folder: Path) -> DatasetSplit:
     folder in PROX's layout is read by `prox`. Raises InputError LTM-001 without motion, LTM-003 and LTM-004
     without SMPL-X, LTM-005 for damaged PROX data.
     """
-    if prox.is_prox(folder):
+    if (folder / prox.FITS).is_dir():
         return _in_scans(model, folder)
     files = sorted(folder.glob("*.npz"))
     if not files:

@@ -207,7 +207,7 @@ def fit_body(
             true_mesh = objectives.posed_vertices(truth, frames[index], poses, surface)
         shift, turn = objectives.route_error(made, truth)
         pose = objectives.pose_error(made[..., ROOT_CHANNELS:], truth[..., ROOT_CHANNELS:], basis_m)
-        collision, contact = objectives.scene_errors(mesh, scene[index], distances, contacts, len(chosen))
+        collision, contact = objectives.scene_errors(mesh, scene[index], distances, len(chosen))
         return {
             "root": w.translation * shift + w.rotation * turn,
             "pose": w.pose * pose,

@@ -4,26 +4,20 @@ A user's box or click replaces the detector. Masks are generated lazily; those b
 stored compressed, so that memory hardly grows with the recording.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.backends.grounding_dino import GroundingDino
+from pipeline.backends.sam2 import Sam2
 from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip
 from pipeline.geometry import subsampling
 from stages.segment_agent.config import FoundationConfig
 from stages.segment_agent.prompts import Prompt
 from stages.segment_agent.segmenter import Mask
-
-if TYPE_CHECKING:
-    from pipeline.backends.grounding_dino import GroundingDino
-    from pipeline.backends.sam2 import Sam2
-
 
 LOOKED_AT = 16
 """number of frames given to the detector"""
@@ -33,18 +27,17 @@ UNSURE = 1.0
 
 def segment(clip: Clip, prompt: Prompt | None, options: FoundationConfig, device: str) -> Iterator[Mask]:
     """Yield one mask per frame. Raises MSK-004 if the animal is not found, MOD-001..003 without models."""
-    from pipeline.backends.grounding_dino import GroundingDino
-    from pipeline.backends.sam2 import Sam2
-
     tracker = Sam2(options.tracker, device)
     if prompt is None:
         frame, box_px = _find(clip, GroundingDino(options.detector, device), options)
     else:
         frame, box_px = prompt.frame, widened(prompt, clip.color_size)
-    return _follow(clip, tracker, frame, box_px, options)
+    return _follow(clip, tracker, frame, box_px)
 
 
-def _find(clip: Clip, detector: GroundingDino, options: FoundationConfig) -> tuple[int, Float[np.ndarray, 4]]:
+def _find(
+    clip: Clip, detector: GroundingDino, options: FoundationConfig
+) -> tuple[int, Float[np.ndarray, "4"]]:
     """Return the frame and box (x0, y0, x1, y1, pixels) of the detection with the highest score."""
     best: tuple[float, int, np.ndarray] | None = None
     for frame in subsampling.evenly(len(clip), LOOKED_AT, rounded=True).tolist():
@@ -59,7 +52,7 @@ def _find(clip: Clip, detector: GroundingDino, options: FoundationConfig) -> tup
     return best[1], best[2]
 
 
-def widened(prompt: Prompt, size: tuple[int, int], least: float = 0.04) -> Float[np.ndarray, 4]:
+def widened(prompt: Prompt, size: tuple[int, int], least: float = 0.04) -> Float[np.ndarray, "4"]:
     """Return the box of a prompt (x0, y0, x1, y1, pixels), enlarged to a minimum size around a click."""
     x0, y0, x1, y1 = prompt.box_px
     grow = np.maximum(least * max(size) - np.array([x1 - x0, y1 - y0]), 0) / 2
@@ -67,9 +60,7 @@ def widened(prompt: Prompt, size: tuple[int, int], least: float = 0.04) -> Float
     return np.concatenate([np.maximum(low, 0), np.minimum(high, size[::-1])])
 
 
-def _follow(
-    clip: Clip, tracker: Sam2, start: int, box_px: Float[np.ndarray, 4], options: FoundationConfig
-) -> Iterator[Mask]:
+def _follow(clip: Clip, tracker: Sam2, start: int, box_px: Float[np.ndarray, "4"]) -> Iterator[Mask]:
     before: list[tuple[bytes, bool, float]] = []
     for log_odds, presence in tracker.track(clip.color, range(start, -1, -1), box_px):
         mask = labelled(log_odds, presence, UNSURE)

@@ -179,7 +179,7 @@ def test_planned_legs_avoid_the_block_and_keep_the_duration(dataset, model):
         Subgoal(np.array([1.2, np.nan, 0.0]), np.pi, 20.0),
         Subgoal(np.array([0.0, 0.7, 0.0])),
     ]
-    places = plan_waypoints(None, ends, dataset.scenes[0], model.motion_prior)
+    places = plan_waypoints(ends, dataset.scenes[0], model.motion_prior)
     where = places.world_from_agent[:, :3, 3]
     np.testing.assert_allclose(
         where[places.subgoal], [[-1.2, strider.HIP_M, 0], [1.2, strider.HIP_M, 0], [0, 0.7, 0]], atol=0.01
@@ -207,7 +207,6 @@ def test_sub_goals_near_the_block_are_moved_to_free_space_and_legs_pass_it(datas
         > np.abs(floor.nearest_turning_place(np.array([0.1, root_m, 0.0]))[[0, 2]]).max()
     ), "a leap needs more room"
     places = plan_waypoints(
-        None,
         [Subgoal(np.array([-0.75, np.nan, 0.0])), Subgoal(np.array([0.75, np.nan, 0.0]))],
         dataset.scenes[0],
         model.motion_prior,
@@ -238,7 +237,7 @@ def test_resting_body_turns_around_in_two_legs(dataset, model):
     goals = [
         Subgoal(np.array([x, np.nan, 1.2]), time_s=t) for x, t in ((-1.0, None), (1.0, 20.0), (-1.0, None))
     ]
-    ahead = plan_waypoints(None, goals, dataset.scenes[0], model.motion_prior).world_from_agent[:, :3, 2]
+    ahead = plan_waypoints(goals, dataset.scenes[0], model.motion_prior).world_from_agent[:, :3, 2]
     assert np.degrees(np.arccos(np.clip((ahead[1:] * ahead[:-1]).sum(1), -1, 1))).max() < 100
 
 
@@ -254,7 +253,7 @@ def test_preferred_places_are_recorded_places():
 def test_sub_goals_are_placed_on_furniture_and_floor(dataset, model):
     """The block of the room is 0.5 m high."""
     goals = [Subgoal(np.array(place)) for place in ([-1.2, np.nan, 0.0], [0.0, 0.45, 0.0], [1.2, 0.9, 0.0])]
-    where = plan_waypoints(None, goals, dataset.scenes[0], model.motion_prior)
+    where = plan_waypoints(goals, dataset.scenes[0], model.motion_prior)
     top, floor = where.world_from_agent[where.subgoal[1:], :3, 3]
     assert top[1] == pytest.approx(0.5 + strider.HIP_M, abs=0.04)
     np.testing.assert_allclose(floor, [1.2, strider.HIP_M, 0.0], atol=0.01)
@@ -262,7 +261,6 @@ def test_sub_goals_are_placed_on_furniture_and_floor(dataset, model):
 
 def test_long_motion_passes_its_waypoints(dataset, model):
     places = plan_waypoints(
-        None,
         [Subgoal(np.array([-1.2, np.nan, -1.0])), Subgoal(np.array([1.2, np.nan, 1.0]))],
         dataset.scenes[0],
         model.motion_prior,
@@ -281,7 +279,7 @@ def test_bodies_of_passed_waypoints_are_generated_and_others_kept(dataset, model
         Subgoal(np.array([1.2, np.nan, -1.0]), time_s=30.0),
         Subgoal(np.array([1.2, np.nan, 1.0])),
     ]
-    places = plan_waypoints(None, ends, dataset.scenes[0], model.motion_prior)
+    places = plan_waypoints(ends, dataset.scenes[0], model.motion_prior)
     given, drawn = (
         model.long_motion(
             places.world_from_agent, dataset.body, dataset.scenes[0], np.random.default_rng(0), stops=stops

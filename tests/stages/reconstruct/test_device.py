@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.fields import fields
+from pipeline.fields import fields, marching_cubes
 from pipeline.fields.fields import Reconstruction
 from pipeline.fields.render import Renderer, render_depth
 from stages.reconstruct import assemble, optimise, results
@@ -38,7 +38,7 @@ def test_all_phases_run_on_another_device(form, tmp_path):
         assert all(is_on_device(value) for table in tables for value in vars(table).values())
         motion = results.motions(problem, videos, 0.75)["v002"]
         assert len(results.scene_surface(problem).vertices) >= 0
-        agent = results.agent_surface(problem, 0.04)
+        agent = marching_cubes.extract_agent(problem.agent, 0.04)
         assert np.isfinite(results.skin_weights(problem, agent)).all()
         results.feature_volume(problem)
         reconstruction = Reconstruction(

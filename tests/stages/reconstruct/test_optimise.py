@@ -7,7 +7,7 @@ import pytest
 import torch
 import trimesh
 
-from pipeline.fields import fields
+from pipeline.fields import fields, marching_cubes
 from pipeline.fields.fields import Field, FieldShape, Reconstruction
 from pipeline.fields.fused_depth import FusedGeometry
 from pipeline.geometry import cameras, rigid, rigid_torch
@@ -150,7 +150,7 @@ def test_room_and_ball_are_reconstructed(solved):
     with torch.no_grad():
         assert (found.scene(centre, code).signed_distance > 0.05).all(), "the middle of the room is free"
         assert (found.scene(wall, code).signed_distance.abs() < 0.05).all(), "metres; cells are 0.2 m"
-    ball = results.agent_surface(found, 0.04)
+    ball = marching_cubes.extract_agent(found.agent, 0.04)
     assert np.abs(np.linalg.norm(ball.vertices, axis=-1) - RADIUS_M).mean() < 0.02
 
 

@@ -90,10 +90,7 @@ def test_body_in_the_block_collides_and_body_in_the_air_has_no_contact(dataset, 
         frame[0, :3, 3] = torch.tensor(place)
         mesh = objectives.posed_vertices(upright, frame, model.poses, surface)
         errors[name] = [
-            float(e)
-            for e in objectives.scene_errors(
-                mesh, torch.zeros(1, dtype=torch.long), distance, model.contacts, 40
-            )
+            float(e) for e in objectives.scene_errors(mesh, torch.zeros(1, dtype=torch.long), distance, 40)
         ]
     assert errors["inside"][0] > 0.05 > errors["stands"][0] > -1e-6
     assert errors["floats"][0] == 0
