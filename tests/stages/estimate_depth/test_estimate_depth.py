@@ -62,7 +62,7 @@ def test_session_is_registered_and_its_animal_is_on_the_floor(mapped, tmp_path):
 
 @pytest.mark.slow
 def test_turnaround_has_multi_view_depth(mapped, tmp_path):
-    path, agent = filmed_room.circle(40)
+    path, agent = filmed_room.circle(28)
     clip, kept, depth, masks = estimate(mapped, tmp_path, path, agent, "turnaround")
     check_cameras(clip, path[kept])
     off, known = [], []
