@@ -13,8 +13,8 @@ from pipeline.workflow import dag
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
-BLOCK = re.compile(r"^```\n(.*?)^```", re.MULTILINE | re.DOTALL)
-AGENTS = {path.stem for path in (ROOT / "agents").glob("*.toml")} | {"luna"}
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+AGENTS = {path.stem for path in (ROOT / "agents").glob("*.toml")} | {"luna", "hen", "toy_plain"}
 TARGETS = set(re.search(r"^COMMANDS := (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)[1].split())
 
 
@@ -22,8 +22,8 @@ def commands() -> list[tuple[str, str]]:
     """Return every command line in the code blocks."""
     found = []
     for page in PAGES:
-        for block in BLOCK.findall(page.read_text()):
-            lines = (line.partition("#")[0].strip() for line in block.splitlines())
+        for language, block in BLOCK.findall(page.read_text()):
+            lines = (line.partition("#")[0].strip() for line in block.splitlines() if not language)
             found += [
                 (page.name, line)
                 for line in lines
