@@ -40,12 +40,12 @@ def approach(outcome: StepOutcome) -> Float[np.ndarray, "person"]:
 
 
 def follow(outcome: StepOutcome) -> Float[np.ndarray, "person"]:
-    """Reward keeping a distance of 1.2 m, 0..1."""
+    """Return minus the deviation of the distance from 1.2 m, meters."""
     return -np.abs(outcome.distance_m - FOLLOW_M)
 
 
 def calm(outcome: StepOutcome) -> Float[np.ndarray, "person"]:
-    """Reward an animal that rests."""
+    """Return minus the animal's speed, meters per second."""
     return -outcome.animal_speed_m_s
 
 
