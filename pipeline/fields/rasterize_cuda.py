@@ -22,7 +22,7 @@ class Gsplat:
                 "DEP-001",
                 what="gsplat is not installed",
                 where="rasterizer gsplat",
-                remedy='install the extra `cuda`, or set backend = "tiles"',
+                remedy='pip install gsplat, or set backend = "tiles"',
             ) from error
         if not torch.cuda.is_available():
             raise InputError(
