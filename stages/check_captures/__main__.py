@@ -1,4 +1,4 @@
-"""Check recordings before a build, in under a minute each: what it is, how good, what to do better.
+"""Check recordings before a build, up to a minute per file: what it is, how good, what to do better.
 
 It has a command line of its own because it makes no artifact and runs before there is a plan.
 
