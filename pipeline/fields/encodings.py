@@ -55,7 +55,7 @@ class DenseGrid(nn.Module):
 
 
 class PositionalMLP(nn.Module):
-    """An MLP on the positional encoding of points, from the box's size to 2 ``finest_m`` (001, Sec. 3.1)."""
+    """An MLP on the positional encoding of points, from the box's size to 2 ``finest_m`` (ATS, Sec. 3.1)."""
 
     middle: Float[Tensor, "3"]
     frequency: Float[Tensor, "octave"]

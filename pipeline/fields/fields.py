@@ -1,4 +1,4 @@
-"""The canonical structure T: neural fields of the scene and the agent (paper 001, Eqs. 1-2).
+"""The canonical structure T: neural fields of the scene and the agent (ATS, Eqs. 1-2).
 
 `Field` maps points to signed distance, color and feature: a multi-resolution dense grid or an MLP with
 positional encoding, and two small heads, with a learnable code per video for the scene. Where geometry was
@@ -93,7 +93,7 @@ def make_encoding(shape: FieldShape) -> DenseGrid | PositionalMLP:
 
 
 class Field(nn.Module):
-    """Signed distance, color and feature at points (paper 001, Eqs. 1 and 2)."""
+    """Signed distance, color and feature at points (ATS, Eqs. 1 and 2)."""
 
     def __init__(self, shape: FieldShape, free_m: float, fused: FusedGeometry | None = None):
         """``free_m`` is the signed distance that an untrained field gives where nothing is fused."""
@@ -241,7 +241,7 @@ def density(
 
 
 class ArticulatedBody(nn.Module):
-    """The agent's 25 Gaussian bones at rest and the skinning weights they give (paper 001, Eq. 3)."""
+    """The agent's 25 Gaussian bones at rest and the skinning weights they give (ATS, Eq. 3)."""
 
     agent_from_bone_rest: Float[Tensor, "bone 4 4"]
 

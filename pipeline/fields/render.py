@@ -76,7 +76,7 @@ class Rendered:
 def ray_weights(
     depth_m: Float[Tensor, "ray sample"], length: Float[Tensor, "ray"], density: Float[Tensor, "ray sample"]
 ) -> Float[Tensor, "ray sample"]:
-    """Return the weight of each sample in the rendering integral (paper 001, Eq. 15); arguments as
+    """Return the weight of each sample in the rendering integral (ATS, Eq. 15); arguments as
     `composite`'s.
 
     Each sample represents the interval up to halfway to its neighbours.
@@ -124,7 +124,7 @@ def composite(
     scene: Layer,
     agent: Layer | None = None,
 ) -> Rendered:
-    """Integrate the fields of scene and agent along rays (paper 001, Eqs. 14-15).
+    """Integrate the fields of scene and agent along rays (ATS, Eqs. 14-15).
 
     Args:
         depth_m: z of the samples, increasing.
@@ -158,7 +158,7 @@ def render_depth(
     agent_from_bone: Float[np.ndarray, "bone 4 4"] | None = None,
     samples: int = 128,
 ) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
-    """Render depth from the fields by volume rendering, as DepthAcc of the paper is measured (paper 001,
+    """Render depth from the fields by volume rendering, as DepthAcc of the paper is measured (ATS,
     A.1).
 
     Unlike `Renderer`, no surface is extracted: even samples up to ``farthest_m`` along z and as many

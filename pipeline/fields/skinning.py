@@ -43,7 +43,7 @@ def skinning_weights(
     bone_scale_m: Float[Tensor, "bone 3"],
     delta: Float[Tensor, "*#batch point bone"] | None = None,
 ) -> Float[Tensor, "*#batch point bone"]:
-    """Return the probability of each bone for each point (paper 001, Sec. 3.1).
+    """Return the probability of each bone for each point (ATS, Sec. 3.1).
 
     Args:
         points_agent: points in the agent frame, in metres.

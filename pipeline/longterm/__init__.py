@@ -1,1 +1,1 @@
-"""Long-term motion in 3D scenes (paper 002): networks, synthesis and physical optimization."""
+"""Long-term motion in 3D scenes (LTM): networks, synthesis and physical optimization."""

@@ -1,4 +1,4 @@
-"""Networks of long-term motion: static bodies, routes between them, poses along routes (paper 002, Sec. 3).
+"""Networks of long-term motion: static bodies, routes between them, poses along routes (LTM, Sec. 3).
 
 Inputs and outputs are in a clip's frame, +y up: `t` is the root's position in metres, `r` its rotation in 6D
 (first two columns), `p` the pose in `pipeline.longterm.bodies.PoseSpace`. RouteNet, PoseNet and BaseNet

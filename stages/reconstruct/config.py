@@ -40,7 +40,7 @@ class SceneFusion:
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weight of each loss after averaging over its elements (paper 001, Eq. 6)."""
+    """Weight of each loss after averaging over its elements (ATS, Eq. 6)."""
 
     distance: float = 1.0
     """signed distance of the scene at and near measured depth"""

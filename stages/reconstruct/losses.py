@@ -1,4 +1,4 @@
-"""Losses of the reconstruction, per element and unweighted (paper 001, Eq. 6 and the terms after it).
+"""Losses of the reconstruction, per element and unweighted (ATS, Eq. 6 and the terms after it).
 
 Weights are in the stage's configuration; `weighted` averages and weights the losses.
 """

@@ -37,14 +37,14 @@ DRIFT_WEIGHT, ANCHOR_WEIGHT, CAMERA_M = 0.1, 0.05, 0.01
 
 
 def swap_probability(progress: float, batches: RayBatches) -> float:
-    """Return the probability of code swaps, linear from first to last (paper 001, scene annealing)."""
+    """Return the probability of code swaps, linear from first to last (ATS, scene annealing)."""
     return batches.swap_first + (batches.swap_last - batches.swap_first) * progress
 
 
 def swap_codes(
     video: Int[Tensor, "ray"], videos: int, probability: float, generator: Generator
 ) -> Int[Tensor, "ray"]:
-    """Replace each code's index by a random one with some probability (paper 001, scene annealing).
+    """Replace each code's index by a random one with some probability (ATS, scene annealing).
 
     Without codes nothing changes.
     """
