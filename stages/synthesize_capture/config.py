@@ -17,7 +17,7 @@ class Config:
     session_s: float = 60.0
     """Length of a session, seconds."""
     test_session_s: float = 120.0
-    """Length of the last session, seconds: a minute holds too few windows of 5.6 s to compare methods."""
+    """Length of the last session, seconds: a minute holds too few windows of 6.4 s to compare methods."""
     walkthrough_s: float = 45.0
     """Length of the walk through the empty room, seconds."""
     turnaround_s: float = 20.0
