@@ -60,7 +60,7 @@ class Episodes:
     fled: Bool[np.ndarray, "episode"]
     seconds: Float[np.ndarray, "episode"]
     person_paths: Float[np.ndarray, "episode step 2"]
-    """Of the person, world x and z, metres; NaN after the episode has ended."""
+    """Of the person, world x and z, meters; NaN after the episode has ended."""
     animal_paths: Float[np.ndarray, "episode step 2"]
 
 

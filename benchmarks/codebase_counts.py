@@ -36,7 +36,7 @@ CALLS_WITH_NAMED_NUMBERS = ("Check", "qa.Check", "np.quantile", "np.percentile")
 SYNTHETIC = ("stages/synthesize_capture",)
 """Packages whose numbers are dimensions of the synthetic world."""
 PLOT_MODULES = ("pictures.py", "plots.py")
-"""Modules whose numbers are sizes, line widths and colours of plots."""
+"""Modules whose numbers are sizes, line widths and colors of plots."""
 ARRAYS = re.compile(r"\b(ndarray|Tensor)\b")
 SHAPED = re.compile(r"\b(Float|Int|UInt8|UInt|Bool|Shaped|Num|Inexact|Real|Complex|Int64|Float32|Float64)\[")
 

@@ -2,7 +2,7 @@
 
 `Sequence` reads a 7-Scenes style folder; `surfaces` finds walkable surfaces; `course` samples a trajectory on which
 the animal walks, rests, and enters and leaves the scene; `Compositor` renders each frame, with occlusion by the
-sequence's depth and with its measured noise and holes. World: that of the sequence, rotated so that +y is up, metres.
+sequence's depth and with its measured noise and holes. World: that of the sequence, rotated so that +y is up, meters.
 """
 
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ from stages.synthesize_capture import animal, gait, raster, shade
 from stages.synthesize_capture.session import STEP_S, AnimalCourse
 
 COLOR_FOCAL_PX, DEPTH_FOCAL_PX, BASELINE_M = 525.5, 585.0, 0.025
-"""Kinect v1 as measured on 7-Scenes: focal lengths of both cameras at 640 x 480, and the offset of the colour camera
+"""Kinect v1 as measured on 7-Scenes: focal lengths of both cameras at 640 x 480, and the offset of the color camera
 to the right"""
 PROJECTOR_BASELINE_M = 0.075
 """Kinect v1: from infrared projector to infrared camera; surfaces in the projector's shadow have no depth"""
@@ -37,17 +37,17 @@ ABSENT_M = 100.0
 
 @dataclass(frozen=True)
 class Sequence:
-    """A 7-Scenes style folder: colour, depth in metres (0 unknown), poses, one pinhole for both."""
+    """A 7-Scenes style folder: color, depth in meters (0 unknown), poses, one pinhole for both."""
 
     folder: Path
     numbers: tuple[int, ...]
     registered: bool
-    """Whether depth is reprojected into the colour camera; otherwise colour is only rescaled to the focal length of the
+    """Whether depth is reprojected into the color camera; otherwise color is only rescaled to the focal length of the
     depth camera."""
 
     @property
     def intrinsics(self) -> Float[np.ndarray, "3 3"]:
-        """Return the intrinsics shared by colour and depth, pixels."""
+        """Return the intrinsics shared by color and depth, pixels."""
         focal = COLOR_FOCAL_PX if self.registered else DEPTH_FOCAL_PX
         return np.array([[focal, 0, 320.0], [0, focal, 240.0], [0, 0, 1]])
 
@@ -61,7 +61,7 @@ class Sequence:
         return cv2.warpAffine(picture, matrix, (640, 480), flags=cv2.INTER_CUBIC)
 
     def depth(self, index: int) -> Float[np.ndarray, "height width"]:
-        """Read depth, metres."""
+        """Read depth, meters."""
         raw = (
             np.asarray(cv2.imread(str(self._path(index, "depth.png")), cv2.IMREAD_UNCHANGED), np.float32)
             / MILLIMETRES
@@ -107,15 +107,15 @@ class Noise:
     """Sensor noise measured on the sequence."""
 
     coefficients: Float[np.ndarray, "3"]
-    """Standard deviation of depth in metres as a polynomial of z in metres, constant last."""
+    """Standard deviation of depth in meters as a polynomial of z in meters, constant last."""
     shadow_side: int
     """Side of a nearer surface on which depth is missing (projector shadow): -1 left, 1 right."""
     color: float
-    """Standard deviation of the colour noise, 0..255."""
+    """Standard deviation of the color noise, 0..255."""
 
 
 def measure_noise(sequence: Sequence, frames: int = 12) -> Noise:
-    """Measure depth noise against local planes by range, the side of the projector shadow, and colour noise."""
+    """Measure depth noise against local planes by range, the side of the projector shadow, and color noise."""
     ranges, errors, sides, grain = [], [], np.zeros(2), []
     for index in np.linspace(0, len(sequence.numbers) - 1, frames).astype(int).tolist():
         depth = sequence.depth(index)
@@ -152,12 +152,12 @@ class Surface:
 
     height_m: float
     heights_m: Float[np.ndarray, "x z"]
-    """differ by pose errors of one to two centimetres, and because real tables are not exactly level"""
+    """differ by pose errors of one to two centimeters, and because real tables are not exactly level"""
     free: Bool[np.ndarray, "x z"]
     origin: Float[np.ndarray, "2"]
 
     def points(self) -> Float[np.ndarray, "cell 3"]:
-        """Return the free cells' centres, world."""
+        """Return the free cells' centers, world."""
         at = self.origin + (np.argwhere(self.free) + 0.5) * CELL_M
         return np.stack([at[:, 0], self.heights_m[self.free], at[:, 1]], axis=1)
 

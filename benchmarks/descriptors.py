@@ -4,7 +4,7 @@
 
 Pairs of overlapping views differ by 5 to 45 degrees: from a folder of RGB-D frames with poses (7-Scenes), unchanged
 and with the second view relit, and from different sessions of a finished build, whose light differs. The true match
-of a cell follows from depth and poses; it is found if the nearest neighbour among all cells of the other picture lies
+of a cell follows from depth and poses; it is found if the nearest neighbor among all cells of the other picture lies
 within one cell of it. Each descriptor is evaluated raw and reduced to the 16 channels that all stages use.
 """
 
@@ -37,16 +37,16 @@ Describe = Callable[[UInt8[np.ndarray, "height width 3"], int], Float[np.ndarray
 
 @dataclass(frozen=True)
 class View:
-    """A picture with its depth (metres, 0 unknown) and its camera."""
+    """A picture with its depth (meters, 0 unknown) and its camera."""
 
     color: UInt8[np.ndarray, "height width 3"]
     depth: Float[np.ndarray, "height width"]
     intrinsics: Float[np.ndarray, "3 3"]
-    """of the colour picture"""
+    """of the color picture"""
     world_from_camera: Float[np.ndarray, "4 4"]
 
     def depth_at(self, pixel: Float[np.ndarray, "point 2"]) -> Float[np.ndarray, "point"]:
-        """Read the depth at colour pixels; 0 outside."""
+        """Read the depth at color pixels; 0 outside."""
         size, inner = np.array(self.color.shape[1::-1]), np.array(self.depth.shape[::-1])
         inside = ((pixel >= 0) & (pixel < size)).all(-1)
         at = np.where(inside[:, None], pixel * inner / size, 0).astype(int)
@@ -54,7 +54,7 @@ class View:
 
 
 def rgbd_views(folder: Path) -> list[View]:
-    """Read frames in the 7-Scenes format; colour and depth share one camera."""
+    """Read frames in the 7-Scenes format; color and depth share one camera."""
     intrinsics, found = np.loadtxt(folder / "camera-intrinsics.txt"), []
     for path in sorted(folder.glob("frame-*.pose.txt")):
         name = path.name.removesuffix(".pose.txt")
@@ -145,7 +145,7 @@ def dense_sift(
 def dense_vgg(
     color: UInt8[np.ndarray, "height width 3"], stride_px: int
 ) -> Float[np.ndarray, "rows columns channel"]:
-    """Descriptors learnt by convex optimization (Simonyan et al. 2014), shipped with opencv-contrib."""
+    """Descriptors learned by convex optimization (Simonyan et al. 2014), shipped with opencv-contrib."""
     gray, points, shape = _keypoint_grid(color, stride_px, WINDOW_PX / 6.25)
     raw = cv2.xfeatures2d.VGG.create().compute(gray, points)[1]
     return _unit(raw).reshape(*shape, -1)
@@ -154,7 +154,7 @@ def dense_vgg(
 def dense_kernels(
     color: UInt8[np.ndarray, "height width 3"], stride_px: int, patch: int = 32
 ) -> Float[np.ndarray, "rows columns channel"]:
-    """Multiple kernel descriptors (Mukundan et al. 2019) of kornia, without its learnt whitening."""
+    """Multiple kernel descriptors (Mukundan et al. 2019) of kornia, without its learned whitening."""
     from kornia.feature import MKDDescriptor
 
     gray, points, shape = _keypoint_grid(color, stride_px, WINDOW_PX)
@@ -205,7 +205,7 @@ def _accuracy(
     first: Float[np.ndarray, "rows columns channel"],
     second: Float[np.ndarray, "rows columns channel"],
 ) -> float:
-    """Return the fraction of cells whose nearest neighbour is within one cell of the true match."""
+    """Return the fraction of cells whose nearest neighbor is within one cell of the true match."""
     nearest = (first.reshape(-1, first.shape[-1])[pair.cell] @ second.reshape(-1, second.shape[-1]).T).argmax(
         1
     )

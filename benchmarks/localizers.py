@@ -32,7 +32,7 @@ from stages.train_localizer.config import Config, NetworkConfig, SceneConfig
 from stages.train_localizer.views import RenderedView
 
 RECALL_LIMITS = (5.0, 0.2)
-"""degrees and metres within which a pose counts as correct"""
+"""degrees and meters within which a pose counts as correct"""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ QUERIES = ("clean", "low contrast", "blurred", "dark")
 def errors_of_renders(
     localizer: model.Localizer, queries: list[RenderedView], degradation: str
 ) -> tuple[float, float, float]:
-    """Return the median rotation (degrees) and translation (metres) error and the recall; no answer counts as wrong."""
+    """Return the median rotation (degrees) and translation (meters) error and the recall; no answer counts as wrong."""
     degraded_queries = iter([replace(query, color=degraded(query.color, degradation)) for query in queries])
     evaluated = described_views.evaluate(localizer, lambda: next(degraded_queries), len(queries))
     return _summary(evaluated.rotation_deg, evaluated.translation_m)

@@ -48,7 +48,7 @@ class RepeatedClip:
         return np.arange(len(self.order)) * 0.1
 
     def color(self, frame: int):
-        """Read the colour of a frame."""
+        """Read the color of a frame."""
         return self.clip.color(int(self.order[frame]))
 
     def depth(self, frame: int):

@@ -17,7 +17,7 @@ the built-in capture with the same coat; sessions have no poses, so that registr
     python -m benchmarks.semi_real registration build/kitchen OUT/truth build/toy/synthetic_capture/truth \\
         --structure SEQUENCE
 
-With `--structure` cameras are also compared with structure from motion on the colour pictures of the sequence
+With `--structure` cameras are also compared with structure from motion on the color pictures of the sequence
 (`benchmarks.structure`), aligned to the world of the build by a similarity on the cameras of the walk-through.
 """
 
@@ -131,7 +131,7 @@ def registration_metrics(
     poses of the sequence, with which it was rendered, are no ground truth of the room (the scale of KinectFusion may
     differ from that of the sensor by several percent), but its pose relative to the camera is exact. `root_placed`
     is the fraction of these frames with a root, `root_where_empty` that of frames without the animal. With
-    ``sequence`` cameras are also compared with structure from motion on its pictures. Metres and degrees.
+    ``sequence`` cameras are also compared with structure from motion on its pictures. Meters and degrees.
     """
     videos = {Path(v.file).stem: v for v in read_videos(build / "plan" / "videos.json")}
     walk = _rows(build, videos["walkthrough"], npz.load(truth / "walkthrough.npz"))
@@ -234,7 +234,7 @@ def main() -> None:
         "--step", type=int, default=3, help="stride of frames; negative: in reverse order"
     )
     draw_parser.add_argument(
-        "--registered", action="store_true", help="reproject depth into the colour camera"
+        "--registered", action="store_true", help="reproject depth into the color camera"
     )
     draw_parser.add_argument(
         "--coat", type=int, help="seed of the animal's appearance; default: the seed of the recording"

@@ -92,7 +92,7 @@ NEAR_M, CHASE_M = 1.2, 1.1
 """Maximal distance to the cat after 5.6 s of a dog that stays with it (it follows at 0.95 m, plays at 0.75 m), and
 distance within one second above which it plays (it follows at 0.9 m/s, plays at 1.5 m/s)."""
 COLLISION_M = 0.45
-"""Distance of centres below which bodies intersect: those of the synthetic world keep 0.62 m on the floor."""
+"""Distance of centers below which bodies intersect: those of the synthetic world keep 0.62 m on the floor."""
 HEADING_DECAY_M = 0.3
 """Distance over which the weight of a past heading decays to 1/e, about a body length."""
 ACTIVITIES = ("follows", "plays", "avoids", "goes its own way")

@@ -1,4 +1,4 @@
-"""Camera poses by structure from motion on colour pictures alone, a reference that is independent of the depth sensor
+"""Camera poses by structure from motion on color pictures alone, a reference that is independent of the depth sensor
 and its tracking.
 
 Runs COLMAP on evenly sampled pictures of a 7-Scenes style folder, with one camera whose focal length and distortion
@@ -20,7 +20,7 @@ from pipeline.mapping.colmap import read_sparse_model
 from pipeline.metrics.pose_errors import constant_between
 
 FOCAL_PX, CENTER_PX = 525.0, "320,240"
-"""Initial intrinsics: the colour camera of a Kinect."""
+"""Initial intrinsics: the color camera of a Kinect."""
 MAX_PICTURES = 168
 """Maximal number of pictures, since all pairs are matched."""
 
@@ -60,7 +60,7 @@ def _solve(scene: Path, numbers: list[int], folder: Path, output: Path) -> None:
 def scale_to(
     ours: Float[np.ndarray, "frame 4 4"], reference: Float[np.ndarray, "frame 4 4"]
 ) -> Float[np.ndarray, ""]:
-    """Return the scale from the units of the reference to ours, by least squares over all camera centres; NaN poses are
+    """Return the scale from the units of the reference to ours, by least squares over all camera centers; NaN poses are
     ignored.
     """
     known = np.isfinite(ours).all((1, 2)) & np.isfinite(reference).all((1, 2))

@@ -1,6 +1,6 @@
 """Pedestrian tracks of ETH/UCY, in the text format of the SGAN splits.
 
-Each row is `frame person x y`, metres, with 0.4 s between consecutive frame numbers. `Crowd.read` reads a file,
+Each row is `frame person x y`, meters, with 0.4 s between consecutive frame numbers. `Crowd.read` reads a file,
 `table` writes it as the CSV that `stages.read_trajectories` reads, `walks` lists the windows of the protocol.
 """
 
@@ -15,7 +15,7 @@ STEP_S = 0.4
 PAST, FUTURE = 8, 12
 """steps of the protocol (Alahi et al. 2016)"""
 HEADING_M = 0.2
-"""Shortest displacement that defines a heading: positions have errors of centimetres."""
+"""Shortest displacement that defines a heading: positions have errors of centimeters."""
 MIN_PEOPLE = 2
 """People present throughout a window for it to count in the protocol of SGAN (Gupta et al. 2018)."""
 
@@ -35,7 +35,7 @@ class Crowd:
     """One recording."""
 
     position: Float[np.ndarray, "step person 2"]
-    """metres; NaN where a person is absent"""
+    """meters; NaN where a person is absent"""
 
     @classmethod
     def read(cls, path: Path) -> "Crowd":

@@ -35,7 +35,7 @@ BASELINES = ("OpenCV DIS", "OpenCV Farneback")
 """Methods that must be outperformed"""
 THRESHOLDS = (0.2, 0.1, 0.05)
 FARNEBACK = (0.5, 5, 15, 3, 7, 1.5, 0)
-"""Pyramid scale, levels, window size, iterations, polynomial neighbourhood and sigma, flags."""
+"""Pyramid scale, levels, window size, iterations, polynomial neighborhood and sigma, flags."""
 MIN_CONFIDENCE = 1 / 255
 """lower bound of stored confidences, so that products stay comparable"""
 

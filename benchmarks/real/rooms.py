@@ -3,7 +3,7 @@
 The halves of a 7-Scenes style folder are converted to recordings without poses: `extract_frames` reads them, the first
 is mapped as a walk-through, the second is registered to it as a session. All poses are compared with two references,
 each aligned to the template by the cameras of the first half: the poses of the folder (KinectFusion), and structure
-from motion on the colour pictures alone.
+from motion on the color pictures alone.
 """
 
 import json
@@ -121,7 +121,7 @@ def register_session(
 
 
 def evaluate(scene: Path, folder: Path) -> dict[str, dict[str, dict[str, float]]]:
-    """Return median errors (metres, degrees) of all methods on the second half, for both references."""
+    """Return median errors (meters, degrees) of all methods on the second half, for both references."""
     walk, session = halves(scene, folder)
     workspace = folder / "workspace"
     shutil.rmtree(workspace, ignore_errors=True)

@@ -60,7 +60,7 @@ ROWS = {
         lambda data, out, seeds: walkers.row(data, out, seeds=seeds),
     ),
     "captured_dog": RowKind(
-        "dog_mocap/*.npz (one array [frame 27 3] per clip, metres, +y up, 60 Hz)",
+        "dog_mocap/*.npz (one array [frame 27 3] per clip, meters, +y up, 60 Hz)",
         "the dog of AI4Animation (CC BY-NC 4.0) as joint positions",
         first("dog_mocap/*.npz"),
         lambda data, out, seeds: captured_dog.row(data, out, seeds=seeds),

@@ -64,7 +64,7 @@ class LiveAnimal:
         return AnimalPose(self.time_s, root, np.stack(bones))
 
     def advance(self, seconds: float, observer_world: Float[np.ndarray, "3"]) -> AnimalPose:
-        """Advance time with the observer's eyes at a position (world, metres) and return the new pose.
+        """Advance time with the observer's eyes at a position (world, meters) and return the new pose.
 
         Raises SIM-012 if time or position are not finite, or time is negative.
         """

@@ -34,7 +34,7 @@ class MujocoAnimal:
 
     @property
     def observer_world(self) -> Float[np.ndarray, "3"]:
-        """Where the observer is in the world of the build (+y up), metres."""
+        """Where the observer is in the world of the build (+y up), meters."""
         return ZUP_FROM_WORLD[:3, :3].T @ self.data.xpos[self.observer]
 
     def step(self, steps: int = 1) -> AnimalPose:

@@ -2,10 +2,10 @@
 
     python -m pipeline.adapters.ros2_animal build/cat [--home build/other] [--seed 0]
 
-Subscribes `observer` (`geometry_msgs/PoseStamped`, +z up, metres): where the eyes of a person or the camera
+Subscribes `observer` (`geometry_msgs/PoseStamped`, +z up, meters): where the eyes of a person or the camera
 of a robot are. Publishes, ten times a second of the node's clock (`use_sim_time` works), `animal`
 (`PoseStamped`: the root, x ahead and z up as REP 103 has it) and `bones` (`PoseArray`, bones at their
-centres), all in the frame `map`. Needs ROS 2 (`rclpy`, `geometry_msgs`), which no wheel brings along.
+centers), all in the frame `map`. Needs ROS 2 (`rclpy`, `geometry_msgs`), which no wheel brings along.
 """
 
 import argparse

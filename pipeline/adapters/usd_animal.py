@@ -27,7 +27,7 @@ class UsdAnimal:
     def __init__(self, stage: Any, animal: LiveAnimal, *, path: str = "/agent"):
         """Take over the animal at ``path`` of a `Usd.Stage`: one that was opened, or referenced into a scene.
 
-        The stage has metres and +y up, as the export has; in a scene with +z up turn the prim at ``path``.
+        The stage has meters and +y up, as the export has; in a scene with +z up turn the prim at ``path``.
         """
         self.animal = animal
         self.motion = UsdSkel.Animation(stage.GetPrimAtPath(f"{path}/motion"))
@@ -38,7 +38,7 @@ class UsdAnimal:
         self._put(animal.pose)
 
     def step(self, seconds: float, observer_world: Float[np.ndarray, "3"]) -> AnimalPose:
-        """Let time pass with the observer's eyes at a place (world of the build, metres)."""
+        """Let time pass with the observer's eyes at a place (world of the build, meters)."""
         pose = self.animal.advance(seconds, observer_world)
         self._put(pose)
         return pose

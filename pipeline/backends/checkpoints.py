@@ -78,7 +78,7 @@ class Preparation:
     def pixels(
         self, color: UInt8[np.ndarray, "height width 3"], size: tuple[int, int]
     ) -> Float[np.ndarray, "1 3 resized_height resized_width"]:
-        """Resize to (height, width), scale to 0..1 and normalise."""
+        """Resize to (height, width), scale to 0..1 and normalize."""
         image = Image.fromarray(color)
         height, width = size
         if color.shape[:2] != size:

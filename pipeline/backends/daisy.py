@@ -2,14 +2,14 @@
 
 `describe` turns a picture into raw descriptors, `fit_basis` finds the basis on those of many recordings, and
 `FeatureBasis.project` gives the 16 unit-length channels that fields, templates and losses use. Gradients
-normalised per patch make them blind to exposure and white balance.
+normalized per patch make them blind to exposure and white balance.
 
 Chosen by measurement (`benchmarks.descriptors`: share of cells whose likest cell in a view 5-45 degrees away
 is the true one or touches it; raw, then with 16 channels). 12 pairs each of a real kitchen, of the same with
 one view relit, and between built-in sessions: DAISY 0.132 0.120, 0.130 0.117, 0.266 0.228; dense SIFT 0.140
 0.120, 0.139 0.120, 0.270 0.228 at three times the seconds. Between sessions only: multiple kernel descriptors
 0.220 0.182 (DAISY 0.266 0.229) and, on 5 pairs, VGG 0.152 0.132 (DAISY 0.205 0.194). DAISY of radius 8 with
-partial normalisation finds half of what this one finds.
+partial normalization finds half of what this one finds.
 """
 
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ MARGIN_PX = 24
 def describe(
     color: UInt8[np.ndarray, "height width 3"], stride_px: int
 ) -> Float[np.ndarray, "rows columns channel"]:
-    """Describe a picture at the cell centres (stride * (j + 1/2), stride * (i + 1/2)) of its own pixels.
+    """Describe a picture at the cell centers (stride * (j + 1/2), stride * (i + 1/2)) of its own pixels.
 
     Descriptors have unit length; cells without any texture are zero.
     """
@@ -61,7 +61,7 @@ class FeatureBasis:
     components: Float[np.ndarray, "16 channel"]
     """principal axes, already divided by the square root of their standard deviation"""
     scale: float
-    """median length of projections before they are normalised"""
+    """median length of projections before they are normalized"""
     explained: Float[np.ndarray, "16"]
     """share of the variance along each axis"""
 
@@ -115,6 +115,6 @@ def _daisy() -> cv2.xfeatures2d.DAISY:
 
 @lru_cache(maxsize=8)
 def _grid(rows: int, columns: int, stride_px: int, scale: float) -> list[cv2.KeyPoint]:
-    """Cell centres in the widened picture as OpenCV key points, whose integer positions are pixel centres."""
+    """Cell centers in the widened picture as OpenCV key points, whose integer positions are pixel centers."""
     y, x = (((np.arange(count) + 0.5) * stride_px * scale - 0.5 + MARGIN_PX) for count in (rows, columns))
     return [cv2.KeyPoint(float(column), float(row), 2 * RADIUS_PX) for row in y for column in x]

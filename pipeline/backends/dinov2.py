@@ -26,7 +26,7 @@ class Dinov2:
     def describe(
         self, color: UInt8[np.ndarray, "height width 3"], stride_px: int
     ) -> Float[np.ndarray, "rows columns channel"]:
-        """Describe a picture at the cell centres (stride * (j + 1/2), stride * (i + 1/2)); unit length."""
+        """Describe a picture at the cell centers (stride * (j + 1/2), stride * (i + 1/2)); unit length."""
         rows, columns = color.shape[0] // stride_px, color.shape[1] // stride_px
         whole = color[: rows * stride_px, : columns * stride_px]
         patch = self._model.config.patch_size

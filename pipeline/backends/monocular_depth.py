@@ -1,7 +1,7 @@
 """Depth from one picture by a network: Depth Anything V2 (Yang et al. 2024) or Depth Pro (Bochkovskii et al.
 2024).
 
-Both answer in proportion to inverse depth, or are turned into it; metres come from whoever knows some.
+Both answer in proportion to inverse depth, or are turned into it; meters come from whoever knows some.
 """
 
 from pathlib import Path
@@ -24,7 +24,7 @@ LONGER_PX = 518
 SCALES_OF_DEPTH_PRO = 4
 """Depth Pro looks at a square of so many patches a side: 1536 pixels of patches of 384."""
 NEAREST_M = 0.05
-"""Nearest depth that a metric network is believed, metres."""
+"""Nearest depth that a metric network is believed, meters."""
 
 
 class MonocularDepth:

@@ -42,7 +42,7 @@ class Raft(nn.Module):
         iterations: int,
         start: Float[Tensor, "batch 2 rows columns"] | None = None,
     ) -> Float[Tensor, "batch 2 height width"]:
-        """Return the flow in pixels; colours 0..255, sides divisible by 8, ``start`` a guess in cells."""
+        """Return the flow in pixels; colors 0..255, sides divisible by 8, ``start`` a guess in cells."""
         first, second = (2 * (picture / 255) - 1 for picture in (first, second))
         here, there = self.fnet(torch.cat([first, second])).float().chunk(2)
         pyramid = correlation_pyramid(here, there)

@@ -52,7 +52,7 @@ class Sam2:
             self._forget(session, frame, frames.step)
 
     def prepared(self, picture: Picture) -> Float[torch.Tensor, "1 3 side side"]:
-        """Resize with antialiasing as bytes, scale and normalise, as the checkpoint's own processor does."""
+        """Resize with antialiasing as bytes, scale and normalize, as the checkpoint's own processor does."""
         image = torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1)))[None]
         size = self._side, self._side
         image = F.interpolate(image, size, mode="bilinear", antialias=True, align_corners=False)

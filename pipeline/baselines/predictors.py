@@ -1,6 +1,6 @@
 """Predictors of goal, path and body with a common interface, ``sample(context, count, rng) -> Samples``.
 
-`Ats` is the behaviour model; `LocationPrior`, `StandStill` and `ConstantVelocity` are simple baselines with
+`Ats` is the behavior model; `LocationPrior`, `StandStill` and `ConstantVelocity` are simple baselines with
 noise fitted to the training windows.
 """
 
@@ -125,7 +125,7 @@ BASELINES = {
 
 @dataclass(frozen=True)
 class Ats:
-    """The behaviour model: goal, path and body by diffusion from the perception code."""
+    """The behavior model: goal, path and body by diffusion from the perception code."""
 
     sampler: Sampler
     volume: FeatureVolume | Scenes

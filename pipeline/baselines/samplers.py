@@ -64,13 +64,13 @@ class GaussianSampler(Sampler):
     def draw_plan_paths(
         self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw paths to the mean goal, metres, ego frame."""
+        """Draw paths to the mean goal, meters, ego frame."""
         return self.paths(codes, self.scaling.goal(self._goal(codes)[0]), sampling, rng)
 
     def goals(
         self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan 3"]:
-        """Draw goals in the ego frame, metres."""
+        """Draw goals in the ego frame, meters."""
         return codes.on_support(self.scaling.goal(self._sample_gaussian(self._goal(codes), rng)))
 
     def draw_paths(
@@ -80,7 +80,7 @@ class GaussianSampler(Sampler):
         sampling: PlanSamplingConfig,
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw a path towards each goal, metres, ego frame."""
+        """Draw a path towards each goal, meters, ego frame."""
         scaled = self._sample_gaussian(self._path(codes, goal, sampling), rng)
         return codes.constrained(self.scaling.path_of_scaled(scaled[:, :3]), self.scaling.rate_hz)
 
@@ -91,7 +91,7 @@ class GaussianSampler(Sampler):
         sampling: PlanSamplingConfig,
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan frame channel"]:
-        """Draw bodies along paths, metres and radians, ego frame."""
+        """Draw bodies along paths, meters and radians, ego frame."""
         control = self.scaling.scaled_path(path)
         zeros = np.zeros((len(path), len(self.scaling.body_mean), path.shape[1]), np.float32)
         outputs = [
@@ -144,7 +144,7 @@ class OneStageSampler(Sampler):
     def draw_plan_paths(
         self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw whole plans and keep the paths, metres, ego frame."""
+        """Draw whole plans and keep the paths, meters, ego frame."""
         return self.draw_plans(codes, sampling, rng, None, None).path
 
     def goals(

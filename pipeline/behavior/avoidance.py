@@ -18,7 +18,7 @@ Points = Float[np.ndarray, "plan 3"]
 
 
 def clearance_of(agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]) -> float:
-    """Return the smallest distance of the root from a person, metres: foremost bone (+z) plus radius."""
+    """Return the smallest distance of the root from a person, meters: foremost bone (+z) plus radius."""
     reach_m = float(agent_from_bone_rest[:, 2, 3].max())
     return PERSON_M + (reach_m if reach_m > 0 else UNKNOWN_REACH_M)
 
@@ -30,7 +30,7 @@ def around_person(
     clearance_m: float,
     clear: Callable[[Points], Points] = lambda points: points,
 ) -> Float[np.ndarray, "plan frame 3"]:
-    """Deform paths around a person who stands still; world frame, metres, first frame after ``start_world``.
+    """Deform paths around a person who stands still; world frame, meters, first frame after ``start_world``.
 
     An animal already nearer than ``clearance_m`` comes no nearer. ``clear`` projects points to where the
     animal may be; if the result still collides, the animal waits. Heights are unchanged.

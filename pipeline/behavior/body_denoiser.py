@@ -27,7 +27,7 @@ PATH_NOISE_M = 0.02
 Paths = Float[Tensor, "batch 3 frame"]
 """Scaled positions in the ego frame"""
 MIN_DIRECTION = 0.01
-"""length (metres, or of a unit vector) below which a vector has no direction"""
+"""length (meters, or of a unit vector) below which a vector has no direction"""
 
 
 class GaussianPrior(nn.Module):
@@ -189,7 +189,7 @@ class BodyDenoiser(nn.Module):
         return posture, step, heading
 
     def steps(self, x: Sequences, t: Steps, control: Paths) -> Float[Tensor, "batch 3 frame"]:
-        """Return the displacement per frame, metres; the first frame repeats the second."""
+        """Return the displacement per frame, meters; the first frame repeats the second."""
         del x, t
         place = control * self.path_std
         step = place[..., 1:] - place[..., :-1]
@@ -202,7 +202,7 @@ class BodyDenoiser(nn.Module):
         unit vectors.
 
         Each is an average of the initial heading and all earlier steps, with weights that decay
-        exponentially with the distance travelled since.
+        exponentially with the distance traveled since.
         """
         horizontal = step[:, ::2]
         square = horizontal.square().sum(1, keepdim=True)
@@ -234,7 +234,7 @@ class OneStageDenoiser(BodyDenoiser):
         self.register_buffer("velocity_std", torch.ones(PATH_CHANNELS))
 
     def steps(self, x: Sequences, t: Steps, control: Paths) -> Float[Tensor, "batch 3 frame"]:
-        """Return the expected displacement per frame given the noisy path, metres."""
+        """Return the expected displacement per frame given the noisy path, meters."""
         del control
         strides = (self.sqrt_alpha_bar[t.long()][:, None, None] * x[:, :PATH_CHANNELS]).transpose(-1, -2)
         return expected_steps(strides * self.velocity_std, self.rate_hz).transpose(-1, -2)
@@ -259,5 +259,5 @@ def rotated_to_heading(
 
 
 def soft_unit(vector: Float[Tensor, "batch 2 frame"]) -> Float[Tensor, "batch 2 frame"]:
-    """Return vectors normalised to about length 1; shorter where the direction is ill-defined."""
+    """Return vectors normalized to about length 1; shorter where the direction is ill-defined."""
     return vector / (vector.square().sum(1, keepdim=True) + MIN_DIRECTION**2).sqrt()

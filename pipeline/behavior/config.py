@@ -1,4 +1,4 @@
-"""Options of the behaviour model and of plan sampling. Standard library only."""
+"""Options of the behavior model and of plan sampling. Standard library only."""
 
 from dataclasses import dataclass, replace
 from typing import Literal

@@ -13,7 +13,7 @@ POSE_CHANNELS = 9
 MAX_PRESENT_M = 100.0
 """others beyond this distance are absent: recordings place absent ones 1 km away"""
 CLOSE_RANGE_M, EDGE_SHARPNESS = 1.5, 4.0
-"""offset of the encoded distance, metres, and steepness of the soft edge at the radius, per radius"""
+"""offset of the encoded distance, meters, and steepness of the soft edge at the radius, per radius"""
 APPROACH_SCALE = 1.5
 """scale of approach speeds (at most 2 m/s), which gives them the range of the encoded distance, +-3"""
 HEADS = 4
@@ -21,7 +21,7 @@ HEADS = 4
 ATTENDED_CHANNELS = 3
 """presence of the others that a head attends to, 0..1, and their mean horizontal position times presence"""
 MIN_WEIGHT = 1e-6
-"""attention weight of others beyond the radius, so that weights can be normalised when nobody is near"""
+"""attention weight of others beyond the radius, so that weights can be normalized when nobody is near"""
 
 
 def mlp(sizes: tuple[int, ...], dropout: float = 0.0) -> nn.Sequential:
@@ -78,7 +78,7 @@ class SetEncoder(nn.Module):
 class OthersEncoder(SetEncoder):
     """Encode the past positions of others by features that vanish towards ``radius_m``.
 
-    Distance and approach speed of each frame (metres, m/s) are explicit features, undamped well inside the
+    Distance and approach speed of each frame (meters, m/s) are explicit features, undamped well inside the
     radius: they decide whether the animal reacts, and learning them from positions takes thousands of steps.
     Beyond the radius all features are zero, so that far others and none at all have the same code.
     """

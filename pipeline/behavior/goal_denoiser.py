@@ -139,7 +139,7 @@ class GoalLikelihood(nn.Module):
     def forward(
         self, offset: Float[Tensor, "*batch 3"], variance: Float[Tensor, "*#batch 1"]
     ) -> Float[Tensor, "*batch number"]:
-        """Return unnormalised likelihoods, their logarithms, and likelihood-weighted posterior means.
+        """Return unnormalized likelihoods, their logarithms, and likelihood-weighted posterior means.
 
         ``offset`` and ``variance`` are those of the clean goal given the noisy one, from the position.
         """

@@ -1,4 +1,4 @@
-"""The behaviour model: its architecture, channels, networks and files.
+"""The behavior model: its architecture, channels, networks and files.
 
 `Architecture` fixes shapes, `BehaviorNets` holds the networks, `contract` and `load` write and read
 `behavior.json`; other functions define the channels of body and past. `pipeline.behavior.planning` samples.
@@ -155,20 +155,20 @@ class Architecture:
 
 @dataclass(frozen=True)
 class Scaling:
-    """Conversion between ego-frame metres and radians and the unit-variance channels that are diffused."""
+    """Conversion between ego-frame meters and radians and the unit-variance channels that are diffused."""
 
     goal_std: Float[np.ndarray, "3"]
     velocity_std: Float[np.ndarray, "*each 4"]
     """of strides (`pipeline.behavior.path_encoding`), shared by all frames or for each frame"""
     path_std: Float[np.ndarray, "3 frame"]
-    """of positions, as they control the body, metres"""
+    """of positions, as they control the body, meters"""
     body_mean: Float[np.ndarray, "channel"]
     body_std: Float[np.ndarray, "channel"]
     rate_hz: float = RATE_HZ
     """frames per second"""
 
     def scaled_goal(self, goal: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
-        """Convert goals in metres to the units of diffusion and of the control of paths."""
+        """Convert goals in meters to the units of diffusion and of the control of paths."""
         return (with_powered_length(goal, GOAL_LENGTH_POWER) / self.goal_std).astype(np.float32)
 
     def goal(self, scaled: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
@@ -178,7 +178,7 @@ class Scaling:
     def path(
         self, scaled: Float[np.ndarray, "plan 4 frame"], start: Float[np.ndarray, "plan 3"]
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Integrate scaled strides from ``start`` to paths in metres."""
+        """Integrate scaled strides from ``start`` to paths in meters."""
         return path_from_velocity_channels(np.swapaxes(scaled, 1, 2) * self.velocity_std, start, self.rate_hz)
 
     def warped_path(
@@ -187,12 +187,12 @@ class Scaling:
         start: Float[np.ndarray, "plan 3"],
         path: Float[np.ndarray, "plan frame 3"],
     ) -> Float[np.ndarray, "plan 4 frame"]:
-        """Return scaled strides that follow other paths in metres."""
+        """Return scaled strides that follow other paths in meters."""
         strides = np.swapaxes(scaled, 1, 2) * self.velocity_std
         return np.swapaxes(warped_path(strides, start, path, self.rate_hz) / self.velocity_std, 1, 2)
 
     def scaled_path(self, path: Float[np.ndarray, "plan frame 3"]) -> Float[np.ndarray, "plan 3 frame"]:
-        """Convert paths in metres to the control of bodies."""
+        """Convert paths in meters to the control of bodies."""
         return (np.swapaxes(path, 1, 2) / self.path_std).astype(np.float32)
 
     def path_of_scaled(self, scaled: Float[np.ndarray, "plan 3 frame"]) -> Float[np.ndarray, "plan frame 3"]:

@@ -24,9 +24,9 @@ recorded ones at rest"""
 VELOCITY_POWER, GOAL_LENGTH_POWER = 0.5, 0.7
 """powers of the lengths of velocities and goals (0.7 better than 0.5 and 1 on a held-out home)"""
 GOAL_TOLERANCE_M, GOAL_TOLERANCE_SHARE = 0.1, 0.25
-"""tolerance of a path's end from its goal, metres, or relative to the goal's distance if that is more"""
+"""tolerance of a path's end from its goal, meters, or relative to the goal's distance if that is more"""
 MIN_SQUARED_M2 = 1e-12
-"""lower bound of squared lengths, square metres: shorter vectors have no direction"""
+"""lower bound of squared lengths, square meters: shorter vectors have no direction"""
 
 
 @overload
@@ -46,7 +46,7 @@ def with_powered_length(
 def velocity_channels_from_path(
     path: Float[Tensor, "*batch frame 3"], start: Float[Tensor, "*batch 3"], rate_hz: float = RATE_HZ
 ) -> Float[Tensor, "*batch frame 4"]:
-    """Return the strides along a path in metres that begins a frame after ``start``."""
+    """Return the strides along a path in meters that begins a frame after ``start``."""
     before = torch.cat([start[..., None, :], path[..., :-1, :]], dim=-2)
     velocity = (path - before) * rate_hz
     moves = torch.where((velocity**2).sum(-1, keepdim=True) > REST_SPEED_M_S**2, 1.0, -1.0)
@@ -58,7 +58,7 @@ def path_from_velocity_channels(
     start: Float[np.ndarray, "*batch 3"],
     rate_hz: float = RATE_HZ,
 ) -> Float[np.ndarray, "*batch frame 3"]:
-    """Integrate sampled strides to a path in metres."""
+    """Integrate sampled strides to a path in meters."""
     root = strides[..., :3] * np.where(strides[..., 3:] > 0, 1.0, REST_DAMPING)
     return start[..., None, :] + (with_powered_length(root, 1 / VELOCITY_POWER) / rate_hz).cumsum(-2)
 
@@ -66,7 +66,7 @@ def path_from_velocity_channels(
 def expected_steps(
     strides: Float[Tensor, "batch frame 4"], rate_hz: float = RATE_HZ
 ) -> Float[Tensor, "batch frame 3"]:
-    """Return the displacement per frame, metres, of unscaled strides."""
+    """Return the displacement per frame, meters, of unscaled strides."""
     root = strides[..., :3] * torch.where(strides[..., 3:] > 0, 1.0, REST_DAMPING)
     return with_powered_length(root, 1 / VELOCITY_POWER) / rate_hz
 
@@ -77,7 +77,7 @@ def warped_path(
     path: Float[np.ndarray, "*batch frame 3"],
     rate_hz: float = RATE_HZ,
 ) -> Float[np.ndarray, "*batch frame 4"]:
-    """Return strides that follow another path, metres in the same frame, with unchanged motion flags."""
+    """Return strides that follow another path, meters in the same frame, with unchanged motion flags."""
     velocity = np.diff(path, axis=-2, prepend=start[..., None, :]) * rate_hz
     root = with_powered_length(velocity, VELOCITY_POWER) / np.where(strides[..., 3:] > 0, 1.0, REST_DAMPING)
     return np.concatenate([root, strides[..., 3:]], axis=-1)

@@ -1,7 +1,7 @@
 """Perception (omega of the paper): scene, others' past and own past as one code.
 
 `world_from_ego` gives the frame of all inputs, `FeatureVolume.around` samples the scene in it, and
-`Perception` encodes the three raw inputs (metres, ego frame) as 3 x 64 channels, normalised inside the
+`Perception` encodes the three raw inputs (meters, ego frame) as 3 x 64 channels, normalized inside the
 network. `PerceptionEnsemble` is an ensemble of such networks with weights of their own.
 """
 
@@ -85,7 +85,7 @@ class FeatureVolume:
         return clamped, (index == clamped).all(-1)
 
     def around(self, ego: Float[np.ndarray, "batch 4 4"]) -> Float[np.ndarray, "batch channel 64 8 64"]:
-        """Sample the nearest voxels on the ego grid (Eq. 11), centred at the root; zero outside."""
+        """Sample the nearest voxels on the ego grid (Eq. 11), centered at the root; zero outside."""
         index, inside = self.voxel(rigid.apply(ego, grid_points_ego().reshape(-1, 3)))
         features = self.features.reshape(len(self.features), -1)
         cell = np.asarray(np.ravel_multi_index(tuple(np.moveaxis(index, -1, 0)), self.occupancy.shape))
@@ -97,7 +97,7 @@ class FeatureVolume:
 
 
 def grid_points_ego(stride: int = 1) -> Float[np.ndarray, "width height length 3"]:
-    """Return the centres of the ego grid's cells, or of blocks of ``stride`` cells, in metres."""
+    """Return the centers of the ego grid's cells, or of blocks of ``stride`` cells, in meters."""
     axes = [(np.arange(n // stride) + 0.5 - n / stride / 2) * GRID_CELL_M * stride for n in GRID_SHAPE]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 

@@ -81,7 +81,7 @@ class TorchNetworks:
 
 @dataclass(frozen=True)
 class Observation:
-    """The inputs of perception, in metres and the ego frame."""
+    """The inputs of perception, in meters and the ego frame."""
 
     scene_grid: Float[np.ndarray, "batch channel 64 8 64"]
     others: Float[np.ndarray, "batch other past_frame 10"]
@@ -167,13 +167,13 @@ class PlanCondition:
         return PlanCondition(self.full[some], references, self.start[some], constraint)
 
     def on_support(self, goal: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
-        """Move goals in metres to where the agent may rest."""
+        """Move goals in meters to where the agent may rest."""
         return goal if self.constraint is None else self.constraint.goals_on_support(goal, self.start)
 
     def constrained(
         self, path: Float[np.ndarray, "plan frame 3"], rate_hz: float
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Keep paths in metres out of solid space and on the supporting surface."""
+        """Keep paths in meters out of solid space and on the supporting surface."""
         limit = self.constraint
         return path if limit is None else limit.on_support(limit.out_of_solid(path), self.start, rate_hz)
 
@@ -209,7 +209,7 @@ class Sampler:
         *,
         count: int = 1,
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw goals and paths as `plan` does, without bodies; metres, ego frame."""
+        """Draw goals and paths as `plan` does, without bodies; meters, ego frame."""
         return self.draw_plan_paths(self.codes(observation, sampling, count), sampling, rng)
 
     def draw_plans(
@@ -254,7 +254,7 @@ class Sampler:
     def goals(
         self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
     ) -> Float[np.ndarray, "plan 3"]:
-        """Draw goals in the ego frame, metres."""
+        """Draw goals in the ego frame, meters."""
 
         def denoise(code: Array) -> Denoise:
             return lambda x, t: self.networks.goal(x, _filled(len(x), t), code)
@@ -290,7 +290,7 @@ class Sampler:
         sampling: PlanSamplingConfig,
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw a path to each goal (Eq. 8) with guidance; metres, ego frame."""
+        """Draw a path to each goal (Eq. 8) with guidance; meters, ego frame."""
         control = self.scaling.scaled_goal(goal)
 
         def denoise(code: Array, keep: float = 0.0) -> Denoise:
@@ -354,7 +354,7 @@ class Sampler:
         goal: Float[np.ndarray, "plan 3"],
         sampling: PlanSamplingConfig,
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Convert scaled paths to metres, snap them to the goals that condition them, and constrain them."""
+        """Convert scaled paths to meters, snap them to the goals that condition them, and constrain them."""
         pull = float(sampling.goal and sampling.snap_to_goal) * min(sampling.guidance, 1.0)
         path = self.scaling.path(scaled, codes.start)
         return codes.constrained(snapped_to_goal(path, codes.start, goal, pull), self.scaling.rate_hz)

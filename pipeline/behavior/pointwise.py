@@ -22,7 +22,7 @@ from pipeline.behavior.perception import GRID_CELL_M, GRID_SHAPE, MAP_KEY_CHANNE
 from pipeline.behavior.trajectories import RATE_HZ
 
 HALF_MAP_M = GRID_SHAPE[0] * GRID_CELL_M / 2
-"""distance from the centre of a map to its edge"""
+"""distance from the center of a map to its edge"""
 MAP_CHANNELS = 2 * MAP_KEY_CHANNELS
 """channels of a map"""
 
@@ -30,7 +30,7 @@ MAP_CHANNELS = 2 * MAP_KEY_CHANNELS
 def sample_maps(
     maps: Float[Tensor, "batch member map"], points: Float[Tensor, "batch point 3"]
 ) -> Float[Tensor, "batch member channel point"]:
-    """Sample maps bilinearly at points in metres of the ego frame; zeros beyond the edge."""
+    """Sample maps bilinearly at points in meters of the ego frame; zeros beyond the edge."""
     cells = math.isqrt(int(maps.shape[-1]) // MAP_CHANNELS)
     images = maps.flatten(0, 1).unflatten(1, (MAP_CHANNELS, cells, cells))
     where = (points[:, None, :, None, ::2] / HALF_MAP_M).expand(-1, maps.shape[1], -1, -1, -1).flatten(0, 1)
@@ -102,6 +102,6 @@ class WaypointUNet(ControlUNet):
     def waypoints(
         self, x: Float[Tensor, "batch 4 frame"], t: Float[Tensor, "batch"]
     ) -> Float[Tensor, "batch frame 3"]:
-        """Return the expected waypoints given noisy strides, metres from the animal."""
+        """Return the expected waypoints given noisy strides, meters from the animal."""
         strides = (self.sqrt_alpha_bar[t.long()][:, None, None] * x).transpose(-1, -2) * self.velocity_std
         return expected_steps(strides, self.rate_hz).cumsum(1)

@@ -76,7 +76,7 @@ class Scenes:
     def around(
         self, ego: Float[np.ndarray, "window 4 4"], video: Int[np.ndarray, "window"] | None
     ) -> Float[np.ndarray, "window channel 64 8 64"]:
-        """Sample the ego grid (`world_from_ego`, metres) of every window in its own scene (Eq. 11)."""
+        """Sample the ego grid (`world_from_ego`, meters) of every window in its own scene (Eq. 11)."""
         if not self.channels:
             return np.zeros((len(ego), 0, *GRID_SHAPE), np.float32)
         number = self.number(video, len(ego))

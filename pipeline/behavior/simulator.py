@@ -1,4 +1,4 @@
-"""The behaviour model as an environment: `reset(seed)`, then `step(observer)` ten times a second.
+"""The behavior model as an environment: `reset(seed)`, then `step(observer)` ten times a second.
 
 Each step plays one frame of the current plan. A plan is followed until it ends or the observer has moved
 noticeably; the next one is sampled from the last 8 frames and blended in. Replanning at every step would
@@ -114,7 +114,7 @@ class AnimalBatch:
         self.played[some], self.planned_others[some] = 0, self._others_now()[some]
 
     def command(self, goal_world: Float[np.ndarray, "animal 3"]) -> None:
-        """Set commanded goals (metres, world); NaN lets an animal choose its own."""
+        """Set commanded goals (meters, world); NaN lets an animal choose its own."""
         self.goal_command = np.array(goal_world, float)
 
     def step(
@@ -122,7 +122,7 @@ class AnimalBatch:
         observer: Float[np.ndarray, "animal 3"],
         companions: Float[np.ndarray, "animal companion past_frame 4"] | None = None,
     ) -> PoseFrames:
-        """Advance by 0.1 s with the observers at these positions (metres, world) and return the new frame.
+        """Advance by 0.1 s with the observers at these positions (meters, world) and return the new frame.
 
         ``companions`` are the past tracks of those from outside, as many as in `begin`.
         """
@@ -260,7 +260,7 @@ class AnimalBatch:
     ) -> tuple[Float[np.ndarray, "some 3"], Float[np.ndarray, "some frame 3"], Float[np.ndarray, "some"]]:
         """Return goal, path and blocked share of the least blocked of ``count`` candidates per observation.
 
-        ``commanded`` goals (metres, ego frame) replace sampled ones where they are not NaN.
+        ``commanded`` goals (meters, ego frame) replace sampled ones where they are not NaN.
         """
         codes = self.sampler.codes(observation, self.sampling, count)
         goals = self.sampler.goals(codes, self.sampling, self.rng)
@@ -319,7 +319,7 @@ class Simulator:
 
     @property
     def past_world(self) -> Float[np.ndarray, "past_frame 3"]:
-        """Past positions of the animal, the current one last; metres."""
+        """Past positions of the animal, the current one last; meters."""
         return np.stack([frame.root[0, 0, :3, 3] for frame in self.animals.past])
 
     def step(
@@ -327,7 +327,7 @@ class Simulator:
         observer: Float[np.ndarray, "3"],
         companions: Float[np.ndarray, "companion past_frame 4"] | None = None,
     ) -> SimulatorState:
-        """Advance by 0.1 s with the observer at this position (metres, world) and these ``companions``."""
+        """Advance by 0.1 s with the observer at this position (meters, world) and these ``companions``."""
         others = None if companions is None else companions[None]
         now = self.animals.step(np.asarray(observer, float)[None], others)
         self.frame += 1

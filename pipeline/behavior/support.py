@@ -1,6 +1,6 @@
 """Supporting surfaces: tops of solid voxels, and the height of an animal's root above them.
 
-If samples are off by a tenth of a metre, an animal floats or sinks. `Support.heights` clamps roots to the
+If samples are off by a tenth of a meter, an animal floats or sinks. `Support.heights` clamps roots to the
 recorded height range above the nearest top; `smoothed_jumps` turns steps between tops into jumps.
 """
 

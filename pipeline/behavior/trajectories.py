@@ -1,4 +1,4 @@
-"""Trajectories of agent and observer on a regular time grid, and the windows of behaviour models.
+"""Trajectories of agent and observer on a regular time grid, and the windows of behavior models.
 
 `slice_behavior` writes them, `BehaviorData.load` reads them, and `BehaviorData.windows` returns windows as a
 `Context` (the past, all that a predictor may see) and a `Future` (what it must predict).
@@ -25,7 +25,7 @@ UP = np.array([0.0, 1.0, 0.0])
 KINDS = ("person", "animal")
 """kinds that the fourth channel of a companion indexes; the first three are its position"""
 ABSENT_M = 1000.0
-"""distance at which absent others are placed, metres"""
+"""distance at which absent others are placed, meters"""
 MAX_COMPANIONS = 15
 """maximum number of companions, the nearest: more hardly fit into the radius, nor crowds into memory"""
 WINDOWS_AT_ONCE = 8192
@@ -253,7 +253,7 @@ def nearest(
 ) -> Float[np.ndarray, "window some past_frame 4"]:
     """Return the companions nearest to the agent's current position, at most `MAX_COMPANIONS`.
 
-    Positions are metres in one frame. Companions with NaN in the last frame are absent; earlier frames that
+    Positions are meters in one frame. Companions with NaN in the last frame are absent; earlier frames that
     are unknown take the first known position, so that nothing of the future is needed.
     """
     level = [0, 2]

@@ -1,6 +1,6 @@
 """The training loop: seeded steps, checkpoints, resuming, recovery from non-finite losses.
 
-`fit` minimises a loss with an optimiser and can resume from checkpoints after any kill. Randomness is a pure
+`fit` minimizes a loss with an optimizer and can resume from checkpoints after any kill. Randomness is a pure
 function of (seed, step), so that on a CPU an interrupted run is bit-identical to an uninterrupted one.
 SIGTERM saves and exits with 75; a loss that stays non-finite exits with 76 and a diagnosis.
 """
@@ -63,7 +63,7 @@ def fit(
     shared: bool = False,
     asked_to_stop: Callable[[], bool] | None = None,
 ) -> FitRecord:
-    """Minimise ``loss(step, generator)`` for ``steps`` steps, from the newest checkpoint in ``resume`` if
+    """Minimize ``loss(step, generator)`` for ``steps`` steps, from the newest checkpoint in ``resume`` if
     there is one.
 
     ``modules`` hold all state to checkpoint (including averaged weights). The loss returns a scalar or named,
@@ -71,7 +71,7 @@ def fit(
     Steps whose loss or gradient is not finite are skipped; three in a row roll back to the last checkpoint at
     half the rate, and a second rollback ends the run (exit 76, ``diagnosis.json`` in ``resume``).
     ``asked_to_stop`` replaces the signal handlers: several fits in threads share one `termination`.
-    With ``shared``, all processes of `pipeline.core.distributed` minimise the mean of their losses; rank 0
+    With ``shared``, all processes of `pipeline.core.distributed` minimize the mean of their losses; rank 0
     keeps checkpoints.
     """
     shared = shared and distributed.size() > 1
@@ -103,7 +103,7 @@ def generator_for(seed: int, step: int, rank: int = 0) -> torch.Generator:
 
 
 class _Loop:
-    """State of a run (modules, optimiser, step, losses so far), which can be saved and restored."""
+    """State of a run (modules, optimizer, step, losses so far), which can be saved and restored."""
 
     def __init__(
         self,

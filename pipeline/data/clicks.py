@@ -66,7 +66,7 @@ class ClickedClip:
         return int(found[0]) if len(found) else None
 
     def lift(self, click: ClickedPixel) -> Float[np.ndarray, "3"] | None:
-        """Back-project a click by the median depth around it: camera axes, metres; None without depth."""
+        """Back-project a click by the median depth around it: camera axes, meters; None without depth."""
         frame = self.frame_of(click)
         if frame is None:
             return None
@@ -91,7 +91,7 @@ class ClickFit:
 
     @property
     def typical_m(self) -> float:
-        """Root mean square residual, metres."""
+        """Root mean square residual, meters."""
         return float(np.sqrt(np.nanmean(self.residual_m**2)))
 
 

@@ -58,7 +58,7 @@ STEP_SHARE = 0.25
 
 @dataclass(frozen=True)
 class Clip:
-    """One recording at 10 Hz: upright colour, depth in metres, confidence, intrinsics, odometry."""
+    """One recording at 10 Hz: upright color, depth in meters, confidence, intrinsics, odometry."""
 
     folder: Path
     timestamp_s: Float[np.ndarray, "frame"]
@@ -72,7 +72,7 @@ class Clip:
     depth_size: tuple[int, int]
     """(height, width) in pixels"""
     scale: str = "measured"
-    """what makes its lengths metres: its own depth, the id of another recording whose depth does, or
+    """what makes its lengths meters: its own depth, the id of another recording whose depth does, or
     nothing: `relative`; `mapped` where cameras and depth are the map's, and so no evidence against it
     """
 
@@ -100,7 +100,7 @@ class Clip:
         return images.read_color(self.folder / "color" / f"{frame:06d}.jpg")
 
     def depth(self, frame: int) -> Float[np.ndarray, "height width"]:
-        """Read one frame's depth in metres, 0 = unknown, at the sensor's resolution."""
+        """Read one frame's depth in meters, 0 = unknown, at the sensor's resolution."""
         return images.read_depth(self.folder / "depth" / f"{frame:06d}.exr")
 
     def confidence(self, frame: int) -> UInt8[np.ndarray, "height width"]:
@@ -143,7 +143,7 @@ class Pictures:
 
 @dataclass(frozen=True)
 class Masks:
-    """The agent's masks of one recording, at colour resolution: 255 agent, 0 background, 128 unknown."""
+    """The agent's masks of one recording, at color resolution: 255 agent, 0 background, 128 unknown."""
 
     folder: Path
     visible: np.ndarray
@@ -168,7 +168,7 @@ class Masks:
 def usable_depth(
     clip: Clip, frame: int, *, nearest_m: float = 0.0, farthest_m: float = np.inf, keep_steps: bool = True
 ) -> Float[np.ndarray, "height width"]:
-    """Read one frame's depth (metres) where it can be relied on, 0 elsewhere: the one policy of all stages.
+    """Read one frame's depth (meters) where it can be relied on, 0 elsewhere: the one policy of all stages.
 
     Out are pixels of low confidence and those outside of the range; without ``keep_steps`` also those at
     depth steps, where a sensor averages two surfaces into flying pixels.
@@ -185,7 +185,7 @@ def usable_depth(
 def back_project_pixels(
     clip: Clip, frame: int, pixel: Float[np.ndarray, "point 2"], depth: Float[np.ndarray, "height width"]
 ) -> Float[np.ndarray, "point 3"]:
-    """Back-project colour pixels to the camera frame by the frame's ``depth``; NaN where there is none."""
+    """Back-project color pixels to the camera frame by the frame's ``depth``; NaN where there is none."""
     z = cameras.sample_nearest(depth, pixel * np.divide(depth.shape, clip.color_size)[::-1])
     points = cameras.unproject(pixel, clip.intrinsics[frame]) * z[:, None]
     return np.where((z > 0)[:, None], points, np.nan)

@@ -9,7 +9,7 @@ from pipeline.data import npz
 from pipeline.data.schema import FileSchema
 
 STRIDE_PX = 8
-"""stride of the descriptor grid, colour pixels"""
+"""stride of the descriptor grid, color pixels"""
 CHANNELS = 16
 """channels of a descriptor after projection to the shared basis"""
 BASIS = FileSchema.of(
@@ -23,7 +23,7 @@ FEATURES = FileSchema.of("features/features.npz", "features [frame height width 
 
 
 def open_features(folder: Path) -> Float[np.ndarray, "frame height width 16"]:
-    """Map the L2-normalised descriptors of a finished `features/<id>`."""
+    """Map the L2-normalized descriptors of a finished `features/<id>`."""
     return npz.open_lazily(folder / "features.npz", "features")
 
 

@@ -9,7 +9,7 @@ from pipeline.data import npz
 from pipeline.data.schema import FileSchema
 
 STRIDE_PX = 4
-"""stride of the flow grid, colour pixels"""
+"""stride of the flow grid, color pixels"""
 GAPS = (1, 2, 4, 8)
 """frames between the two pictures of a pair"""
 FLOW = FileSchema.of(
@@ -23,7 +23,7 @@ def path_of(folder: Path, gap: int, *, backward: bool = False) -> Path:
 
 
 def open_flow(folder: Path, gap: int, *, backward: bool = False) -> Float[np.ndarray, "frame height width 2"]:
-    """Map the flow of one gap, colour pixels, per cell of `STRIDE_PX`."""
+    """Map the flow of one gap, color pixels, per cell of `STRIDE_PX`."""
     return npz.open_lazily(path_of(folder, gap, backward=backward), "flow")
 
 

@@ -12,7 +12,7 @@ COLUMNS = (
     ["x", "y", "z", "nx", "ny", "nz"] + [f"f_dc_{i}" for i in range(3)] + [f"f_rest_{i}" for i in range(45)]
     + ["opacity"] + [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
 )  # fmt: skip
-"""opacity as logit, scale as natural logarithm of metres, rotation as quaternion wxyz"""
+"""opacity as logit, scale as natural logarithm of meters, rotation as quaternion wxyz"""
 SPLATS = FileSchema.of(
     "splats/splats.npz",
     "agent_weights [point bone] f4",

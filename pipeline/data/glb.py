@@ -44,7 +44,7 @@ class Action:
 
 
 def static(mesh: Mesh, name: str) -> bytes:
-    """Return a file of a static mesh with vertex colours; metres, +y up."""
+    """Return a file of a static mesh with vertex colors; meters, +y up."""
     document = _Document()
     document.add_mesh(mesh, name, None)
     document.file.nodes = [gltf.Node(name=name, mesh=0)]
@@ -53,7 +53,7 @@ def static(mesh: Mesh, name: str) -> bytes:
 
 
 def skinned(mesh: Mesh, skin: Skin, actions: Sequence[Action]) -> bytes:
-    """Return a file of a skinned mesh (agent frame, metres) with one animation per action."""
+    """Return a file of a skinned mesh (agent frame, meters) with one animation per action."""
     document = _Document()
     document.add_mesh(mesh, "agent", skin)
     joints = list(range(_FIRST_JOINT, _FIRST_JOINT + len(skin.bone_names)))
@@ -149,7 +149,7 @@ def _translation_quaternion(parent_from_node: Float[np.ndarray, "n 4 4"]) -> tup
 
 
 def _without_flips(quaternion: Float[np.ndarray, "frame 4"]) -> Float[np.ndarray, "frame 4"]:
-    """Choose quaternion signs so that neighbouring keyframes interpolate along the shorter arc."""
+    """Choose quaternion signs so that neighboring keyframes interpolate along the shorter arc."""
     flips = np.where((quaternion[1:] * quaternion[:-1]).sum(-1) < 0, -1.0, 1.0)
     return quaternion * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
 
@@ -162,7 +162,7 @@ def _unit_normals(mesh: Mesh) -> Float32[np.ndarray, "vertex 3"]:
 
 
 def _linear_rgba(color: UInt8[np.ndarray, "vertex 3"]) -> Float32[np.ndarray, "vertex 4"]:
-    """Convert sRGB to linear RGBA, as in glTF's vertex colours."""
+    """Convert sRGB to linear RGBA, as in glTF's vertex colors."""
     srgb = color.astype(np.float32) / 255
     linear = images.linear_from_srgb(srgb)
     return np.concatenate([linear, np.ones_like(linear[:, :1])], 1).astype(np.float32)
@@ -174,7 +174,7 @@ def read_static(data: bytes) -> Mesh:
 
 
 def read_skinned(data: bytes) -> tuple[Mesh, Skin, list[Action]]:
-    """Read a file that `skinned` wrote: colours to 8 bits, everything else to float32."""
+    """Read a file that `skinned` wrote: colors to 8 bits, everything else to float32."""
     document = _Opened(data)
     attributes = document.file.meshes[0].primitives[0].attributes
     table = document.file.skins[0]

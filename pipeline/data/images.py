@@ -1,4 +1,4 @@
-"""Images on disk: colour (JPEG, PNG, WebP), 8-bit labels (PNG), depth (EXR, one HALF channel ``Z``, metres).
+"""Images on disk: color (JPEG, PNG, WebP), 8-bit labels (PNG), depth (EXR, one HALF channel ``Z``, meters).
 
 The only file that decodes OpenEXR and OpenCV images. Sizes are checked before pixels are decoded:
 a few hundred bytes can ask for gigabytes.
@@ -17,11 +17,11 @@ from jaxtyping import Float, Shaped, UInt8
 from pipeline.core.errors import InputError
 
 MAX_PIXELS = 32 << 20
-"""limit for a colour picture, and for all channels of a depth picture: 8K video, more than any phone's"""
+"""limit for a color picture, and for all channels of a depth picture: 8K video, more than any phone's"""
 SRGB_SLOPE, SRGB_OFFSET, SRGB_GAMMA, SRGB_KNEE = 12.92, 0.055, 2.4, 0.0031308
 """The transfer curve of sRGB (IEC 61966-2-1); the knee in linear intensity."""
 MAX_DEPTH_M = 1000.0
-"""maximum plausible depth, metres"""
+"""maximum plausible depth, meters"""
 MAX_EXR_BYTES = 4 * MAX_PIXELS + (1 << 16)
 """limit for a depth picture's file: uncompressed floats and a header"""
 PNG_CHUNK_BYTES = 12
@@ -74,7 +74,7 @@ def write_gray(path: Path, image: UInt8[np.ndarray, "height width"]) -> None:
 
 
 def read_depth(path: Path, channel: str | None = "Z") -> Float[np.ndarray, "height width"]:
-    """Read a depth EXR as float32 metres, 0 where the value is not finite, not positive or absurdly far.
+    """Read a depth EXR as float32 meters, 0 where the value is not finite, not positive or absurdly far.
 
     Without a ``channel`` the file must have exactly one. Raises InputError CAP-022 for files that are not
     EXR, ask for too many pixels or lack the channel.
@@ -91,7 +91,7 @@ def read_depth(path: Path, channel: str | None = "Z") -> Float[np.ndarray, "heig
 
 
 def write_depth(path: Path, depth: Float[np.ndarray, "height width"]) -> None:
-    """Write z-depth in metres (0 = unknown) as one HALF channel ``Z``, ZIP compressed."""
+    """Write z-depth in meters (0 = unknown) as one HALF channel ``Z``, ZIP compressed."""
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     stream = io.BytesIO()  # OpenEXR ignores a full disk when it closes a file
     with OpenEXR.File(header, {"Z": np.ascontiguousarray(depth, np.float16)}) as file:

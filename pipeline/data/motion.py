@@ -1,7 +1,7 @@
 """The time-varying structure D: poses of camera, agent and bones in every frame.
 
 `Motion` is one video's result as files hold it (`save`, `load`), `MotionTable` all videos' while it is being
-optimised: initial poses and small learned se(3) corrections on their right side.
+optimized: initial poses and small learned se(3) corrections on their right side.
 """
 
 from collections.abc import Sequence
@@ -153,5 +153,5 @@ class MotionTable(nn.Module):
         return self.initial_agent[frame] @ rigid_torch.se3_exp(self.root[frame])
 
     def agent_from_bone(self, frame: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch bone 4 4"]:
-        """Return posed bones, metres, agent frame."""
+        """Return posed bones, meters, agent frame."""
         return self.agent_from_bone_rest @ rigid_torch.se3_exp(self.bone[frame])

@@ -18,12 +18,12 @@ BLUE, ORANGE, GREEN, RED, GREY = "#3b6ea5", "#dd8452", "#55a868", "#c44e52", "#b
 """What was recorded of the animal; what was generated; the observer; what is wrong or sampled;
 surroundings."""
 BACKGROUND = 245
-"""Grey value (of 255) of the background."""
+"""Gray value (of 255) of the background."""
 DOTS_PER_INCH = 80
 SMOOTHED_OVER = 50
 """Smoothing window of a curve: one fiftieth of its length."""
 DEPTH_RANGE_M = 4.0
-"""End of the depth colour scale: the width of a room."""
+"""End of the depth color scale: the width of a room."""
 LABEL_PX = 20
 """Height of a line of text below a picture."""
 
@@ -55,7 +55,7 @@ def loss_curves(
     width_in: float = 9.0,
     log: bool = True,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw smoothed losses, one panel per name and one colour per label."""
+    """Draw smoothed losses, one panel per name and one color per label."""
     figure, axes = panels(1, max(len(curves), 1), width_in=width_in, height_in=3.0)
     for axis, (title, labelled_curves) in zip(axes[0], curves.items(), strict=False):
         for number, (label, values) in enumerate(labelled_curves.items()):
@@ -137,7 +137,7 @@ def resized(
     return cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_NEAREST)
 
 
-def labelled(image: UInt8[np.ndarray, "height width 3"], text: str) -> UInt8[np.ndarray, "labelled width 3"]:
+def labelled(image: UInt8[np.ndarray, "height width 3"], text: str) -> UInt8[np.ndarray, "labeled width 3"]:
     """Return a picture with a line of text below it."""
     strip = np.full((LABEL_PX, image.shape[1], 3), BACKGROUND, np.uint8)
     place = (4, LABEL_PX - 6)
@@ -167,7 +167,7 @@ def outlined(
 
 
 def depth_colors(depth: Float[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width 3"]:
-    """Colour z depth in metres from near (yellow) to far (violet); unknown (0) is black."""
+    """Color z depth in meters from near (yellow) to far (violet); unknown (0) is black."""
     nearness = np.clip(255 * (1 - depth / DEPTH_RANGE_M), 0, 255).astype(np.uint8)
     colors = cv2.applyColorMap(nearness, cv2.COLORMAP_VIRIDIS)[..., ::-1]
     return colors * (depth > 0)[..., None].astype(np.uint8)

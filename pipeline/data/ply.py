@@ -1,4 +1,4 @@
-"""PLY meshes, binary little-endian: positions, optional colour and any per-vertex float properties.
+"""PLY meshes, binary little-endian: positions, optional color and any per-vertex float properties.
 
 `write_ply` and `read_ply` are exact inverses for float32 data. Reading checks counts, indices and finiteness.
 """

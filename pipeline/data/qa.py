@@ -17,7 +17,7 @@ from pipeline.data import images
 
 Status = Literal["ok", "warn", "fail"]
 MARKS = {"ok": "●", "warn": "▲", "fail": "■", "none": "○"}
-"""Symbols of a status, readable without colour; "none": no check."""
+"""Symbols of a status, readable without color; "none": no check."""
 
 
 @dataclass(frozen=True)

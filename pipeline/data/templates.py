@@ -40,7 +40,7 @@ class SceneCameras:
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     """of every frame; those not registered are placed by odometry"""
     intrinsics: Float[np.ndarray, "frame 3 3"]
-    """colour pixels"""
+    """color pixels"""
     registered: Bool[np.ndarray, "frame"]
     keyframe: Bool[np.ndarray, "frame"]
     """jointly optimized frames; the others were aligned to the resulting surface"""
@@ -72,7 +72,7 @@ class AgentCameras:
     timestamp_s: Float[np.ndarray, "frame"]
     agent_from_camera: Float[np.ndarray, "frame 4 4"]
     intrinsics: Float[np.ndarray, "frame 3 3"]
-    """colour pixels"""
+    """color pixels"""
     registered: Bool[np.ndarray, "frame"]
 
     @classmethod

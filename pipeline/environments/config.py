@@ -30,7 +30,7 @@ class EnvironmentConfig:
     turn_rad_s: float = 2.0
     """Highest turning speed, rad/s."""
     start_m: tuple[float, float] = (1.5, 3.5)
-    """Nearest and furthest distance from the animal at which an episode begins, metres."""
+    """Nearest and furthest distance from the animal at which an episode begins, meters."""
     goal_steps: int = 4
     """Denoising steps of the animal's goals; 50 for the full sampler."""
     sequence_steps: int = 6

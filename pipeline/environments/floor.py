@@ -10,7 +10,7 @@ from pipeline.behavior.perception import FeatureVolume
 SHIN_M, HEAD_M = 0.3, 1.6
 """Heights above the floor between which solid voxels stop a person."""
 CELLS, CELL_M = 16, 0.25
-"""Cells along each side of an observed occupancy map, and the side of a cell in metres."""
+"""Cells along each side of an observed occupancy map, and the side of a cell in meters."""
 
 
 @dataclass(frozen=True)
@@ -20,10 +20,10 @@ class PersonFloor:
     blocked: Bool[np.ndarray, "x z"]
     """True where a person cannot stand."""
     corner: Float[np.ndarray, "2"]
-    """World x and z where column 0 begins, metres."""
+    """World x and z where column 0 begins, meters."""
     cell_m: float
     floor_m: float
-    """World height of the floor, metres."""
+    """World height of the floor, meters."""
 
     @classmethod
     def of(cls, volume: FeatureVolume, roots_world: Float[np.ndarray, "frame 3"]) -> "PersonFloor":
@@ -39,7 +39,7 @@ class PersonFloor:
         return cls(blocked, volume.origin[[0, 2]], volume.voxel_m, floor_m)
 
     def blocks(self, points: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
-        """Return which world points (x, z; metres) are blocked or outside; none without a scene."""
+        """Return which world points (x, z; meters) are blocked or outside; none without a scene."""
         if self.blocked.size == 1:
             return np.zeros(points.shape[:-1], bool)
         index = np.floor((points - self.corner) / self.cell_m).astype(int)

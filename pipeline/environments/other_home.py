@@ -1,4 +1,4 @@
-"""The animal of one build in the reconstructed home of another; both homes are in metres.
+"""The animal of one build in the reconstructed home of another; both homes are in meters.
 
 `ReconstructedHome.of_build` opens the home of a finished build. `move_in` puts an animal into another home:
 features are converted to the basis that its model was trained on, recorded moments are placed on the other
@@ -44,7 +44,7 @@ MAX_CELLS = 4000
 
 @dataclass(frozen=True)
 class ReconstructedHome:
-    """A build's home as behaviour models perceive it, in the world frame of that build."""
+    """A build's home as behavior models perceive it, in the world frame of that build."""
 
     volume: FeatureVolume
     marks: UInt8[np.ndarray, "x y z"]
@@ -79,7 +79,7 @@ class ReconstructedHome:
         except (InputError, OSError, ValueError, KeyError, TypeError) as error:
             raise _other_version(f"is no home as this version writes it ({error})", behavior_data) from error
         if scale.startswith("relative"):
-            raise _unusable("is not in metres: its scale comes from pictures alone", scene_template)
+            raise _unusable("is not in meters: its scale comes from pictures alone", scene_template)
         level = floor_level(table["allowed"] >= SUPPORTED)
         if level is None or not np.isfinite(table["stands_m"]).all():
             raise _unusable("shows no floor that carries an animal", behavior_data)
@@ -94,7 +94,7 @@ class ReconstructedHome:
         return Scenes((self.volume,), (self.marks > 0,), np.zeros(1, int), (support,))
 
     def height_above_top(self, root_world: Float[np.ndarray, "3"], *, moves: bool) -> float:
-        """Return the height of a root above its support, metres, clipped to the animal's usual range."""
+        """Return the height of a root above its support, meters, clipped to the animal's usual range."""
         support = Support.of(self.volume, self.marks, self.stands_m)
         assert support is not None, "checked by `load`"
         column = np.floor((root_world[[0, 2]] - support.corner) / support.voxel_m).astype(int)
@@ -164,7 +164,7 @@ def share_known(own: ReconstructedHome, other: ReconstructedHome) -> float:
     The nearest one is no less alike than `KNOWN_PERCENT` of the cells of ``own`` are to their nearest one
     elsewhere in it.
 
-    Alike are feature, of unit length, and height above the floor, a metre of which counts as much as features
+    Alike are feature, of unit length, and height above the floor, a meter of which counts as much as features
     60 degrees apart.
     """
     known, place = _surface(own)
@@ -179,7 +179,7 @@ def share_known(own: ReconstructedHome, other: ReconstructedHome) -> float:
 
 
 def _surface(home: ReconstructedHome) -> tuple[Float[np.ndarray, "cell 17"], Float[np.ndarray, "cell 3"]]:
-    """Return what surface cells look like, and where they are (metres)."""
+    """Return what surface cells look like, and where they are (meters)."""
     volume = home.volume
     length = np.linalg.norm(volume.features.astype(np.float32), axis=0)
     index = np.argwhere((volume.occupancy == 1) & (length > 0))
@@ -220,7 +220,7 @@ def place_starts(
 
 
 def _floor_places(home: ReconstructedHome) -> Float[np.ndarray, "place 3"]:
-    """Return the centres of the floor's cells, metres."""
+    """Return the centers of the floor's cells, meters."""
     level = round((home.floor_m - home.volume.origin[1]) / home.volume.voxel_m)
     column = np.argwhere(home.marks[:, level] >= SUPPORTED)
     place = home.volume.origin[[0, 2]] + (column + 0.5) * home.volume.voxel_m

@@ -21,14 +21,14 @@ from pipeline.environments.world import AnimalWorld, checked
 
 PERSON, ANIMAL = "person", "animal"
 GOAL_M = 3.0
-"""Distance of the goal that an action of 1 stands for, metres."""
+"""Distance of the goal that an action of 1 stands for, meters."""
 
 
 class PersonAnimalEnv(ParallelEnv):
     """The person walks, the animal is steered: its action is a goal in its own frame, left and
     ahead.
 
-    The behaviour model plans path and body to that goal, as it does to its own. The animal's reward is the
+    The behavior model plans path and body to that goal, as it does to its own. The animal's reward is the
     person's with the opposite sign.
     """
 
@@ -62,7 +62,7 @@ class PersonAnimalEnv(ParallelEnv):
         return self.action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None):
-        """Begin at a recorded moment, the person a few metres off."""
+        """Begin at a recorded moment, the person a few meters off."""
         if seed is not None or not hasattr(self, "rng"):
             self.rng = np.random.default_rng(seed)
         self.agents, self.frame = list(self.possible_agents), 0

@@ -31,7 +31,7 @@ class PersonEnv(gymnasium.Env):
         self.window: PictureWindow | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """Begin at a recorded moment, the person a few metres off."""
+        """Begin at a recorded moment, the person a few meters off."""
         super().reset(seed=seed)
         self.frame = 0
         self.world.begin(1, self.np_random, (options or {}).get("split", "train"))

@@ -1,4 +1,4 @@
-"""Top-down view of a pair: blocked cells grey, person green, animal blue, its plan and goal orange."""
+"""Top-down view of a pair: blocked cells gray, person green, animal blue, its plan and goal orange."""
 
 import cv2
 import numpy as np
@@ -7,12 +7,12 @@ from jaxtyping import Float, UInt8
 from pipeline.environments.world import AnimalWorld
 
 SIDE_PX, SIDE_M = 400, 8.0
-"""Side of a picture in pixels, and of what it shows in metres."""
+"""Side of a picture in pixels, and of what it shows in meters."""
 NOSE_M = 0.3
 """Length of the line that points ahead of the animal."""
 GROUND, SOLID = (250, 250, 250), (150, 150, 150)
 PERSON, ANIMAL, PLAN = (85, 168, 104), (59, 110, 165), (221, 132, 82)
-"""Colours, RGB."""
+"""Colors, RGB."""
 
 
 def bird_view(world: AnimalWorld, row: int) -> UInt8[np.ndarray, "400 400 3"]:

@@ -11,7 +11,7 @@ from pipeline.environments.config import RewardName
 REACHED_M = 0.7
 """Distance at which the animal counts as reached: an arm's length."""
 REACHED_REWARD, FLEEING_COST = 5.0, 5.0
-"""Terminal reward and cost of `approach`, metres of progress; if doubled, PPO may learn to stay away."""
+"""Terminal reward and cost of `approach`, meters of progress; if doubled, PPO may learn to stay away."""
 FOLLOW_M = 1.2
 """Distance at which `follow` is best."""
 

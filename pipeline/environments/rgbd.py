@@ -1,4 +1,4 @@
-"""RGB-D camera of a person: colour and depth of the reconstruction with the posed animal.
+"""RGB-D camera of a person: color and depth of the reconstruction with the posed animal.
 
 The camera is at eye height and looks ahead and down. Scene and animal are the surfaces of the artifact
 `reconstruction`, the animal posed by its bones (dual-quaternion blending, as in the reconstruction itself).
@@ -28,7 +28,7 @@ PITCH_RAD = np.deg2rad(20.0)
 FAR_M = 10.0
 """Maximum depth; larger depths are clipped."""
 AGENT_FACES = 2000
-"""Triangles of the decimated animal: half a pixel each at one metre."""
+"""Triangles of the decimated animal: half a pixel each at one meter."""
 FOCAL_PX = WIDTH_PX / 2 / np.tan(FIELD_RAD / 2)
 INTRINSICS = np.array([[FOCAL_PX, 0, WIDTH_PX / 2], [0, FOCAL_PX, HEIGHT_PX / 2], [0, 0, 1]])
 
@@ -37,7 +37,7 @@ class RgbdCamera:
     """Renders the surfaces of homes and their animal."""
 
     def __init__(self, scenes: Sequence[Mesh], body: SkinnedBody):
-        """``scenes`` are in the world frames of their homes, metres."""
+        """``scenes`` are in the world frames of their homes, meters."""
         self.scenes = [RayCaster(scene) for scene in scenes]
         self.body, nearest = decimate(body.mesh, AGENT_FACES)
         self.skin = SkinnedShape(self.body.vertices, body.weights[nearest], body.agent_from_bone_rest)
@@ -61,8 +61,8 @@ class RgbdCamera:
         world_from_agent: Float[np.ndarray, "4 4"],
         agent_from_bone: Float[np.ndarray, "bone 4 4"],
     ) -> tuple[UInt8[np.ndarray, "48 64 3"], Float[np.ndarray, "48 64"]]:
-        """Render from a position (metres) at a heading about +y (radians, 0 along +z): colour, and z-depth in
-        metres (0: no surface).
+        """Render from a position (meters) at a heading about +y (radians, 0 along +z): color, and z-depth in
+        meters (0: no surface).
         """
         level = np.cos(PITCH_RAD)
         ahead = np.array([np.sin(heading) * level, -np.sin(PITCH_RAD), np.cos(heading) * level])

@@ -13,7 +13,7 @@ from pipeline.environments.rgbd import FAR_M, HEIGHT_PX, WIDTH_PX
 from pipeline.environments.world import ANIMAL_NUMBERS, AnimalWorld, animal_seen, occupancy_seen
 
 FAR = 20.0
-"""Bound of all observed numbers: metres or m/s; homes are smaller, animals slower."""
+"""Bound of all observed numbers: meters or m/s; homes are smaller, animals slower."""
 
 
 def person_observation_space(observations: Sequence[Seen]) -> gymnasium.spaces.Dict:
@@ -38,7 +38,7 @@ def person_observation_space(observations: Sequence[Seen]) -> gymnasium.spaces.D
 
 def person_observation(world: AnimalWorld) -> dict[str, Shaped[np.ndarray, "person ..."]]:
     """Return all persons' observations, first axis person: the animal, their velocity and occupancy in their
-    own frames, and pictures with depth (metres, 0: no surface).
+    own frames, and pictures with depth (meters, 0: no surface).
     """
     parts: dict[str, np.ndarray] = {}
     for seen in world.config.observations:

@@ -1,7 +1,7 @@
 """A batch of person-animal pairs that plan together and restart independently.
 
 `AnimalWorld.load` opens a build, `begin` starts pairs, `restart` some, `step` advances all by 0.1 s. Actions
-move persons; the behaviour model moves animals through `AnimalBatch`, which replans only when a plan ends or
+move persons; the behavior model moves animals through `AnimalBatch`, which replans only when a plan ends or
 the person has moved noticeably, at the rate `plans_per_step`.
 """
 
@@ -31,7 +31,7 @@ from pipeline.metrics.flight import WITHIN_S, flees
 from pipeline.workflow import artifact
 
 EYE_M = 1.4
-"""Height of a person's phone above the floor, metres."""
+"""Height of a person's phone above the floor, meters."""
 CLOSE_M = 2.4
 """Distance from the person within which an animal that moves away counts as fleeing."""
 START_DRAWS = 30
@@ -44,7 +44,7 @@ class Persons:
     """Where the persons are; rows are replaced when an episode begins."""
 
     position: Float[np.ndarray, "person 2"]
-    """World x and z, metres."""
+    """World x and z, meters."""
     heading: Float[np.ndarray, "person"]
     """About world +y, radians; 0 looks along +z."""
     velocity: Float[np.ndarray, "person 2"]
@@ -179,17 +179,17 @@ class AnimalWorld:
 
     @property
     def animal_position(self) -> Float[np.ndarray, "animal 3"]:
-        """World positions of the roots, metres."""
+        """World positions of the roots, meters."""
         return self.animals.past[-1].root[:, 0, :3, 3]
 
     @property
     def distance_m(self) -> Float[np.ndarray, "person"]:
-        """Horizontal distance of person and animal, metres."""
+        """Horizontal distance of person and animal, meters."""
         return np.linalg.norm(self.animal_position[:, [0, 2]] - self.persons.position, axis=-1)
 
     @property
     def eyes(self) -> Float[np.ndarray, "person 3"]:
-        """World positions that the animals perceive, metres."""
+        """World positions that the animals perceive, meters."""
         x, z = self.persons.position.T
         height = np.array([self.floors[scene].floor_m for scene in self.scene]) + EYE_M
         return np.stack([x, height, z], axis=-1)
@@ -210,7 +210,7 @@ class AnimalWorld:
         return np.array(self.habitat.share_known)[self.home]
 
     def pictures(self) -> list[tuple[UInt8[np.ndarray, "48 64 3"], Float[np.ndarray, "48 64"]]]:
-        """Return what the persons' cameras see: colour, and z-depth in metres (0 where nothing is)."""
+        """Return what the persons' cameras see: color, and z-depth in meters (0 where nothing is)."""
         assert self.camera is not None, "a world that is seen is opened with `rgbd` among its observations"
         now = self.animals.past[-1]
         bones = bones_from_channels(now.bones[:, 0], self.data.agent_from_bone_rest)

@@ -1,6 +1,6 @@
 """Spatial encodings of fields: multi-resolution dense grids, or an MLP with positional encoding.
 
-Both map points in the field's frame, metres, to ``channels`` channels.
+Both map points in the field's frame, meters, to ``channels`` channels.
 """
 
 import math
@@ -42,7 +42,7 @@ class DenseGrid(nn.Module):
         self.channels = channels * len(voxel_m)
 
     def forward(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point channel"]:
-        """Interpolate at points in the field's frame, metres; outside the box the border values hold."""
+        """Interpolate at points in the field's frame, meters; outside the box the border values hold."""
         found = []
         for extent, level in zip(self.extents, self.levels, strict=True):
             place = ((points - self.low) / extent * 2 - 1).view(1, 1, 1, -1, 3)
@@ -76,7 +76,7 @@ class PositionalMLP(nn.Module):
         self.channels = width
 
     def forward(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point channel"]:
-        """Return the MLP's features of points, metres."""
+        """Return the MLP's features of points, meters."""
         place = points - self.middle
         phase = (place[:, :, None] * self.frequency).flatten(1)
         return self.network(torch.cat([place, phase.sin(), phase.cos()], dim=1))

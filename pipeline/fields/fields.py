@@ -5,7 +5,7 @@ positional encoding, and two small heads, with a learnable code per video for th
 fused beforehand (`FusedGeometry`), signed distance is fixed and the heads learn color and features alone.
 `density` turns signed distance into the density of volume rendering. `ArticulatedBody` poses the agent's
 field by Gaussian bones. `Reconstruction` holds all of it; `save` and `load` move it to and from a folder.
-Points and distances are in metres.
+Points and distances are in meters.
 """
 
 import json
@@ -131,7 +131,7 @@ class Field(nn.Module):
 
     @property
     def lattice_m(self) -> float:
-        """The resolution at which the surface is worth extracting, metres."""
+        """The resolution at which the surface is worth extracting, meters."""
         return self.fused.voxel_m if self.fused else LATTICE_M
 
     def encode(
@@ -143,7 +143,7 @@ class Field(nn.Module):
         """Return the encoding of points, the video's code and fused geometry, the input of both heads.
 
         Args:
-            points: in the field's frame, metres.
+            points: in the field's frame, meters.
             video: whose scene; -1 for the scene that the videos share. None without codes.
             code: whose code instead of the video's own (scene annealing).
         """
@@ -162,7 +162,7 @@ class Field(nn.Module):
         return torch.cat(parts, dim=-1)
 
     def distance(self, encoded: Float[Tensor, "point channel"]) -> Float[Tensor, "point"]:
-        """Return signed distances, metres, positive in free space: fused ones, or else the head's."""
+        """Return signed distances, meters, positive in free space: fused ones, or else the head's."""
         limit = self.shape.truncation_m
         if self.geometry is None:
             assert limit is not None, "fused distances saturate"
@@ -198,20 +198,20 @@ class Field(nn.Module):
         video: Int[Tensor, "point"],
         code: Int[Tensor, "point"] | None = None,
     ) -> Float[Tensor, "point"]:
-        """Return signed distances alone, metres; arguments as `encode`'s."""
+        """Return signed distances alone, meters; arguments as `encode`'s."""
         if self.fused and self.shape.truncation_m:
             return self.shape.truncation_m * self.fused(points, video)[:, 0]
         return self.distance(self.encode(points, video, code))
 
     @property
     def beta_m(self) -> Float[Tensor, ""]:
-        """The scale of the Laplace distribution in `density`, metres."""
+        """The scale of the Laplace distribution in `density`, meters."""
         return self.log_beta.exp().clamp(*(WIDE_RANGE_M if self.shape.starts_as_box else BETA_RANGE_M))
 
     def density(
         self, signed_distance: Float[Tensor, "*point"], min_beta_m: float = 0.0
     ) -> Float[Tensor, "*point"]:
-        """Convert signed distances to density per metre; saturated distances are free space.
+        """Convert signed distances to density per meter; saturated distances are free space.
 
         ``min_beta_m``: the coarse pass of importance sampling sets it to half its sample spacing, so that no
         surface falls between two samples.
@@ -228,7 +228,7 @@ def _head(inputs: int, width: int, outputs: int) -> tuple[nn.Sequential, nn.Line
 def density(
     signed_distance: Float[Tensor, "*point"], beta_m: Float[Tensor, ""], truncation_m: float | None = None
 ) -> Float[Tensor, "*point"]:
-    """Turn signed distance into volume density per metre: a Laplace CDF (Yariv et al., VolSDF, Eqs. 2-3).
+    """Turn signed distance into volume density per meter: a Laplace CDF (Yariv et al., VolSDF, Eqs. 2-3).
 
     For distances that saturate at ``truncation_m`` the remaining tail of the CDF is subtracted; otherwise
     free space would accumulate opacity.

@@ -47,12 +47,12 @@ class FusedGeometry(nn.Module):
 
     @property
     def voxel_m(self) -> float:
-        """Edge of a cell in metres."""
+        """Edge of a cell in meters."""
         return float(self.sizes[0])
 
     @property
     def truncation_m(self) -> float:
-        """Signed distances saturate here, metres."""
+        """Signed distances saturate here, meters."""
         return float(self.sizes[1])
 
     def is_own(self, points: Float[Tensor, "point 3"], video: int) -> Bool[Tensor, "point"]:
@@ -71,9 +71,9 @@ class FusedGeometry(nn.Module):
     def forward(
         self, points: Float[Tensor, "point 3"], video: Int[Tensor, "point"]
     ) -> Float[Tensor, "point 5"]:
-        """Interpolate at world points, metres, in a video's scene (-1: the shared scene).
+        """Interpolate at world points, meters, in a video's scene (-1: the shared scene).
 
-        Returns signed distance in units of the truncation, color in 0..1 (grey where unknown), and its
+        Returns signed distance in units of the truncation, color in 0..1 (gray where unknown), and its
         confidence.
         """
         result = points.new_tensor([1.0, 0.5, 0.5, 0.5, 0.0]).repeat(len(points), 1)

@@ -22,7 +22,7 @@ from pipeline.geometry.meshes import Mesh, area_normals
 BAND0 = 0.28209479177387814
 """value of the spherical harmonic of degree 0"""
 SIGMA_PER_SPACING = 0.7
-"""standard deviation of a surface's Gaussians, in spacings of its points: neighbours overlap"""
+"""standard deviation of a surface's Gaussians, in spacings of its points: neighbors overlap"""
 INITIAL_OPACITY = 0.9
 """of a surface's Gaussians; nearer to 1 the logit has no gradient"""
 OPACITY_MARGIN = 1e-4
@@ -103,7 +103,7 @@ class SurfaceSamples:
     color: Float[np.ndarray, "point 3"]
     """0..1"""
     spacing_m: float
-    """mean distance of neighbours"""
+    """mean distance of neighbors"""
 
 
 def sample_surface(mesh: Mesh, number: int, rng: np.random.Generator) -> SurfaceSamples:
@@ -229,7 +229,7 @@ class RenderedCloud:
     color: Float[Tensor, "height width 3"]
     """over black"""
     depth: Float[Tensor, "height width"]
-    """mean z, normalized by coverage, metres"""
+    """mean z, normalized by coverage, meters"""
     agent: Float[Tensor, "height width"]
     coverage: Float[Tensor, "height width"]
     extra: Float[Tensor, "height width channel"]

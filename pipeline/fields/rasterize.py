@@ -1,7 +1,7 @@
 """Draw 3D Gaussians (Kerbl et al. 2023): `project` them into a camera, then blend them front to back.
 
-`blend_dense` is the readable reference in torch, for few Gaussians. `draw` uses the tile rasteriser
-for a CPU or gsplat on CUDA; the tile rasteriser is tested against the reference, values and gradients.
+`blend_dense` is the readable reference in torch, for few Gaussians. `draw` uses the tile rasterizer
+for a CPU or gsplat on CUDA; the tile rasterizer is tested against the reference, values and gradients.
 """
 
 from typing import Literal, assert_never
@@ -29,7 +29,7 @@ def project(
 
     Args:
         rotation: quaternions wxyz, world from the Gaussian's own axes.
-        log_scale: logarithm of the standard deviations in metres.
+        log_scale: logarithm of the standard deviations in meters.
     """
     view = camera_from_world[:3, :3]
     x, y, depth = (means_world @ view.T + camera_from_world[:3, 3]).unbind(-1)
@@ -99,7 +99,7 @@ def draw(
     camera_from_world: Float[Tensor, "4 4"], intrinsics: Float[Tensor, "3 3"],
     height: int, width: int, backend: Backend = "tiles",
 ) -> tuple[Float[Tensor, "height width channel"], Float[Tensor, "height width"]]:  # fmt: skip
-    """Draw Gaussians with any values (colour, depth, masks ...): returns blended values and coverage 0..1."""
+    """Draw Gaussians with any values (color, depth, masks ...): returns blended values and coverage 0..1."""
     match backend:
         case "tiles" | "dense":
             footprints = project(

@@ -1,4 +1,4 @@
-"""The Gaussian rasteriser for CUDA: gsplat, an optional dependency."""
+"""The Gaussian rasterizer for CUDA: gsplat, an optional dependency."""
 
 import importlib
 
@@ -45,7 +45,7 @@ class Gsplat:
         height: int,
         width: int,
     ) -> tuple[Float[Tensor, "height width channel"], Float[Tensor, "height width"]]:
-        """Draw one view, metres; see `pipeline.fields.rasterize.draw`."""
+        """Draw one view, meters; see `pipeline.fields.rasterize.draw`."""
         image, coverage, _ = self._rasterization(
             means_world, torch.nn.functional.normalize(rotation, dim=-1), log_scale.exp(), opacity, values,
             camera_from_world[None], intrinsics[None], width, height, near_plane=0.1, eps2d=BLUR_PX2,

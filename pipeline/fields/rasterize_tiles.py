@@ -1,4 +1,4 @@
-"""The Gaussian rasteriser for a CPU: numba over tiles of 8 x 8 pixels, with an analytic backward pass.
+"""The Gaussian rasterizer for a CPU: numba over tiles of 8 x 8 pixels, with an analytic backward pass.
 
 Gradients are gathered in a fixed number of buffers, each filled in a fixed order, so that the result does not
 depend on the number of threads.

@@ -35,7 +35,7 @@ class Layer:
     """One field's density, color and features at samples along rays."""
 
     density: Float[Tensor, "ray sample"]
-    """per metre"""
+    """per meter"""
     color: Float[Tensor, "ray sample 3"]
     feature: Float[Tensor, "ray sample 16"]
 
@@ -63,7 +63,7 @@ class Rendered:
     color: Float[Tensor, "ray 3"]
     feature: Float[Tensor, "ray 16"]
     depth: Float[Tensor, "ray"]
-    """expected z in metres, normalized by opacity"""
+    """expected z in meters, normalized by opacity"""
     agent: Float[Tensor, "ray"]
     """opacity of the agent, 0..1"""
     opacity: Float[Tensor, "ray"]
@@ -79,7 +79,7 @@ def ray_weights(
     """Return the weight of each sample in the rendering integral (ATS, Eq. 15); arguments as
     `composite`'s.
 
-    Each sample represents the interval up to halfway to its neighbours.
+    Each sample represents the interval up to halfway to its neighbors.
     """
     optical_depth = density * _interval_edges(depth_m).diff(dim=-1) * length[:, None]
     return torch.exp(-(optical_depth.cumsum(-1) - optical_depth)) * (1 - torch.exp(-optical_depth))
@@ -98,7 +98,7 @@ def importance_depths(
     density: Float[Tensor, "ray sample"],
     generator: Generator | None = None,
 ) -> Float[Tensor, "ray sample"]:
-    """Draw as many more samples, z in metres, from the weights of a coarse pass (NeRF, Mildenhall et al.
+    """Draw as many more samples, z in meters, from the weights of a coarse pass (NeRF, Mildenhall et al.
     2020, Sec. 5.2).
 
     Stratified with a ``generator``, else at the middle of each stratum.
@@ -128,7 +128,7 @@ def composite(
 
     Args:
         depth_m: z of the samples, increasing.
-        length: metres along each ray per metre of z.
+        length: meters along each ray per meter of z.
         agent: None where there is none.
     """
     density, color, feature = scene.density, scene.color, scene.feature
@@ -165,7 +165,7 @@ def render_depth(
     importance samples are composited. Without the agent's pose the scene alone is rendered.
 
     Returns:
-        Expected z in metres (0 where the fields are less opaque than `MIN_OPACITY`), and the agent's
+        Expected z in meters (0 where the fields are less opaque than `MIN_OPACITY`), and the agent's
         opacity, 0..1.
     """
     device = reconstruction.scene.log_beta.device
@@ -213,7 +213,7 @@ class _PosedRays:
     def layers(
         self, depth: Float[Tensor, "ray sample"], min_beta_m: float = 0.0
     ) -> tuple[Layer, Layer | None]:
-        """Evaluate scene and posed agent at samples, z in metres; `Field.density` explains the least beta."""
+        """Evaluate scene and posed agent at samples, z in meters; `Field.density` explains the least beta."""
         scene, agent, body = self.reconstruction.scene, self.reconstruction.agent, self.reconstruction.body
         points_camera = (self.direction[:, None] * depth[..., None]).reshape(-1, 3)
         world = rigid_torch.apply(self.world_from_camera, points_camera)
@@ -232,7 +232,7 @@ class DrawnView:
 
     color: UInt8[np.ndarray, "height width 3"]
     depth: Float[np.ndarray, "height width"]
-    """metres along z; 0 = nothing there"""
+    """meters along z; 0 = nothing there"""
     agent: Bool[np.ndarray, "height width"]
     """the agent is in front"""
 

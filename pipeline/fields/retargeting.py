@@ -3,7 +3,7 @@
 Bones are learned per animal and do not correspond, so motion is transferred by surfaces:
 `find_correspondences` aligns the extents of both bodies, `transfer` moves the corresponding points with the
 source, and `fit_bones` finds the bone poses whose linear blend fits them best. `retarget_root`
-scales the path. Shapes are canonical (agent frame, +z towards the head), metres.
+scales the path. Shapes are canonical (agent frame, +z towards the head), meters.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ EXTENT_PERCENT = (1.0, 99.0)
 SURFACE_POINTS = 600
 """Vertices of the target that bones are fitted to, evenly chosen."""
 SWEEPS = 6
-"""Passes over all bones; a body retargeted to itself is then within a millimetre."""
+"""Passes over all bones; a body retargeted to itself is then within a millimeter."""
 FRAMES_AT_ONCE = 256
 ROTATION_PRIOR = 1e-3
 """Weight of the transferred rotation relative to the points: resolves fits of collinear points."""
@@ -72,7 +72,7 @@ def find_correspondences(
 
 def shape_distance_m(source: SkinnedShape, target: SkinnedShape) -> float:
     """Return how far the body plans differ: mean distance from the target's vertices to the source's after
-    aligning extents, metres."""
+    aligning extents, meters."""
     scaled = _scaled(source, target, source.vertices)
     return float(KDTree(scaled).query(target.vertices)[0].mean())
 

@@ -46,7 +46,7 @@ def skinning_weights(
     """Return the probability of each bone for each point (ATS, Sec. 3.1).
 
     Args:
-        points_agent: points in the agent frame, in metres.
+        points_agent: points in the agent frame, in meters.
         agent_from_bone_rest: bones at rest, or posed bones when the points are posed.
         bone_scale_m: standard deviations of the Gaussian bones along their own axes.
         delta: learned correction, added to the logits.
@@ -98,7 +98,7 @@ def move(
     points: Float[Tensor, "*#batch point 3"],
     inverse: bool = False,
 ) -> Float[Tensor, "*#batch point 3"]:
-    """Apply one motion of `blend` a point, or its inverse with ``inverse``, metres.
+    """Apply one motion of `blend` a point, or its inverse with ``inverse``, meters.
 
     Component by component: PyTorch takes several times longer over axes of length 3.
     """
@@ -114,7 +114,7 @@ def move(
 
 @dataclass(frozen=True)
 class SkinnedShape:
-    """A surface at rest with its skinning weights and bones; agent frame, metres."""
+    """A surface at rest with its skinning weights and bones; agent frame, meters."""
 
     vertices: Float[np.ndarray, "vertex 3"]
     weights: Float[np.ndarray, "vertex bone"]

@@ -23,7 +23,7 @@ _DESCENT_STEPS = 150
 
 @dataclass(frozen=True)
 class Poses:
-    """Some poses of bones and surface, agent frame, metres."""
+    """Some poses of bones and surface, agent frame, meters."""
 
     posed_from_rest: Float[np.ndarray, "frame bone 4 4"]
     """motion of each bone"""
@@ -96,7 +96,7 @@ def _gram(
 def _descend_on_simplex(
     gram: Float[np.ndarray, "vertex k k"], weights: Float[np.ndarray, "vertex k"]
 ) -> Float[np.ndarray, "vertex k"]:
-    """Minimise w' G w over convex weights by projected gradient descent."""
+    """Minimize w' G w over convex weights by projected gradient descent."""
     rate = 1.0 / np.maximum(np.trace(gram, axis1=1, axis2=2), 1e-20)[:, None]
     for _ in range(_DESCENT_STEPS):
         weights = _project_to_simplex(weights - rate * np.einsum("vij,vj->vi", gram, weights))
@@ -112,7 +112,7 @@ def _project_to_simplex(values: Float[np.ndarray, "vertex k"]) -> Float[np.ndarr
 
 
 def _best_on_simplex(gram: Float[np.ndarray, "vertex k k"]) -> Float[np.ndarray, "vertex k"]:
-    """Minimise w' G w over convex weights exactly, by enumerating all supports."""
+    """Minimize w' G w over convex weights exactly, by enumerating all supports."""
     count = gram.shape[1]
     ridge = 1e-9 * (np.trace(gram, axis1=1, axis2=2)[:, None, None] + 1e-12) * np.eye(count)
     best, best_cost = np.zeros(gram.shape[:2]), np.full(len(gram), np.inf)

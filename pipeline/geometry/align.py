@@ -46,7 +46,7 @@ def ransac_rigid(
     """Return ``target_from_source`` and the inliers among correspondences with many outliers.
 
     Triplets are drawn by weight; those whose side lengths disagree or whose sides are shorter than
-    ``min_side_m`` are dropped before the closed form. The best hypothesis minimises the truncated distance
+    ``min_side_m`` are dropped before the closed form. The best hypothesis minimizes the truncated distance
     and is refitted on its inliers. With fewer than 3 points the identity and no inliers are returned.
     """
     count = len(source)

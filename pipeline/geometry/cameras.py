@@ -1,6 +1,6 @@
-"""Pinhole cameras in OpenCV axes: x right, y down, z forward; pixel centres at +0.5; depth is z.
+"""Pinhole cameras in OpenCV axes: x right, y down, z forward; pixel centers at +0.5; depth is z.
 
-This file owns the pixel-centre rule, the OpenGL flip and the quarter turns. Projection works on NumPy arrays
+This file owns the pixel-center rule, the OpenGL flip and the quarter turns. Projection works on NumPy arrays
 and on torch tensors alike, lookups in images on NumPy arrays.
 """
 
@@ -20,14 +20,14 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def pixel_grid(height: int, width: int) -> Float[np.ndarray, "height width 2"]:
-    """Return the pixel centres (x, y) of an image."""
+    """Return the pixel centers (x, y) of an image."""
     return pixel_centres(*np.indices((height, width)))
 
 
 def pixel_centres(
     row: Int[np.ndarray, "*batch"], column: Int[np.ndarray, "*batch"]
 ) -> Float[np.ndarray, "*batch 2"]:
-    """Return the centres (x, y) of pixels given by row and column."""
+    """Return the centers (x, y) of pixels given by row and column."""
     return np.stack([column, row], axis=-1) + 0.5
 
 
@@ -56,7 +56,7 @@ def unproject(pixel: Array, intrinsics: Array) -> Array:
 def back_project(
     depth: Float[np.ndarray, "height width"], intrinsics: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "height width 3"]:
-    """Lift a depth image to points in camera axes; unknown depth 0 gives the camera's centre."""
+    """Lift a depth image to points in camera axes; unknown depth 0 gives the camera's center."""
     return ray_directions(intrinsics, *depth.shape) * depth[..., None]
 
 
@@ -79,7 +79,7 @@ def in_picture(pixel: Array, z: Array, size: tuple[int, int], nearest_m: float =
 def sample_nearest(
     image: Shaped[np.ndarray, "height width"], pixel: Float[np.ndarray, "*batch 2"]
 ) -> Shaped[np.ndarray, "*batch"]:
-    """Return the values of an image at pixels (x, y) by nearest-neighbour lookup; 0 outside."""
+    """Return the values of an image at pixels (x, y) by nearest-neighbor lookup; 0 outside."""
     inside = in_picture(pixel, np.ones(pixel.shape[:-1]), image.shape)
     values = image[pixel_index(np.where(inside[..., None], pixel, 0))]
     return np.where(inside, values, image.dtype.type(0))
@@ -99,7 +99,7 @@ def lookup_depth(
     points_camera: Float[np.ndarray, "*batch 3"],
     nearest_m: float = 0.0,
 ) -> Float[np.ndarray, "*batch"]:
-    """Return the depth (metres) measured where points project; 0 where it is unknown or the point is out of
+    """Return the depth (meters) measured where points project; 0 where it is unknown or the point is out of
     view or not farther than ``nearest_m``. Points may also be rays, in the depth camera's axes."""
     pixel, z = project(points_camera, intrinsics)
     return np.where(z > nearest_m, sample_nearest(depth, pixel), 0)
@@ -111,7 +111,7 @@ def back_project_pixels(
     depth: Float[np.ndarray, "depth_height depth_width"],
     depth_intrinsics: Float[np.ndarray, "3 3"],
 ) -> Float[np.ndarray, "*batch 3"]:
-    """Back-project pixels by a depth image of the same camera centre and axes; zero where it is unknown."""
+    """Back-project pixels by a depth image of the same camera center and axes; zero where it is unknown."""
     ray = unproject(pixel, intrinsics)
     return ray * lookup_depth(depth, depth_intrinsics, ray)[..., None]
 

@@ -1,6 +1,6 @@
 """Depth of an animal in a single picture, from the contact of its lowest pixels with the map.
 
-The body is modelled as a box: a vertical face at the contact point towards the camera, and a level back.
+The body is modeled as a box: a vertical face at the contact point towards the camera, and a level back.
 """
 
 from dataclasses import dataclass
@@ -60,7 +60,7 @@ def depth_of(
     world_from_camera: Float[np.ndarray, "4 4"],
 ) -> Float[np.ndarray, "height width"]:
     """Return the depth of a body of height ``back_m`` at a contact point inside a mask; 0 outside the mask
-    and where rays miss the body. Metres, world +y up."""
+    and where rays miss the body. Meters, world +y up."""
     rows, columns = np.nonzero(mask)
     eye = world_from_camera[:3, 3]
     rays = cameras.unproject(cameras.pixel_centres(rows, columns), intrinsics) @ world_from_camera[:3, :3].T

@@ -1,4 +1,4 @@
-"""Mesh decimation by edge collapse, with colours and vertex correspondence."""
+"""Mesh decimation by edge collapse, with colors and vertex correspondence."""
 
 import fast_simplification
 import numpy as np

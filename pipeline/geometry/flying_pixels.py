@@ -4,11 +4,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 SUPPORTERS, TOLERANCE_M = 3, 0.03
-"""neighbours within this tolerance of depth on a surface; a flying pixel along a straight edge has two"""
+"""neighbors within this tolerance of depth on a surface; a flying pixel along a straight edge has two"""
 
 
 def supported(depth: Float[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
-    """Return which pixels have three of eight neighbours at nearly their own depth (metres, 0 = unknown)."""
+    """Return which pixels have three of eight neighbors at nearly their own depth (meters, 0 = unknown)."""
     height, width = depth.shape
     around = np.pad(depth, 1)
     count = np.zeros(depth.shape, np.uint8)

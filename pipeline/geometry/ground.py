@@ -83,7 +83,7 @@ def floor_direction(
 def _spherical_cap(
     centre: Float[np.ndarray, "3"], radius_rad: float, count: int
 ) -> Float[np.ndarray, "direction 3"]:
-    """Return directions on a Fibonacci spiral within an angle of a centre, the centre first."""
+    """Return directions on a Fibonacci spiral within an angle of a center, the center first."""
     share = np.arange(count) / count
     cosine, turn = 1 - share * (1 - np.cos(radius_rad)), np.pi * (3 - np.sqrt(5)) * np.arange(count)
     sine = np.sqrt(1 - cosine**2)

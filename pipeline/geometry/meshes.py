@@ -12,19 +12,19 @@ from pipeline.geometry import cameras
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh in one frame, metres."""
+    """A triangle mesh in one frame, meters."""
 
     vertices: Float[np.ndarray, "vertex 3"]
     faces: Int[np.ndarray, "face 3"]
     color: UInt8[np.ndarray, "vertex 3"] | None = None
 
     def face_areas(self) -> Float[np.ndarray, "face"]:
-        """Return the area of each face, square metres."""
+        """Return the area of each face, square meters."""
         return np.linalg.norm(area_normals(self.vertices[self.faces].astype(np.float64)), axis=-1) / 2
 
     @property
     def area_m2(self) -> float:
-        """Area of all faces, square metres."""
+        """Area of all faces, square meters."""
         return float(self.face_areas().sum())
 
     def face_normals(self) -> Float[np.ndarray, "face 3"]:
@@ -78,7 +78,7 @@ class RayCaster:
         origins: Float[np.ndarray, "ray 3"] | Float[np.ndarray, "3"],
         directions: Float[np.ndarray, "ray 3"],
     ) -> Hits:
-        """Return the first hit of each ray, from origins of its own or one of all, mesh frame, metres."""
+        """Return the first hit of each ray, from origins of its own or one of all, mesh frame, meters."""
         origins = np.ascontiguousarray(np.broadcast_to(origins, directions.shape), np.float32)
         found = self._scene.run(origins, np.ascontiguousarray(directions, np.float32), output=True)
         hit = found["primID"] >= 0

@@ -1,7 +1,7 @@
 """Rigid motions as 4x4 matrices in NumPy, always named ``a_from_b``.
 
 Build them with `make` or `exp`, chain them with ``@``, move points with `apply`, undo with `inverse`.
-Quaternions are wxyz with w >= 0; this file owns that order. Angles are radians, lengths metres.
+Quaternions are wxyz with w >= 0; this file owns that order. Angles are radians, lengths meters.
 """
 
 import itertools
@@ -20,7 +20,7 @@ ANY_OTHER = np.array([0.3, 0.2, 0.1])
 def make(
     rotation: Float[np.ndarray, "*#batch 3 3"], translation: Float[np.ndarray, "*#batch 3"]
 ) -> Float[np.ndarray, "*#batch 4 4"]:
-    """Assemble transforms from rotations and translations, metres (broadcast over the batch)."""
+    """Assemble transforms from rotations and translations, meters (broadcast over the batch)."""
     rotation, translation = np.asarray(rotation, float), np.asarray(translation, float)
     batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     a_from_b = np.zeros((*batch, 4, 4))
@@ -56,7 +56,7 @@ def vector_from_rotation(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.
 
 
 def exp(twist: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 4 4"]:
-    """Make a transform from (rotation vector in radians, translation in metres), decoupled: SO(3) x R^3."""
+    """Make a transform from (rotation vector in radians, translation in meters), decoupled: SO(3) x R^3."""
     return make(rotation_from_vector(twist[..., :3]), twist[..., 3:])
 
 
@@ -124,7 +124,7 @@ def rotation_to_6d(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarra
 
 
 def rotation_from_6d(columns: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """Orthonormalise two columns into a rotation (Zhou et al. 2019, Eq. 15), parallel ones into any."""
+    """Orthonormalize two columns into a rotation (Zhou et al. 2019, Eq. 15), parallel ones into any."""
     first = normalized(columns[..., :3])
     second = columns[..., 3:] - (first * columns[..., 3:]).sum(-1, keepdims=True) * first
     parallel = np.linalg.norm(second, axis=-1, keepdims=True) < PARALLEL

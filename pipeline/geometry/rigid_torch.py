@@ -17,7 +17,7 @@ def so3_exp(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 def make(
     rotation: Float[Tensor, "*#batch 3 3"], translation: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*#batch 4 4"]:
-    """Assemble transforms from rotations and translations, metres."""
+    """Assemble transforms from rotations and translations, meters."""
     top = torch.cat([rotation, translation[..., None]], dim=-1)
     bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=rotation.dtype, device=rotation.device).expand(
         *top.shape[:-2], 1, 4
@@ -55,7 +55,7 @@ def quaternion_from_rotation(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Ten
 
 
 def rotation_from_6d(columns: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 3 3"]:
-    """Orthonormalise two columns into a rotation (Zhou et al. 2019, Eq. 15)."""
+    """Orthonormalize two columns into a rotation (Zhou et al. 2019, Eq. 15)."""
     first = torch.nn.functional.normalize(columns[..., :3], dim=-1)
     second = columns[..., 3:] - (first * columns[..., 3:]).sum(-1, keepdim=True) * first
     second = torch.nn.functional.normalize(second, dim=-1)

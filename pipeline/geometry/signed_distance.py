@@ -1,4 +1,4 @@
-"""Signed distance field of a scene, negative inside solids. World frame, metres.
+"""Signed distance field of a scene, negative inside solids. World frame, meters.
 
 `from_mesh` computes it on a voxel grid: distance from dense surface samples, sign from a vote of rays, which
 tolerates open meshes. `SignedDistance.at` interpolates it differentiably.
@@ -30,11 +30,11 @@ RAYS = np.array(
 
 @dataclass(frozen=True)
 class SignedDistance:
-    """Distances at the centres of voxels."""
+    """Distances at the centers of voxels."""
 
     values: Float[Tensor, "x y z"]
     origin: Float[Tensor, "3"]
-    """world position of the centre of the first voxel"""
+    """world position of the center of the first voxel"""
     voxel_m: float
 
     def at(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
@@ -79,7 +79,7 @@ def surface_points(mesh: Mesh, spacing_m: float) -> SurfacePoints:
 def voxel_centres(
     low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], voxel_m: float
 ) -> Float[np.ndarray, "x y z 3"]:
-    """Return the centres of the voxels between two corners of a box, the first one at ``low``; metres."""
+    """Return the centers of the voxels between two corners of a box, the first one at ``low``; meters."""
     shape = np.maximum(np.ceil((np.asarray(high, float) - low) / voxel_m).astype(int), 2)
     axes = [low[axis] + voxel_m * np.arange(shape[axis]) for axis in range(3)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)

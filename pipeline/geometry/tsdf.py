@@ -1,4 +1,4 @@
-"""TSDF fusion of posed depth and colour, and extraction of the observed surface (Curless and Levoy 1996).
+"""TSDF fusion of posed depth and color, and extraction of the observed surface (Curless and Levoy 1996).
 
 `enclose` makes an empty volume around points, `Volume.integrate` fuses a frame, `Volume.surface` extracts the
 mesh.
@@ -13,19 +13,19 @@ from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
 
 CORNER_SHARE = 1e-4
-"""added to trilinear weights, so that a point at a corner without color takes its neighbours' colors"""
+"""added to trilinear weights, so that a point at a corner without color takes its neighbors' colors"""
 FREE_GAIN = 0.2
 """Weight of free-space observations against surface ones, to keep rims and thin legs."""
 
 
 class Volume:
-    """A dense grid of signed distance (positive in free space, in truncations), weight and colour."""
+    """A dense grid of signed distance (positive in free space, in truncations), weight and color."""
 
     def __init__(
         self, origin: Float[np.ndarray, "3"], shape: tuple[int, int, int], voxel_m: float, truncation_m: float
     ):
         self.origin = np.asarray(origin, float)
-        """World position of the centre of voxel 0."""
+        """World position of the center of voxel 0."""
         self.voxel_m, self.truncation_m = voxel_m, truncation_m
         self.distance = np.ones(shape, np.float32)
         self.weight = np.zeros(shape, np.float32)

@@ -12,7 +12,7 @@ from pipeline.geometry.subsampling import runs
 EXTENT, MARGIN_M = (0.002, 0.998), 0.2
 """quantiles of vertices that span a picture, without stray ones, and the margin around them"""
 UNCOLORED = 170
-"""grey value of a surface without colors"""
+"""gray value of a surface without colors"""
 BACKGROUND = 245
 
 
@@ -22,7 +22,7 @@ class Overview:
 
     image: UInt8[np.ndarray, "height width 3"]
     origin: Float[np.ndarray, "2"]
-    """World (x, z) of the picture's upper left corner, metres."""
+    """World (x, z) of the picture's upper left corner, meters."""
     meter_px: float
 
     def pixel(self, points_world: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point 2"]:
@@ -61,13 +61,13 @@ def view(
     height: int,
     width: int,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw a mesh with its vertex colours as a camera sees it."""
+    """Draw a mesh with its vertex colors as a camera sees it."""
     _, hits = render_view(caster, world_from_camera, intrinsics, height, width)
     return shade(caster.mesh, hits).reshape(height, width, 3)
 
 
 def shade(mesh: Mesh, hits) -> UInt8[np.ndarray, "ray 3"]:
-    """Return the vertex colours at the hits, light grey where nothing was hit."""
+    """Return the vertex colors at the hits, light gray where nothing was hit."""
     color = np.full((len(mesh.vertices), 3), UNCOLORED, np.uint8) if mesh.color is None else mesh.color
     painted = np.clip(np.round(hits.interpolate(mesh, color)), 0, 255).astype(np.uint8)
     return np.where((hits.face >= 0)[:, None], painted, np.uint8(BACKGROUND))

@@ -1,6 +1,6 @@
 """Localizers: estimate the camera pose of one RGB-D picture relative to a map (the scene or the agent).
 
-Two kinds: nearest neighbours in a bank of rendered patches, followed by RANSAC over rigid alignments (depth
+Two kinds: nearest neighbors in a bank of rendered patches, followed by RANSAC over rigid alignments (depth
 is known), and the paper's absolute pose regression. Descriptors are DAISY or those of the network that the
 features were fitted with. The inlier ratio is calibrated to a probability. `load` opens a trained localizer,
 `Localizer.localize` queries it.
@@ -72,9 +72,9 @@ class RansacSolver:
     """RANSAC parameters that turn matched patches into one pose."""
 
     threshold_m: float
-    """Inlier threshold: distance between a patch and its match, metres."""
+    """Inlier threshold: distance between a patch and its match, meters."""
     min_side_m: float
-    """Least side of a RANSAC sample's triangle, metres."""
+    """Least side of a RANSAC sample's triangle, meters."""
     iterations: int
     """Number of RANSAC samples of three matches."""
     sectors: int
@@ -105,7 +105,7 @@ class Localizer:
     ) -> list[PoseHypothesis]:
         """Return pose hypotheses, best first; at most one for a scene.
 
-        Depth in metres, intrinsics in pixels; ``mask`` limits the picture to where the target may be.
+        Depth in meters, intrinsics in pixels; ``mask`` limits the picture to where the target may be.
         """
         patches = extract_patches(
             color, depth, depth_intrinsics, intrinsics, mask, self.sampling, self.describe
@@ -147,7 +147,7 @@ class Localizer:
         return self._hypothesis(map_from_camera, ratio, matched[inlier], points_camera)
 
     def _regress(self, net, query, patches) -> PoseHypothesis:
-        """Regress the map position of the camera's centre, or of the animal's."""
+        """Regress the map position of the camera's center, or of the animal's."""
         points = patches.points_camera
         anchor = np.zeros(3) if self.sampling.target == "scene" else np.median(points, axis=0)
         map_from_camera, certainty = net.regress(query, patches.cell, anchor)

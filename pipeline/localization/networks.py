@@ -1,6 +1,6 @@
 """The paper's absolute pose regression.
 
-`PoseRegressor`, a ResNet-18 with group normalisation over dense descriptors, regresses the camera's rotation
+`PoseRegressor`, a ResNet-18 with group normalization over dense descriptors, regresses the camera's rotation
 (a unit quaternion) and position (Eq. 5), and its expected error.
 """
 
@@ -14,15 +14,15 @@ from pipeline.geometry import rigid, rigid_torch
 GRID = 16
 """Cells along each side of the regressor's descriptor grid."""
 GROUPS, HIDDEN = 8, 256
-"""Groups of the group normalisation, and hidden units of the head."""
+"""Groups of the group normalization, and hidden units of the head."""
 MIN_LOG, MAX_LOG = -6.0, 3.0
-"""Bounds of the predicted log error (radians + metres)."""
+"""Bounds of the predicted log error (radians + meters)."""
 IDENTITY_BIAS = 1e-3
 """Added to the quaternion's real part, so that zero output is a rotation."""
 
 
 class _ResidualBlock(nn.Module):
-    """Residual block of two 3x3 convolutions (He et al. 2016) with group normalisation."""
+    """Residual block of two 3x3 convolutions (He et al. 2016) with group normalization."""
 
     def __init__(self, c_in: int, c_out: int, stride: int):
         super().__init__()
@@ -37,7 +37,7 @@ class _ResidualBlock(nn.Module):
 
 
 class PoseRegressor(nn.Module):
-    """Descriptor grid -> rotation, anchor position in the map (metres), log of the expected error."""
+    """Descriptor grid -> rotation, anchor position in the map (meters), log of the expected error."""
 
     middle: Tensor
     extent: Tensor
@@ -62,7 +62,7 @@ class PoseRegressor(nn.Module):
     def forward(
         self, grid: Float[Tensor, "batch axis row column"]
     ) -> tuple[Float[Tensor, "batch 3 3"], Float[Tensor, "batch 3"], Float[Tensor, "batch"]]:
-        """Return rotations ``map_from_camera``, positions of the anchor in the map (metres), log errors."""
+        """Return rotations ``map_from_camera``, positions of the anchor in the map (meters), log errors."""
         out = self.head(self.trunk(grid * grid.shape[1] ** 0.5))
         quaternion = out[:, :4] + out.new_tensor([IDENTITY_BIAS, 0, 0, 0])
         return (
@@ -80,7 +80,7 @@ class PoseRegressor(nn.Module):
     ) -> tuple[Float[np.ndarray, "4 4"], float]:
         """Return ``map_from_camera`` of one picture and a certainty in 0..1.
 
-        ``anchor_camera`` is the point whose map position is regressed, camera frame, metres.
+        ``anchor_camera`` is the point whose map position is regressed, camera frame, meters.
         """
         rotation, position, log_error = self(torch.from_numpy(on_grid(query, cell))[None])
         matrix = rotation[0].double().numpy()
@@ -92,7 +92,7 @@ class PoseRegressor(nn.Module):
 def on_grid(
     query: Float[np.ndarray, "patch axis"], cell: Int[np.ndarray, "patch 2"]
 ) -> Float[np.ndarray, "axis row column"]:
-    """Scatter patches onto the regressor's grid: centred, subsampled to fit, zero where empty."""
+    """Scatter patches onto the regressor's grid: centered, subsampled to fit, zero where empty."""
     extent = cell.max(0) + 1
     target = (
         cell * GRID // max(int(extent.max()), GRID)
@@ -108,7 +108,7 @@ def pose_loss(
     log_error: Float[Tensor, "batch"],
     true_rotation: Float[Tensor, "batch 3 3"], true_position: Float[Tensor, "batch 3"],
 ) -> tuple[Float[Tensor, "batch"], Float[Tensor, "batch"]]:  # fmt: skip
-    """Return the loss of Eq. 5, geodesic angle plus squared distance (radians, square metres), and the
+    """Return the loss of Eq. 5, geodesic angle plus squared distance (radians, square meters), and the
     negative log likelihood of angle plus distance.
     """
     chord = (rotation - true_rotation).flatten(1).norm(dim=1) / 8**0.5

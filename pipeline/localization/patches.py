@@ -1,7 +1,7 @@
 """Patches of an RGB-D picture: resized to one scale, described by DAISY or DINOv2, back-projected by depth.
 
 `extract_patches` describes one picture, `PcaBasis` reduces its descriptors, `PatchBank` finds nearest
-neighbours among patches of rendered views. Views of the agent are scaled by their depth.
+neighbors among patches of rendered views. Views of the agent are scaled by their depth.
 """
 
 from collections.abc import Callable
@@ -23,9 +23,9 @@ MIN_PATCHES = 6
 MIN_MASK_PX, MIN_DEPTH_PX, DEPTH_SAMPLES = 30, 10, 400
 """Agent: least mask pixels, least of them with depth, and mask pixels sampled for the median depth."""
 MIN_DEPTH_M = 0.1
-"""Smaller depth counts as missing, metres."""
+"""Smaller depth counts as missing, meters."""
 GREY = 128
-"""Grey value outside the mask."""
+"""Gray value outside the mask."""
 KEYPOINT_PX = 8.0
 """Size of DAISY's keypoints, pixels; no effect on unrotated descriptors."""
 PCA_SAMPLES = 20_000
@@ -43,7 +43,7 @@ class PatchSampling:
 
     target: Target
     focal_px: float
-    """Scene: focal length that pictures are resized to, pixels. Agent: pixels per metre of the crops."""
+    """Scene: focal length that pictures are resized to, pixels. Agent: pixels per meter of the crops."""
     window_px: int
     """Agent: edge of the square crop, pixels; scene: unused."""
     stride_px: int
@@ -58,7 +58,7 @@ class Patches:
 
     descriptors: Float[np.ndarray, "patch channel"]
     points_camera: Float[np.ndarray, "patch 3"]
-    """Metres."""
+    """Meters."""
     cell: Int[np.ndarray, "patch 2"]
     """Row and column of each patch on the picture's grid."""
 
@@ -71,7 +71,7 @@ class PcaBasis:
     components: Float[np.ndarray, "axis channel"]
 
     def project(self, descriptors: Float[np.ndarray, "patch channel"]) -> Float[np.ndarray, "patch axis"]:
-        """Project descriptors onto the components and normalise to unit length."""
+        """Project descriptors onto the components and normalize to unit length."""
         reduced = (descriptors.astype(np.float32) - self.mean) @ self.components.T
         return reduced / np.maximum(np.linalg.norm(reduced, axis=1, keepdims=True), MIN_NORM)
 
@@ -93,14 +93,14 @@ class PatchBank:
     descriptors: Float[np.ndarray, "patch axis"]
     """Unit length."""
     points_map: Float[np.ndarray, "patch 3"]
-    """Metres."""
+    """Meters."""
     view: Int[np.ndarray, "patch"]
     map_from_camera: Float[np.ndarray, "view 4 4"]
 
     def match(
         self, query: Float[np.ndarray, "query axis"], subset: Int[np.ndarray, "subset"] | None = None
     ) -> tuple[Float[np.ndarray, "query 3"], Float[np.ndarray, "query"]]:
-        """Return the map point of each query's nearest neighbour (optionally in a subset), and its weight."""
+        """Return the map point of each query's nearest neighbor (optionally in a subset), and its weight."""
         descriptors, points = self.descriptors, self.points_map
         if subset is not None:
             descriptors, points = descriptors[subset], points[subset]
@@ -127,7 +127,7 @@ class PatchBank:
 def describe_daisy(
     picture: UInt8[np.ndarray, "height width 3"], sampling: PatchSampling
 ) -> tuple[Float[np.ndarray, "patch channel"], Float[np.ndarray, "patch 2"]]:
-    """Return dense DAISY descriptors (Tola et al. 2010) of a resized picture and their centres, pixels."""
+    """Return dense DAISY descriptors (Tola et al. 2010) of a resized picture and their centers, pixels."""
     gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     offset = sampling.stride_px // 2
     y, x = np.mgrid[offset : gray.shape[0] : sampling.stride_px, offset : gray.shape[1] : sampling.stride_px]
@@ -141,7 +141,7 @@ def describe_daisy(
 def describe_cells(
     picture: UInt8[np.ndarray, "height width 3"], stride_px: int, describe: Describe
 ) -> tuple[Float[np.ndarray, "patch channel"], Float[np.ndarray, "patch 2"]]:
-    """Return a network's descriptors of a resized picture and their cell centres, pixels."""
+    """Return a network's descriptors of a resized picture and their cell centers, pixels."""
     cells = describe(picture, stride_px)
     centre = (cameras.pixel_grid(*cells.shape[:2]) * stride_px).reshape(-1, 2)
     return cells.reshape(-1, cells.shape[-1]), centre
@@ -159,7 +159,7 @@ def extract_patches(
     """Describe one picture at the localizer's scale; None if too little of the target is visible.
 
     Args:
-        color, depth, depth_intrinsics, intrinsics: RGB, metres (0 = unknown), pixels; one camera centre.
+        color, depth, depth_intrinsics, intrinsics: RGB, meters (0 = unknown), pixels; one camera center.
         mask: pixels of the target; None: all.
         sampling: scale and grid.
         describe: a network; None: DAISY at the sampling's radii.
@@ -193,7 +193,7 @@ def extract_patches(
 
 
 def _crop(color, depth, depth_intrinsics, intrinsics, mask, sampling):
-    """Crop a square of fixed metric size around the mask, grey outside the mask; None without depth."""
+    """Crop a square of fixed metric size around the mask, gray outside the mask; None without depth."""
     row, column = np.nonzero(mask)
     if len(row) < MIN_MASK_PX:
         return None

@@ -20,12 +20,12 @@ from pipeline.geometry import rigid, rigid_torch, subsampling
 from pipeline.geometry.meshes import Mesh
 
 LEVER_M = 0.1
-"""Length that converts bone rotations in radians to metres in the pose space."""
+"""Length that converts bone rotations in radians to meters in the pose space."""
 
 
 @dataclass(frozen=True)
 class SkinnedBody:
-    """A skinned surface at rest, agent frame, metres."""
+    """A skinned surface at rest, agent frame, meters."""
 
     mesh: Mesh
     weights: Float[np.ndarray, "vertex bone"]

@@ -1,4 +1,4 @@
-"""Settings of long-term motion: network sizes, training, and motion optimisation.
+"""Settings of long-term motion: network sizes, training, and motion optimization.
 
 Standard library only, so that a stage's configuration can be read without torch.
 """
@@ -40,7 +40,7 @@ class LongTermOptimizerConfig:
 
 @dataclass(frozen=True)
 class MotionOptimizationConfig:
-    """Length of the optimisation; its terms are `motion_optimization.MotionTerms`."""
+    """Length of the optimization; its terms are `motion_optimization.MotionTerms`."""
 
     steps: int = 200
     """steps of Adam"""

@@ -1,7 +1,7 @@
 """Contact of a body with the scene, found from data: contact vertices, feet, and stance phases of each foot.
 
 `find_contact_vertices` takes the vertices that are among the closest to the scene in many frames; nothing is
-labelled by hand. `detect_stance` finds the frames in which each foot is in stance, for any motion.
+labeled by hand. `detect_stance` finds the frames in which each foot is in stance, for any motion.
 """
 
 from collections.abc import Iterator
@@ -139,7 +139,7 @@ def enforce_swing_time(
 ) -> Bool[np.ndarray, "frame foot"]:
     """Split, shorten or drop stance phases so that each foot has time to swing between two of them.
 
-    Phases with more than `STRIDE_M` of skate are split. A swing over d metres takes at least
+    Phases with more than `STRIDE_M` of skate are split. A swing over d meters takes at least
     sqrt(6 d / `SWING_M_S2`) seconds (a cubic in time, at rest at both ends).
     """
     enforced = np.zeros_like(stance)
@@ -185,7 +185,7 @@ def _make_room_to_swing(
 
 
 def motion_tensors(motion: BodyMotion) -> tuple[Float[Tensor, "frame 4 4"], Float[Tensor, "frame bone 4 4"]]:
-    """Return root and bones of a motion as torch tensors, metres."""
+    """Return root and bones of a motion as torch tensors, meters."""
     root, bones = np.asarray(motion.world_from_agent), np.asarray(motion.agent_from_bone)
     return torch.from_numpy(root).float(), torch.from_numpy(bones).float()
 

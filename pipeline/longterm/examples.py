@@ -73,7 +73,7 @@ class DatasetSplit:
 
 
 def reconstructed_split(reconstruction: Path, data: BehaviorData) -> DatasetSplit:
-    """Read stretches of two seconds or more of reconstructed sessions; behaviour test videos are held out."""
+    """Read stretches of two seconds or more of reconstructed sessions; behavior test videos are held out."""
     found = [
         (video, part) for video, trajectory in data.trajectories.items() for part in stretches(trajectory)
     ]
@@ -95,7 +95,7 @@ LEVEL_SHARE = 0.5
 LEVEL_HEIGHT_M = 0.03
 """Standard deviation of the heights of such places."""
 POSE_STRIDE = 3
-"""Stride of the frames that the pose space is fitted to: neighbours at 30 fps hardly differ."""
+"""Stride of the frames that the pose space is fitted to: neighbors at 30 fps hardly differ."""
 MOVED_M = 0.5
 """A clip that ends further than this from its start travels (the paper keeps only those)."""
 

@@ -1,4 +1,4 @@
-"""Long-term motion through sub-goals, or any other motion, optimised to be physically plausible.
+"""Long-term motion through sub-goals, or any other motion, optimized to be physically plausible.
 
 Plausibility before and after uses the same stance: the feet that should stand in the given motion.
 """
@@ -59,7 +59,7 @@ def travel(
     settings: MotionOptimizationConfig | None,
     rng: np.random.Generator,
 ) -> Journey:
-    """Synthesize motion through sub-goals; with ``settings`` None it is not optimised."""
+    """Synthesize motion through sub-goals; with ``settings`` None it is not optimized."""
     waypoints = plan_waypoints(subgoals, world.scene, world.model.motion_prior)
     roots, stops = waypoints.world_from_agent, waypoints.subgoal
     raw, _ = world.model.long_motion(roots, world.body, world.scene, rng, stops=stops)
@@ -70,7 +70,7 @@ def travel(
 def refine_motion(
     world: LongTermWorld, raw: BodyMotion, settings: MotionOptimizationConfig | None
 ) -> Journey:
-    """Optimise any motion at 30 fps, unless ``settings`` is None; the journey has no sub-goals."""
+    """Optimize any motion at 30 fps, unless ``settings`` is None; the journey has no sub-goals."""
     meter, stance = world.meter, world.meter.stance(raw, should_stand=True)
     motion = raw
     if settings is not None:
@@ -86,7 +86,7 @@ def refine_at_rate(
     given: BodyMotion,
     settings: MotionOptimizationConfig,
 ) -> tuple[BodyMotion, Plausibility, Plausibility]:
-    """Optimise motion of any rate; return it at its own times, and plausibility before and after."""
+    """Optimize motion of any rate; return it at its own times, and plausibility before and after."""
     raw = resample_motion(timestamp_s, given)
     meter, stance = world.meter, world.meter.stance(raw, should_stand=True)
     optimized = optimize_motion(raw, world.model.contact_body(world.body), world.scene.distance, settings)

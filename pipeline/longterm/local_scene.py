@@ -41,7 +41,7 @@ class LocalScene:
     points: Float[Tensor, "clip point 3"]
     """on the scene's surface"""
     field: Float[Tensor, "clip x y z"]
-    """signed distance at the voxels of the box, metres, in half precision"""
+    """signed distance at the voxels of the box, meters, in half precision"""
 
     def __getitem__(self, index: Int[Tensor, "some"] | Int[np.ndarray, "some"]) -> "LocalScene":
         """Return the surroundings of some of the clips."""

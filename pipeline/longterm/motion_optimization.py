@@ -1,8 +1,8 @@
-"""Motion optimisation for physical plausibility: no foot skate, no penetration, contact preserved.
+"""Motion optimization for physical plausibility: no foot skate, no penetration, contact preserved.
 
-`optimize_motion` optimises positions, orientations and poses of all frames jointly with Adam (Wang et al.
-2021, Sec. 3.4), for long-term motion, samples of the behaviour model and reconstructed motion alike. World
-frame, metres, radians.
+`optimize_motion` optimizes positions, orientations and poses of all frames jointly with Adam (Wang et al.
+2021, Sec. 3.4), for long-term motion, samples of the behavior model and reconstructed motion alike. World
+frame, meters, radians.
 """
 
 from dataclasses import dataclass, replace
@@ -23,9 +23,9 @@ from pipeline.longterm.plausibility import SOLID_M, PlausibilityMeter
 from pipeline.longterm.short_motions import BodyMotion
 
 LEARNING_RATE = 0.004
-"""Initial learning rate of Adam, metres and radians."""
+"""Initial learning rate of Adam, meters and radians."""
 RATE_FALL = 0.9
-"""Share of the learning rate by which it decays linearly over the optimisation."""
+"""Share of the learning rate by which it decays linearly over the optimization."""
 LIFT_FRAMES = 4
 """Frames before and after a lifted one over which the lift fades in and out."""
 HIGHEST_LIFT_M = 0.2
@@ -42,7 +42,7 @@ FRAMES_AT_ONCE = 100
 
 @dataclass(frozen=True)
 class MotionTerms:
-    """Weights and scales of the terms; each term is a mean over frames, in metres or square metres."""
+    """Weights and scales of the terms; each term is a mean over frames, in meters or square meters."""
 
     foot: float = 5.0
     """E_foot: distance of a foot in stance from its mean position in that phase"""
@@ -70,7 +70,7 @@ class MotionTerms:
 
 
 TERMS = MotionTerms()
-"""The weights of every optimisation."""
+"""The weights of every optimization."""
 
 
 @dataclass(frozen=True)
@@ -265,7 +265,7 @@ def foot_error(
 
 
 def collision_error(distance_m: Float[Tensor, "*vertex"], margin_m: float) -> Float[Tensor, "*vertex"]:
-    """Return the depth of each vertex inside the scene or its margin, metres (E_col, Eq. 5)."""
+    """Return the depth of each vertex inside the scene or its margin, meters (E_col, Eq. 5)."""
     return (margin_m - distance_m).clamp_min(0)
 
 
@@ -276,7 +276,7 @@ def contact_error(distance_m: Float[Tensor, "*vertex"], scale_m: float) -> Float
 
 
 def smooth_error(points: Float[Tensor, "frame vertex 3"]) -> Float[Tensor, "change vertex"]:
-    """Return the squared second difference of vertices over frames, square metres (E_smooth, Eq. 7).
+    """Return the squared second difference of vertices over frames, square meters (E_smooth, Eq. 7).
 
     The paper takes the first difference, which also slows the body down.
     """

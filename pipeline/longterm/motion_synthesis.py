@@ -116,7 +116,7 @@ class LongTerm:
         return cls(sizes, poses, contacts, motion_prior, static.eval(), route.eval(), pose.eval())
 
     def contact_body(self, body: SkinnedBody) -> ContactBody:
-        """Return a body with contacts and pose space, for the optimisation."""
+        """Return a body with contacts and pose space, for the optimization."""
         return ContactBody(body, self.contacts, self.poses)
 
     def bodies(

@@ -1,6 +1,6 @@
 """Networks of long-term motion: static bodies, routes between them, poses along routes (LTM, Sec. 3).
 
-Inputs and outputs are in a clip's frame, +y up: `t` is the root's position in metres, `r` its rotation in 6D
+Inputs and outputs are in a clip's frame, +y up: `t` is the root's position in meters, `r` its rotation in 6D
 (first two columns), `p` the pose in `pipeline.longterm.bodies.PoseSpace`. RouteNet, PoseNet and BaseNet
 predict offsets from linear interpolation between start and end that vanish at both ends, so that clips join.
 """
@@ -22,13 +22,13 @@ from pipeline.longterm.short_motions import RATE_HZ, STEPS
 ROOT_CHANNELS = 9
 """channels of t and r"""
 REACH_M = 1.5
-"""radius around a clip's centre within which scene points are sampled"""
+"""radius around a clip's center within which scene points are sampled"""
 BODY_REACH_M = 0.8
 """radius around a static body within which scene points are sampled"""
 LEAK = 0.2
 """negative slope of LeakyReLU"""
 MIN_GAIT_CYCLES = 0.4
-"""lowest initial frequency of the gait phases per metre and per second of locomotion; they span 2 more"""
+"""lowest initial frequency of the gait phases per meter and per second of locomotion; they span 2 more"""
 IDLE_M_S = 0.1
 """speed at which time counts half as time of locomotion"""
 
@@ -161,7 +161,7 @@ class CoarseToFine(nn.Module):
         seen: LocalScene,
         extra: Float[Tensor, "batch frame extra"] | None = None,
     ) -> list[Float[Tensor, "batch frame channel"]]:
-        """Return coarse and refined prediction, t in metres and r orthonormal, in the clip's frame."""
+        """Return coarse and refined prediction, t in meters and r orthonormal, in the clip's frame."""
         coarse = orthonormalized(self.coarse(start, end, seen.points, extra))
         fixed = coarse.detach()
         distances = (

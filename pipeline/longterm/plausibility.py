@@ -1,7 +1,7 @@
 """Physical plausibility of motion in a scene: collision, contact, foot skate and seams, as in the paper.
 
 `plausibility` takes the stance as an argument, so that a motion can be measured with the same stance before
-and after optimisation.
+and after optimization.
 """
 
 from dataclasses import dataclass
@@ -65,7 +65,7 @@ class PlausibilityMeter:
     def gap_and_penetration(
         self, motion: BodyMotion
     ) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame"]]:
-        """Return per frame the gap between contact vertices and scene, and the penetration depth, metres."""
+        """Return per frame the gap between contact vertices and scene, and the penetration depth, meters."""
         distance = self.scene.at(self.surface(*motion_tensors(motion)))
         gap = distance[:, self.contacts.vertices].min(1).values.clamp_min(0)
         return gap.numpy(), (-distance).clamp_min(0).amax(1).numpy()
@@ -97,7 +97,7 @@ class PlausibilityMeter:
 def seams(
     body: SkinnedBody, motion: BodyMotion, every: int, vertices: int | None = 200
 ) -> Float[np.ndarray, "seam vertex"]:
-    """Return how much longer each vertex's step is at every ``every``-th frame than beside it, metres.
+    """Return how much longer each vertex's step is at every ``every``-th frame than beside it, meters.
 
     ``vertices`` is the number of sampled vertices; None: all.
     """

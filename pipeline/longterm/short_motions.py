@@ -81,7 +81,7 @@ def smooth_seams(motion: BodyMotion) -> BodyMotion:
 
 
 def limit_turn_rate(motion: BodyMotion, max_rad: float) -> BodyMotion:
-    """Spread root turns faster than ``max_rad`` per frame over neighbouring frames; positions and poses stay.
+    """Spread root turns faster than ``max_rad`` per frame over neighboring frames; positions and poses stay.
 
     For half a turn within two seconds, networks with 6D rotations flip within a frame or two.
     """

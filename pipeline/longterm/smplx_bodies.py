@@ -36,7 +36,7 @@ class Person:
     parent: Int[np.ndarray, "bone"]
     """parent bones; -1 for the pelvis"""
     pelvis: Float[np.ndarray, "3"]
-    """position of the pelvis at rest in the frame of SMPL-X, metres"""
+    """position of the pelvis at rest in the frame of SMPL-X, meters"""
     hand_mean: Float[np.ndarray, "hand 45"]
     """mean pose of the left and the right hand, rotation vectors"""
     hand_components: Float[np.ndarray, "hand component 45"]

@@ -1,7 +1,7 @@
 """Path planning: from distant sub-goals to waypoints two seconds apart along paths over the free floor.
 
 `WalkableFloor.of` finds the free floor; `plan_waypoints` plans paths between sub-goals around furniture and
-splits them into two-second legs. Sub-goals come from the user, the behaviour model or
+splits them into two-second legs. Sub-goals come from the user, the behavior model or
 `sample_visited_subgoals`.
 """
 
@@ -57,7 +57,7 @@ class Subgoal:
     """A target position, optionally with heading and time."""
 
     position_world: Float[np.ndarray, "3"]
-    """of the root, metres; height NaN: on the floor"""
+    """of the root, meters; height NaN: on the floor"""
     heading_rad: float | None = None
     """heading about +y, from +z towards +x; None: free"""
     time_s: float | None = None
@@ -108,7 +108,7 @@ class WalkableFloor:
         return cls(free, room_m, low[[0, 2]], floor, *ends)
 
     def cell(self, position: Float[np.ndarray, "3"]) -> tuple[int, int]:
-        """Return the free cell (x, z) nearest to a world position, metres."""
+        """Return the free cell (x, z) nearest to a world position, meters."""
         return self._nearest(self.free, position)
 
     def nearest_turning_place(self, position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
@@ -128,7 +128,7 @@ class WalkableFloor:
         return np.array([place[0], position[1], place[1]])
 
     def blocked_m(self, path: Float[np.ndarray, "point 3"]) -> float:
-        """Return the length of a polyline over blocked cells, metres."""
+        """Return the length of a polyline over blocked cells, meters."""
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path[:, [0, 2]], axis=0), axis=1))])
         query = np.arange(0, along[-1], CELL_M / 4)
         points = np.stack([np.interp(query, along, path[:, axis]) for axis in (0, 2)], axis=-1)
@@ -156,7 +156,7 @@ class WalkableFloor:
         return bool(np.all(place >= 0) and np.all(place <= self.free.shape) and within)
 
     def refuse_outside(self, position: Float[np.ndarray, "3"]) -> None:
-        """Raise SIM-003 for a world position, metres, outside the scene's bounds."""
+        """Raise SIM-003 for a world position, meters, outside the scene's bounds."""
         if not self.contains(position):
             low, high = self.corner, self.corner + CELL_M * np.array(self.free.shape)
             heights = f"y {self.lowest_m:.1f} .. {self.highest_m:.1f} m (floor {self.height_m:.1f} m)"
@@ -168,7 +168,7 @@ class WalkableFloor:
     def path(
         self, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]
     ) -> Float[np.ndarray, "point 2"]:
-        """Return a smooth least-cost path between two positions, away from furniture; x and z, metres."""
+        """Return a smooth least-cost path between two positions, away from furniture; x and z, meters."""
         cost = np.where(self.free, 1 + 4 * np.exp(-self.room_m / NEAR_FURNITURE_M), BLOCKED_COST)
         cells, _ = route_through_array(cost, self.cell(start), self.cell(end))
         path = self.corner + CELL_M * np.array(cells, float)

@@ -83,7 +83,7 @@ class MotionScene:
         count: int,
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "batch point 3"]:
-        """Sample points within ``reach_m`` of each centre, in the given frames; zeros if there are none."""
+        """Sample points within ``reach_m`` of each center, in the given frames; zeros if there are none."""
         points = self.surface.points.astype(np.float32)
         standing = np.abs(self.surface.normals[:, 1]) < VERTICAL_SURFACE
         frame_from_world = rigid.inverse(world_from_frame)

@@ -29,7 +29,7 @@ POINT_STEPS = 3
 POINT_DAMPING = 1e-6
 """Damping of a point's step, relative to its Hessian's trace: keeps points on parallel rays solvable."""
 MIN_DEPTH_M = 0.05
-"""Observations of nearer points are ignored, metres."""
+"""Observations of nearer points are ignored, meters."""
 RADIAL_SIGMA, MIN_DISTORTION_PX = 0.05, 0.5
 """Prior standard deviation of radial distortion, and the largest distortion (pixels) that is set to zero
 as noise."""

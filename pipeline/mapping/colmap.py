@@ -81,7 +81,7 @@ def mapping_options(seed: int, *, calibrate: bool = False) -> pycolmap.Increment
 
 @dataclass(frozen=True)
 class SparseModel:
-    """Registered keyframes, points in the model's frame (arbitrary scale), observations in colour pixels."""
+    """Registered keyframes, points in the model's frame (arbitrary scale), observations in color pixels."""
 
     frame: Int[np.ndarray, " key"]
     model_from_camera: Float[np.ndarray, "key 4 4"]

@@ -14,13 +14,13 @@ from pipeline.geometry.meshes import Mesh
 from pipeline.mapping.pose_optimization import MAP, Correspondences
 
 NOISE_M, NOISE_SHARE = 0.008, 0.004
-"""Noise of phone LiDAR: 8 mm and 0.4 % of the depth, metres."""
+"""Noise of phone LiDAR: 8 mm and 0.4 % of the depth, meters."""
 MAX_DEPTH_M = 4.5
-"""Phone LiDAR is unreliable beyond this, metres."""
+"""Phone LiDAR is unreliable beyond this, meters."""
 MIN_DEPTH_M = 0.1
-"""Smaller depth counts as missing, metres."""
+"""Smaller depth counts as missing, meters."""
 MAX_STEP_M, MAX_STEP_SHARE = 0.05, 0.05
-"""Pixels whose neighbour differs by more (metres plus share of the depth) are depth edges and not used."""
+"""Pixels whose neighbor differs by more (meters plus share of the depth) are depth edges and not used."""
 SPAN_PX, MAX_NORMAL_STEP_M, MAX_NORMAL_STEP_SHARE = 4, 0.05, 0.06
 """Span of the differences of `image_normals`, and the same over it."""
 QUERY_RADIUS_RATIO = 1.5
@@ -43,7 +43,7 @@ class Scan:
 
 
 def depth_noise(depth_m: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
-    """Return the standard deviation of phone LiDAR depth, metres."""
+    """Return the standard deviation of phone LiDAR depth, meters."""
     return NOISE_M + NOISE_SHARE * depth_m
 
 
@@ -76,7 +76,7 @@ def scan(
     ignore: Bool[np.ndarray, "height width"] | None = None,
     max_depth_m: float = MAX_DEPTH_M,
 ) -> Scan:
-    """Keep every ``stride``-th pixel with known depth (metres) and confidence >= 1, away from depth edges."""
+    """Keep every ``stride``-th pixel with known depth (meters) and confidence >= 1, away from depth edges."""
     usable = (depth > MIN_DEPTH_M) & (depth < max_depth_m)
     if confidence is not None:
         usable &= confidence >= 1
@@ -96,7 +96,7 @@ def scan(
 
 
 class SurfaceMap:
-    """A mesh's vertices and normals, ready for nearest-neighbour queries."""
+    """A mesh's vertices and normals, ready for nearest-neighbor queries."""
 
     def __init__(self, mesh: Mesh):
         normals = mesh.vertex_normals()
@@ -112,9 +112,9 @@ class SurfaceMap:
         reach_m: float,
         inflation: float = 1.0,
     ) -> Correspondences:
-        """Pair scan points with the tangent plane of the nearest camera-facing vertex within reach (metres).
+        """Pair scan points with the tangent plane of the nearest camera-facing vertex within reach (meters).
 
-        ``inflation`` multiplies the depth noise, since errors of neighbouring pixels are correlated.
+        ``inflation`` multiplies the depth noise, since errors of neighboring pixels are correlated.
         """
         first = np.repeat(frames, [len(scan.points_camera) for scan in scans])
         points = np.concatenate([scan.points_camera for scan in scans])
@@ -132,6 +132,6 @@ class SurfaceMap:
         return Correspondences(first[facing], second, points[matched], points_second, normal[facing], sigma)
 
     def distance(self, points_world: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point"]:
-        """Return signed point-to-plane distances to the nearest vertex, metres; negative behind it."""
+        """Return signed point-to-plane distances to the nearest vertex, meters; negative behind it."""
         _, nearest = self._tree.query(points_world)
         return np.einsum("pi,pi->p", points_world - self.points_world[nearest], self.normals_world[nearest])

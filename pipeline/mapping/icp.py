@@ -14,24 +14,24 @@ from jaxtyping import Bool, Float
 from pipeline.geometry import cameras, rigid
 
 MIN_DEPTH_M = 0.05
-"""Points nearer to the target camera are not projected, metres."""
+"""Points nearer to the target camera are not projected, meters."""
 MIN_COSINE = 0.7
 """Least cosine between the normals of a correspondence (45 degrees)."""
 POINTS_PER_MEASUREMENT = 20
-"""Points per independent measurement, since errors of neighbouring pixels are correlated."""
+"""Points per independent measurement, since errors of neighboring pixels are correlated."""
 NOISE_FLOOR_M = 0.005
-"""Least noise assumed in the information matrix, metres: phone depth is no better."""
+"""Least noise assumed in the information matrix, meters: phone depth is no better."""
 DAMPING = 1e-3
 """Levenberg-Marquardt damping per unit of weight; keeps flat walls solvable."""
 CONVERGED = 1e-5
-"""Steps below this (radians, metres) end the iteration."""
+"""Steps below this (radians, meters) end the iteration."""
 NORMAL_JUMP, NORMAL_JUMP_DEPTH_M = 0.06, 0.5
-"""Depth edge: neighbours differ by more than this share of the depth, or of this depth (metres) if larger."""
+"""Depth edge: neighbors differ by more than this share of the depth, or of this depth (meters) if larger."""
 
 
 @dataclass(frozen=True)
 class DepthImage:
-    """Points (metres) and unit normals of a depth image in its camera frame."""
+    """Points (meters) and unit normals of a depth image in its camera frame."""
 
     points: Float[np.ndarray, "height width 3"]
     normals: Float[np.ndarray, "height width 3"]
@@ -48,7 +48,7 @@ class IcpResult:
     overlap: float
     """Share of the projected source points that have a correspondence."""
     residual_m: float
-    """Weighted RMS point-to-plane distance, metres."""
+    """Weighted RMS point-to-plane distance, meters."""
 
 
 def depth_image(
@@ -57,7 +57,7 @@ def depth_image(
     usable: Bool[np.ndarray, "height width"],
     stride: int,
 ) -> DepthImage:
-    """Compute points and normals of a depth image (metres, 0 = unknown) at every ``stride``-th pixel."""
+    """Compute points and normals of a depth image (meters, 0 = unknown) at every ``stride``-th pixel."""
     grid = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     points = cameras.back_project(depth, intrinsics)[grid].astype(np.float32)
     points[~(usable & (depth > 0))[grid]] = 0

@@ -20,7 +20,7 @@ from pipeline.geometry.align import rotation_between
 from pipeline.mapping.icp import DepthImage, IcpResult, align_views
 
 JUMP_M_S = 4.0
-"""A step is a jump if faster than its neighbours by more than this, m/s: hands reach about 2 m/s."""
+"""A step is a jump if faster than its neighbors by more than this, m/s: hands reach about 2 m/s."""
 SUSPECT_M_S = 0.8
 """Likewise, where depth decides: a hand can do it, and so can a jump of 10 cm."""
 EXPLAINED_BETTER = 2.0
@@ -36,7 +36,7 @@ CAUCHY_SCALE = 3.0
 FIXED_PRECISION, FREE_PRECISION = 1e12, 1e-6
 """Prior precision of the graph's first pose, which stays fixed, and of the others, for a regular Hessian."""
 CONVERGED = 1e-6
-"""Steps of the graph below this (radians, metres) end the iteration."""
+"""Steps of the graph below this (radians, meters) end the iteration."""
 KEYFRAME_STEP = 5
 """Frames between keyframes: half a second at 10 Hz, within which views overlap."""
 LOOP_RADIUS_M, LOOP_RADIUS_RAD, LOOP_DISTANCE = 1.0, 0.8, 1.2
@@ -44,9 +44,9 @@ LOOP_RADIUS_M, LOOP_RADIUS_RAD, LOOP_DISTANCE = 1.0, 0.8, 1.2
 LOOP_SPACING = 2
 """Non-maximum suppression: keyframes on either side of a loop partner that are skipped as redundant."""
 REACH_M = 0.15
-"""Correspondence distance of ICP, metres: several times the drift between loop partners."""
+"""Correspondence distance of ICP, meters: several times the drift between loop partners."""
 SIGMA_RAD, SIGMA_M = 0.002, 0.004
-"""Odometry's standard deviation from one frame to the next, radians and metres (ARKit at 10 Hz)."""
+"""Odometry's standard deviation from one frame to the next, radians and meters (ARKit at 10 Hz)."""
 JUMP_INFLATION = 60.0
 """Factor on the standard deviation of a step across a tracking jump."""
 MIN_OVERLAP = 0.4
@@ -73,7 +73,7 @@ class CorrectedOdometry:
     edges: int
     """Number of accepted alignments."""
     residual_m: float
-    """Median ICP residual, metres; NaN without alignments."""
+    """Median ICP residual, meters; NaN without alignments."""
 
 
 def correct_drift(
@@ -183,7 +183,7 @@ class RelativePose:
 def optimize_pose_graph(
     world_from_camera: Float[np.ndarray, "frame 4 4"], edges: Sequence[RelativePose], *, iterations: int
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Minimise the edges' squared Mahalanobis errors by Gauss-Newton; the first pose is fixed.
+    """Minimize the edges' squared Mahalanobis errors by Gauss-Newton; the first pose is fixed.
 
     An edge's residual is log(current first_from_second @ measured second_from_first), its robust kernel
     Cauchy's. Jacobians assume small residuals, which holds for odometry.

@@ -21,7 +21,7 @@ from pipeline.geometry import cameras, rigid
 SIDE_PX, POINTS_A_SIDE = 320, 80
 """longer side of compared pictures, and points along the longer side of depth"""
 CONTRAST_PX, MIN_VARIANCE = 6.0, 9.0
-"""neighbourhood of the local contrast normalization, pixels, and floor of the variance of grey values"""
+"""neighborhood of the local contrast normalization, pixels, and floor of the variance of gray values"""
 OCCLUDED_M, OCCLUDED_SHARE = 0.05, 0.05
 """a point farther than the second picture's depth by this is hidden there"""
 NEAREST_M = 0.05
@@ -43,10 +43,10 @@ class PosedPicture:
     """One upright frame."""
 
     gray: Num[np.ndarray, "height width"]
-    """grey values 0 to 255; inside `check`, divided by local contrast"""
+    """gray values 0 to 255; inside `check`, divided by local contrast"""
     intrinsics: Float[np.ndarray, "3 3"]
     depth: dict[Clock, Float[np.ndarray, "depth_height depth_width"]]
-    """metres, 0 = unknown; of this frame and of those a little earlier and later"""
+    """meters, 0 = unknown; of this frame and of those a little earlier and later"""
     depth_intrinsics: Float[np.ndarray, "3 3"]
     world_from_camera: dict[Clock, Float[np.ndarray, "4 4"]]
     """likewise; the world is the phone's own"""
@@ -164,7 +164,7 @@ def beats(
 
 
 def _normalized(picture: PosedPicture) -> PosedPicture:
-    """Reduce the size and divide grey values by their local contrast, which light and exposure change."""
+    """Reduce the size and divide gray values by their local contrast, which light and exposure change."""
     factor = min(1.0, SIDE_PX / max(picture.gray.shape))
     gray = cv2.resize(picture.gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     values = gray.astype(np.float32)

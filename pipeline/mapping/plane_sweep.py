@@ -24,11 +24,11 @@ DEPTH_QUANTILES, DEPTH_MARGINS = (0.01, 0.99), (0.6, 1.6)
 WINDOW_PX = (7, 7)
 """window of the correlation"""
 CONTRAST_FLOOR = 3.0
-"""contrast, in grey levels of 255, below which correlation is damped"""
+"""contrast, in gray levels of 255, below which correlation is damped"""
 P1, P2 = np.float32(0.04), np.float32(0.5)
 """semi-global matching penalties of one-plane and larger disparity steps, in units of correlation"""
 EDGE_GRAY = 12
-"""grey difference that halves P2"""
+"""gray difference that halves P2"""
 MAX_RELATIVE_ERROR = 0.03
 """relative depth difference within which another view agrees"""
 
@@ -78,7 +78,7 @@ def depth_range(sparse: SparseModel, key: int) -> tuple[float, float]:
 def sweep(
     view: SweepView, others: list[SweepView], depth_bounds: tuple[float, float], planes: int
 ) -> Float[np.ndarray, "height width"]:
-    """Return the plane-sweep depth map, regularised by semi-global matching; 0 where out of range."""
+    """Return the plane-sweep depth map, regularized by semi-global matching; 0 where out of range."""
     distances = 1 / np.linspace(1 / depth_bounds[1], 1 / depth_bounds[0], planes)
     correlation = np.stack([_correlation_volume(view, other, distances) for other in others])
     cost = _aggregate_views(correlation)
@@ -91,7 +91,7 @@ def sweep(
 def _correlation_volume(
     view: SweepView, other: SweepView, distances: np.ndarray
 ) -> Float[np.ndarray, "plane height width"]:
-    """Return normalised cross-correlation per plane; -1 outside the other view."""
+    """Return normalized cross-correlation per plane; -1 outside the other view."""
 
     def mean(picture):
         return cv2.boxFilter(picture, cv2.CV_32F, WINDOW_PX)

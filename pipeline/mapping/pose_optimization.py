@@ -19,7 +19,7 @@ from pipeline.geometry import rigid
 MAP = -1
 """Index of the fixed map in ``Correspondences.second``; its points are in the world frame."""
 MIN_SIGMA = 0.001
-"""Standard deviation of odometry at zero time, radians and metres."""
+"""Standard deviation of odometry at zero time, radians and meters."""
 MIN_STEP_S = 1e-3
 """Least time between frames, seconds."""
 DAMPING = 1e-6
@@ -36,7 +36,7 @@ PRIOR_PRECISION = 1e-9
 
 @dataclass(frozen=True)
 class Correspondences:
-    """Points (metres, in the frame of their camera or the map) that coincide along ``direction_world``."""
+    """Points (meters, in the frame of their camera or the map) that coincide along ``direction_world``."""
 
     first: Int[np.ndarray, "match"]
     second: Int[np.ndarray, "match"]
@@ -122,9 +122,9 @@ def optimize_poses(
     fixed: Bool[np.ndarray, "frame"] | None = None,
     term: PoseTerm | None = None,
 ) -> OptimizedPoses:
-    """Minimise sum_c rho(r_c / sigma_c) + sum_e |log(e)|^2 over all poses, rho the Geman-McClure kernel.
+    """Minimize sum_c rho(r_c / sigma_c) + sum_e |log(e)|^2 over all poses, rho the Geman-McClure kernel.
 
-    Each round recomputes the correspondences within its reach (metres, also the kernel's width) and takes one
+    Each round recomputes the correspondences within its reach (meters, also the kernel's width) and takes one
     Gauss-Newton step on the right-hand twist of each camera. ``fixed`` poses stay; ``term`` is added.
     """
     poses = np.array(world_from_camera, float)
@@ -149,12 +149,12 @@ def marginal_covariance(
     """Return the marginal covariance of each camera's right-hand twist (rotation, translation).
 
     These are diagonal blocks of the inverse Hessian. Correspondences must be with the map and factors between
-    neighbours, so that the Hessian is block tridiagonal: one forward and one backward pass suffice.
+    neighbors, so that the Hessian is block tridiagonal: one forward and one backward pass suffice.
     """
     normal, _ = _normal_equations(world_from_camera, correspondences, relative_poses, reach_m)
     blocks = sparse.bsr_array(normal, blocksize=(6, 6))
     row = np.repeat(np.arange(len(world_from_camera)), np.diff(blocks.indptr))
-    assert (np.abs(row - blocks.indices) <= 1).all(), "correspondences link cameras that are not neighbours"
+    assert (np.abs(row - blocks.indices) <= 1).all(), "correspondences link cameras that are not neighbors"
     diagonal, upper = np.zeros((2, len(world_from_camera), 6, 6))
     diagonal[row[row == blocks.indices]] = blocks.data[row == blocks.indices]
     upper[row[row + 1 == blocks.indices]] = blocks.data[row + 1 == blocks.indices]
@@ -198,7 +198,7 @@ def variance_factor(chi_squares: Float[np.ndarray, "group"]) -> float:
 def residuals(
     world_from_camera: Float[np.ndarray, "frame 4 4"], correspondences: Correspondences
 ) -> Float[np.ndarray, "match"]:
-    """Return the signed distance of each correspondence along its direction, metres."""
+    """Return the signed distance of each correspondence along its direction, meters."""
     first = _world(world_from_camera, correspondences.first, correspondences.points_first)
     second = _world(world_from_camera, correspondences.second, correspondences.points_second)
     return np.einsum("ci,ci->c", first - second, correspondences.direction_world)

@@ -20,14 +20,14 @@ class Keypoints:
     """Keypoints of one picture."""
 
     pixel: Float[np.ndarray, "point 2"]
-    """centres at +0.5"""
+    """centers at +0.5"""
     descriptors: Float[np.ndarray, "point 128"]
     """RootSIFT (Arandjelovic and Zisserman 2012)."""
 
 
 @dataclass(frozen=True)
 class SiftPoints:
-    """Keypoints of one frame with depth, camera frame, metres."""
+    """Keypoints of one frame with depth, camera frame, meters."""
 
     descriptors: Float[np.ndarray, "point 128"]
     points_camera: Float[np.ndarray, "point 3"]
@@ -55,7 +55,7 @@ def lift(
     depth: Float[np.ndarray, "depth_height depth_width"],
     depth_intrinsics: Float[np.ndarray, "3 3"],
 ) -> SiftPoints:
-    """Back-project the keypoints that have depth (metres) to the camera frame."""
+    """Back-project the keypoints that have depth (meters) to the camera frame."""
     points = cameras.back_project_pixels(keypoints.pixel, intrinsics, depth, depth_intrinsics)
     known = points[:, 2] > 0
     return SiftPoints(keypoints.descriptors[known], points[known])

@@ -20,26 +20,26 @@ HEIGHT_PX = 240
 STRIDE_PX = 7
 """Grid spacing of the matched pixels."""
 INLIER_M = 0.03
-"""Inlier threshold, metres at 2 m depth; proportional to depth, as the noise is."""
+"""Inlier threshold, meters at 2 m depth; proportional to depth, as the noise is."""
 INLIER_DEPTH_M, MIN_SCALE = 2.0, 0.5
-"""Depth at which `INLIER_M` holds, metres, and the least scale of it for nearer points."""
+"""Depth at which `INLIER_M` holds, meters, and the least scale of it for nearer points."""
 RANSAC_TRIPLETS = 100
 REFINE_ROUNDS = 5
 """Iterations of reweighted least squares after RANSAC, enough for convergence."""
 MIN_PAIRS = 20
 """Least number of matches with depth."""
 MIN_DEPTH_M = 0.1
-"""Smaller depth counts as missing, metres."""
+"""Smaller depth counts as missing, meters."""
 MIN_INLIER_RATIO = 0.35
 """Below this inlier ratio the motion is unknown (a tracking jump)."""
 GOOD_INLIER_RATIO = 0.7
 """From this inlier ratio on no other initial guess is tried."""
 SIGMA_RAD, SIGMA_M = float(np.deg2rad(0.25)), 0.008
-"""Standard deviations of one motion, radians and metres, measured on rendered sessions."""
+"""Standard deviations of one motion, radians and meters, measured on rendered sessions."""
 SIFT_FEATURES = 500
 """SIFT keypoints per picture, for the fallback where flow fails."""
 FAR_M = 1e3
-"""Depth substituted for unknown depth when warping, metres."""
+"""Depth substituted for unknown depth when warping, meters."""
 CLAHE_CLIP, CLAHE_TILES = 4.0, (6, 8)
 """CLAHE before optical flow: clip limit and tiles (columns, rows)."""
 
@@ -50,7 +50,7 @@ class FlowFrame:
 
     gray: UInt8[np.ndarray, "height width"]
     points_camera: Float[np.ndarray, "height width 3"]
-    """Back-projected pixels, metres; z = 0 where depth is unknown or masked."""
+    """Back-projected pixels, meters; z = 0 where depth is unknown or masked."""
     intrinsics: Float[np.ndarray, "3 3"]
     """Of the resized picture, pixels."""
 
@@ -72,7 +72,7 @@ def prepare_frame(
     depth_intrinsics: Float[np.ndarray, "3 3"],
     usable: Bool[np.ndarray, "height width"],
 ) -> FlowFrame:
-    """Resize a frame for optical flow and back-project usable pixels; colour and depth share a centre."""
+    """Resize a frame for optical flow and back-project usable pixels; color and depth share a center."""
     scale = min(1.0, HEIGHT_PX / min(color.shape[:2]))
     size = (round(color.shape[0] * scale), round(color.shape[1] * scale))
     gray = cv2.resize(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), size[::-1], interpolation=cv2.INTER_AREA)

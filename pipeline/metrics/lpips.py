@@ -24,7 +24,7 @@ CONVOLUTIONS = (
 POOLED_BEFORE = (3, 6)
 """Convolutions that a maximum over 3 pixels with a stride of 2 comes before."""
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""ImageNet's mean and deviation, for colours in -1 .. 1."""
+"""ImageNet's mean and deviation, for colors in -1 .. 1."""
 EPSILON = 1e-10
 MAX_LETTERS = 200
 """Of what torch says of a damaged file."""
@@ -65,7 +65,7 @@ class Lpips(nn.Module):
     def features(
         self, color: Float[Tensor, "1 3 height width"]
     ) -> list[Float[Tensor, "1 channel row column"]]:
-        """Return the activations after every convolution, of unit length at every place; colours 0 .. 1."""
+        """Return the activations after every convolution, of unit length at every place; colors 0 .. 1."""
         shift, scale = (torch.tensor(each, device=color.device)[:, None, None] for each in (SHIFT, SCALE))
         x, found = (2 * color - 1 - shift) / scale, []
         for index, *_ in CONVOLUTIONS:
@@ -78,7 +78,7 @@ class Lpips(nn.Module):
     def distance(
         self, ours: Float[np.ndarray, "height width 3"], true: Float[np.ndarray, "height width 3"]
     ) -> Float[np.ndarray, "height width"]:
-        """Return the distance at every pixel, layers bilinearly enlarged and summed; colours 0 .. 1.
+        """Return the distance at every pixel, layers bilinearly enlarged and summed; colors 0 .. 1.
 
         Its mean over a picture is LPIPS up to the interpolation. Raises no error: pictures under 63 pixels
         are NaN.

@@ -17,12 +17,12 @@ PLAN_SCORES = ("path_minade_m", "orientation_minade_rad", "joints_minade_rad")
 
 
 def goal_distances(samples: Samples, future: Future) -> Float[np.ndarray, "window sample"]:
-    """Return the distance of every sampled goal, metres."""
+    """Return the distance of every sampled goal, meters."""
     return np.linalg.norm(samples.goal - future.goal_world[:, None], axis=-1)
 
 
 def goal_minde(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
-    """Return the distance of the best of the sampled goals, metres."""
+    """Return the distance of the best of the sampled goals, meters."""
     return goal_distances(samples, future).min(1)
 
 
@@ -35,7 +35,7 @@ def goal_energy_score(samples: Samples, future: Future) -> Float[np.ndarray, "wi
 
 
 def path_minade(samples: Samples, future: Future) -> Float[np.ndarray, "window"]:
-    """Return the mean distance along the best of the sampled paths, metres."""
+    """Return the mean distance along the best of the sampled paths, meters."""
     away = np.linalg.norm(_predicted(samples.path) - future.path_world[:, None], axis=-1)
     return away.mean(-1).min(1)
 

@@ -8,7 +8,7 @@ from pipeline.data.clips import Clip, Masks
 from pipeline.geometry.meshes import RayCaster, render_view
 
 HIDDEN_M, MIN_ANIMAL = 0.05, 0.005
-"""Depth nearer than the animal by this hides it, metres; least share of a compared frame that it covers."""
+"""Depth nearer than the animal by this hides it, meters; least share of a compared frame that it covers."""
 
 
 def silhouette_iou(

@@ -1,7 +1,7 @@
 """Exact point-to-mesh distances, and the chamfer distance of triangle meshes.
 
-`TriangleSurface` splits large triangles, so that the piece nearest to a point is among those whose centres
-are not much farther than the nearest centre; trimesh does the geometry of single triangles.
+`TriangleSurface` splits large triangles, so that the piece nearest to a point is among those whose centers
+are not much farther than the nearest center; trimesh does the geometry of single triangles.
 """
 
 import numpy as np
@@ -29,13 +29,13 @@ class TriangleSurface:
         self._centres = KDTree(centre)
 
     def sample(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "point 3"]:
-        """Draw points uniformly over the surface, metres."""
+        """Draw points uniformly over the surface, meters."""
         area = triangles.area(self.corners)
         face = rng.choice(len(area), count, p=area / area.sum())
         return (rng.dirichlet((1, 1, 1), count)[..., None] * self.corners[face]).sum(1)
 
     def distance(self, points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point"]:
-        """Return the distance of each point from the surface, metres."""
+        """Return the distance of each point from the surface, meters."""
         parts = [points[begin : begin + POINTS_AT_ONCE] for begin in range(0, len(points), POINTS_AT_ONCE)]
         return np.concatenate([self._distance(part) for part in parts])
 
@@ -49,7 +49,7 @@ class TriangleSurface:
 
 
 def chamfer(ours: TriangleSurface, true: TriangleSurface, count: int, rng: np.random.Generator) -> float:
-    """Return the mean of both mean distances from ``count`` points of one surface to the other, metres."""
+    """Return the mean of both mean distances from ``count`` points of one surface to the other, meters."""
     there, back = true.distance(ours.sample(count, rng)), ours.distance(true.sample(count, rng))
     return float((there.mean() + back.mean()) / 2)
 

@@ -29,7 +29,7 @@ UNKNOWN = 65535
 MAX_MEMBERS = 1_000_000
 """maximum number of members, 0.6 GB when listed: 90 minutes at 60 Hz with three files per frame"""
 MEMBERS_PER_FRAME, EXTRA_MEMBERS = 4, 1000
-"""maximum members per declared frame (colour, depth, confidence, one more), and in addition"""
+"""maximum members per declared frame (color, depth, confidence, one more), and in addition"""
 GIB = 1 << 30
 MAX_TOTAL_BYTES = 256 * GIB
 MAX_RATIO = 200
@@ -84,7 +84,7 @@ class Container(ABC):
         return table
 
     def color(self, name: str) -> UInt8[np.ndarray, "height width 3"]:
-        """Read a colour picture. Raises CAP-020."""
+        """Read a color picture. Raises CAP-020."""
         return images.decode_color(self.read(name), self.place(name))
 
     def gray(self, name: str, dtype: type = np.uint8) -> UInt[np.ndarray, "height width"]:
@@ -98,7 +98,7 @@ class Container(ABC):
     def meters(
         self, name: str, size: tuple[int, int] | None = None, per_meter: float = 1000.0
     ) -> Float32[np.ndarray, "height width"]:
-        """Read a 16-bit depth PNG of (height, width) ``size`` as metres, 0 = unknown. Raises CAP-008."""
+        """Read a 16-bit depth PNG of (height, width) ``size`` as meters, 0 = unknown. Raises CAP-008."""
         raw = self.gray(name, np.uint16)
         refuse_other_size(raw.shape, size, self.place(name))
         return np.where(raw == UNKNOWN, 0, raw).astype(np.float32) / np.float32(per_meter)

@@ -64,7 +64,7 @@ CONVENTIONS = tuple(
 
 @dataclass(frozen=True)
 class DepthPicture:
-    """One frame's depth (metres, 0 = unknown) and its intrinsics."""
+    """One frame's depth (meters, 0 = unknown) and its intrinsics."""
 
     depth: Float[np.ndarray, "height width"]
     intrinsics: Float[np.ndarray, "3 3"]
@@ -208,7 +208,7 @@ def _score(
 def compare(
     first: DepthPicture, second: DepthPicture, second_from_first: Float[np.ndarray, "4 4"]
 ) -> tuple[float, float, float]:
-    """Return (median depth difference in metres, share of compared points, tolerance in metres)."""
+    """Return (median depth difference in meters, share of compared points, tolerance in meters)."""
     stride = max(STRIDE_PX, max(first.depth.shape) // POINTS_A_SIDE)
     every = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     points_first = cameras.back_project(first.depth, first.intrinsics)[every][first.depth[every] > 0]

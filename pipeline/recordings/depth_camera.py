@@ -1,6 +1,6 @@
-"""A depth camera beside the colour camera, as in Kinects and most RGB-D cameras.
+"""A depth camera beside the color camera, as in Kinects and most RGB-D cameras.
 
-`reproject` registers its depth to the colour camera at about its own resolution, with a z-buffer for
+`reproject` registers its depth to the color camera at about its own resolution, with a z-buffer for
 occlusion.
 """
 
@@ -12,7 +12,7 @@ from jaxtyping import Float
 from pipeline.geometry import cameras, rigid
 
 NEAREST_M = 0.05
-"""minimum depth in the colour camera, metres"""
+"""minimum depth in the color camera, meters"""
 
 
 @dataclass(frozen=True)
@@ -22,18 +22,18 @@ class DepthCamera:
     intrinsics: Float[np.ndarray, "3 3"]
     """pixels of the depth picture as stored"""
     depth_from_color: Float[np.ndarray, "4 4"]
-    """rigid, metres"""
+    """rigid, meters"""
     size: tuple[int, int]
     """(height, width) of the depth picture as stored, pixels"""
 
     @property
     def baseline_m(self) -> float:
-        """Distance between the two cameras, metres."""
+        """Distance between the two cameras, meters."""
         return float(np.linalg.norm(self.depth_from_color[:3, 3]))
 
 
 def grid_size(depth_size: tuple[int, int], color_size: tuple[int, int]) -> tuple[int, int]:
-    """Return the (height, width) of reprojected depth: the colour's aspect ratio, the depth's longer side."""
+    """Return the (height, width) of reprojected depth: the color's aspect ratio, the depth's longer side."""
     share = max(depth_size) / max(color_size)
     return round(color_size[0] * share), round(color_size[1] * share)
 
@@ -44,7 +44,7 @@ def reproject(
     color_intrinsics: Float[np.ndarray, "3 3"],
     color_size: tuple[int, int],
 ) -> Float[np.ndarray, "height width"]:
-    """Return the depth that the colour camera would measure, metres, 0 = unknown, on a grid of `grid_size`.
+    """Return the depth that the color camera would measure, meters, 0 = unknown, on a grid of `grid_size`.
 
     Every known pixel is splatted to the cells that its footprint covers, the nearest surface wins.
     """

@@ -41,7 +41,7 @@ MAX_TILT_DEG = 45.0
 UNIT_VIEWS = 5
 """number of frames for checking the unit of depth"""
 NEAREST_TYPICAL_M, FARTHEST_TYPICAL = 0.1, 2.0
-"""limits of the median depth: metres, and multiples of the maximum depth that is used"""
+"""limits of the median depth: meters, and multiples of the maximum depth that is used"""
 MAX_STRETCHED = 0.03
 """maximum relative difference in aspect ratio between pictures and depth"""
 AGREEMENT_PAIRS, AGREEMENT_GAP_S, CLOCK_FRAMES = 40, 1.2, 2
@@ -58,9 +58,9 @@ class ExtractionPlan:
     chosen: Int[np.ndarray, "frame"]
     timestamp_s: Float[np.ndarray, "frame"]
     stored_size: tuple[int, int]
-    """(height, width) of the colour pictures before rotation"""
+    """(height, width) of the color pictures before rotation"""
     intrinsics: Float[np.ndarray, "frame 3 3"]
-    """colour pixels"""
+    """color pixels"""
     depth_intrinsics: Float[np.ndarray, "frame 3 3"]
     odometry_from_camera: Float[np.ndarray, "frame 4 4"] | None
     gravity_known: bool
@@ -81,7 +81,7 @@ class ExtractedFrame:
     jpeg: bytes
     """the phone's original bytes if the picture is unchanged"""
     depth: Float[np.ndarray, "depth_height depth_width"]
-    """metres, 0 = unknown"""
+    """meters, 0 = unknown"""
     confidence: UInt8[np.ndarray, "depth_height depth_width"]
     """0 low, 1 medium, 2 high"""
     sharpness: float
@@ -184,7 +184,7 @@ def _refuse_other_pictures(
     """Raise CAP-004 for a principal point outside the picture: intrinsics of another size or rotation."""
     (height, width), (x, y) = color_size, np.median(intrinsics[:, :2, 2], axis=0)
     if not (0 < x < width and 0 < y < height):
-        why = f"the intrinsics' centre, {x:.0f} {y:.0f}, lies outside of pictures of {width} x {height}"
+        why = f"the intrinsics' center, {x:.0f} {y:.0f}, lies outside of pictures of {width} x {height}"
         raise broken_metadata(where, why)
 
 
@@ -210,7 +210,7 @@ def _refuse_other_unit(recording: Recording, max_depth_m: float) -> None:
     typical_m = float(np.median(depth))
     if not NEAREST_TYPICAL_M < typical_m < FARTHEST_TYPICAL * max_depth_m:
         what = f"depth is typically {typical_m:.3g} m, where up to {max_depth_m:g} m are used"
-        remedy = "PNG holds millimetres (TUM: see depth_scale.txt), EXR metres; record within 5 m"
+        remedy = "PNG holds millimeters (TUM: see depth_scale.txt), EXR meters; record within 5 m"
         raise InputError("CAP-008", what, recording.where, remedy)
 
 
@@ -303,7 +303,7 @@ def _posed_picture(
 
 
 def stored_depth(recording: Recording, number: int, max_depth_m: float) -> Float[np.ndarray, "height width"]:
-    """Read one frame's depth in metres, as stored (not rotated), at most `MAX_DEPTH_SIDE_PX` large."""
+    """Read one frame's depth in meters, as stored (not rotated), at most `MAX_DEPTH_SIDE_PX` large."""
     depth = known_depth(recording.read_depth(number), max_depth_m)
     if recording.depth_camera is not None:
         assert recording.intrinsics is not None, recording.where
@@ -314,7 +314,7 @@ def stored_depth(recording: Recording, number: int, max_depth_m: float) -> Float
 
 
 def _sampled(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Resize a picture to a (height, width) by nearest neighbour."""
+    """Resize a picture to a (height, width) by nearest neighbor."""
     same = image.shape == size
     return image if same else cv2.resize(image, size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
 
@@ -346,7 +346,7 @@ def reduced_size(size: tuple[int, int], max_side_px: int) -> tuple[int, int]:
 def known_depth(
     depth: Float[np.ndarray, "height width"], max_depth_m: float
 ) -> Float[np.ndarray, "height width"]:
-    """Return depth in metres, 0 where it is not finite, not positive or out of the sensor's range."""
+    """Return depth in meters, 0 where it is not finite, not positive or out of the sensor's range."""
     return np.where(np.isfinite(depth) & (depth > 0) & (depth < max_depth_m), depth, np.float32(0))
 
 
@@ -369,7 +369,7 @@ def quality_of(
 
 
 def summary(recording: Recording, plan: ExtractionPlan) -> str:
-    """Summarise an extraction plan in one line."""
+    """Summarize an extraction plan in one line."""
     seconds = recording.timestamp_s[-1] - recording.timestamp_s[0]
     height, width = recording.color_size
     turned = f"turned {90 * plan.quarter_turns} deg clockwise" if plan.quarter_turns else "upright as stored"

@@ -1,4 +1,4 @@
-"""The known formats: how each is recognised and which module reads it.
+"""The known formats: how each is recognized and which module reads it.
 
 A new format is a module with `open_recording` and a line here. Standard library only until a recording is
 opened, since the planner uses `format_of`.

@@ -1,6 +1,6 @@
 """NeRFCapture: the folder that its streaming scripts write; the zip the phone saves has no metric depth.
 
-Stream: `transforms.json` with `integer_depth_scale` (metres per unit), a colour and a 16-bit depth picture
+Stream: `transforms.json` with `integer_depth_scale` (meters per unit), a color and a 16-bit depth picture
 per frame.
 """
 
@@ -23,7 +23,7 @@ from pipeline.recordings.recording import (
 
 COEFFICIENTS = ("fl_x", "fl_y", "cx", "cy")
 MIN_REACH_M = 4.0
-"""minimum range of 16-bit depth, metres: beyond its range depth wraps around"""
+"""minimum range of 16-bit depth, meters: beyond its range depth wraps around"""
 LARGEST_UNIT = 65535
 """maximum value of 16-bit depth"""
 ASSUMED_HZ = 10.0
@@ -38,7 +38,7 @@ def open_recording(path: Path) -> Recording:
     listed = _frames(table, container)
     frames = [frame for frame in listed if {frame["file_path"], frame["depth_path"]} <= container.names]
     if not frames:
-        raise no_frames(container.where, "no frame has colour and depth")
+        raise no_frames(container.where, "no frame has color and depth")
     timestamp_s, remarks = _times(frames, container.where)
     depth_size = container.meters(frames[0]["depth_path"]).shape
     coefficients = np.array([frame["coefficients"] for frame in frames])
@@ -61,14 +61,14 @@ def open_recording(path: Path) -> Recording:
 
 
 def _meters_per_unit(table: dict[str, Any], container: Container) -> float:
-    """Return the unit of the depth pictures, metres. Raises CAP-004 and CAP-010 if there is none."""
+    """Return the unit of the depth pictures, meters. Raises CAP-004 and CAP-010 if there is none."""
     if isinstance(container, ZipContainer) or "depth_integer_scale" in table:
         what = "a zip of transforms, as NeRFCapture saves it, holds no metric depth"
         remedy = "stream from the app with its nerfcapture_dataset.py and give the folder that it writes"
         raise InputError("CAP-010", what, container.where, remedy)
     scale = table.get("integer_depth_scale")
     if not isinstance(scale, int | float) or not 0 < scale < 1:
-        raise broken_metadata(container.where, "'integer_depth_scale' (metres per unit of depth) is missing")
+        raise broken_metadata(container.where, "'integer_depth_scale' (meters per unit of depth) is missing")
     if LARGEST_UNIT * scale < MIN_REACH_M:
         what = f"depth beyond {LARGEST_UNIT * scale:.3g} m was written as if it were near"
         remedy = "stream again with a depth_scale of 10, if need be as the default of nerfcapture_dataset.py"
@@ -105,7 +105,7 @@ def _frames(table: dict[str, Any], container: Container) -> list[dict[str, Any]]
 
 
 def _member(name: str, container: Container) -> str:
-    """Return the member that a frame names; the app's script omits the suffix of colour pictures."""
+    """Return the member that a frame names; the app's script omits the suffix of color pictures."""
     name = name.removeprefix("./")
     return next((each for each in (name, f"{name}.png", f"{name}.jpg") if each in container.names), name)
 

@@ -1,6 +1,6 @@
 """A video: alone, or in a folder with `intrinsics.txt` and `depth/`, a picture per frame, named by number.
 
-Depth: 16-bit PNG in millimetres or EXR in metres, aligned with the picture as stored. `poses.txt`, if any:
+Depth: 16-bit PNG in millimeters or EXR in meters, aligned with the picture as stored. `poses.txt`, if any:
 frame number, tx ty tz qx qy qz qw of the camera (OpenCV axes) in its world. A video alone has no scale.
 """
 

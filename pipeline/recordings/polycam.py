@@ -1,6 +1,6 @@
 """Polycam raw data (LiDAR or room mode, developer mode): sparse keyframes with poses, for the walk-through.
 
-Optimised pictures and cameras (`corrected_*`) are used where both exist; depth is dropped in
+Optimized pictures and cameras (`corrected_*`) are used where both exist; depth is dropped in
 their black borders. The app's own mesh, `raw.glb`, is rotated to its own axes; the inverse of
 `alignmentTransform` (column-major) maps it back to the cameras' world.
 """
@@ -31,7 +31,7 @@ from pipeline.recordings.recording import (
 )
 
 TRUSTED_M = 5.0
-"""maximum trusted depth, metres"""
+"""maximum trusted depth, meters"""
 MAX_MESH_BYTES = 512 << 20
 GLB_JSON_LENGTH_AT, GLB_JSON_AT = 12, 20  # byte offsets of length and content of a GLB's JSON chunk
 COEFFICIENTS = ("fx", "fy", "cx", "cy")

@@ -89,7 +89,7 @@ def _open(container: Container, layout: _Layout) -> Recording:
         raise no_depth(container.where, "Record3D's archive holds none")
     index = np.array(sorted(stored & pictures), int)
     if len(index) == 0:
-        raise no_frames(container.where, "none has colour and depth")
+        raise no_frames(container.where, "none has color and depth")
     timestamp_s = metadata.timestamp_s(index)
     index, timestamp_s = index[np.isfinite(timestamp_s)], timestamp_s[np.isfinite(timestamp_s)]
     intrinsics, pose = metadata.intrinsics(index), metadata.pose(index)
@@ -147,7 +147,7 @@ class _Metadata:
         return np.where(good, timestamp_s - timestamp_s[good][0], np.nan)
 
     def intrinsics(self, index: Int[np.ndarray, "frame"]) -> Float[np.ndarray, "frame 3 3"]:
-        """Return K in colour pixels, per frame if the app wrote it, else the first frame's."""
+        """Return K in color pixels, per frame if the app wrote it, else the first frame's."""
         coefficients = self._rows("perFrameIntrinsicCoeffs", (4,), index)
         missing = ~(np.all(np.isfinite(coefficients), axis=1) & np.all(coefficients[:, :2] > 0, axis=1))
         if missing.any():

@@ -35,9 +35,9 @@ class Recording:
     timestamp_s: Float[np.ndarray, "frame"]
     """increasing, from 0 on the recording's own clock"""
     intrinsics: Float[np.ndarray, "frame 3 3"] | None
-    """colour pixels; None if unknown (plain video)"""
+    """color pixels; None if unknown (plain video)"""
     pose: Float[np.ndarray, "frame 7"] | None
-    """quaternion and translation (metres) in the documented convention, NaN where lost; None without"""
+    """quaternion and translation (meters) in the documented convention, NaN where lost; None without"""
     color_size: tuple[int, int]
     """(height, width) in pixels"""
     depth_size: tuple[int, int] | None
@@ -45,7 +45,7 @@ class Recording:
     read_color: Callable[[int], Picture | None]
     """picture of a frame number; None if it is damaged"""
     read_depth: Callable[[int], Float[np.ndarray, "height width"]]
-    """depth of a frame number, metres, as stored"""
+    """depth of a frame number, meters, as stored"""
     read_confidence: Callable[[int], UInt8[np.ndarray, "height width"] | None] | None = None
     """0 low, 1 medium, 2 high, or None for a frame without; None if the recording has none"""
     convention: Convention = OPENCV
@@ -55,9 +55,9 @@ class Recording:
     quarter_turns: int = 0
     """clockwise, stored to upright, from the video's rotation tag; used if `up` is None"""
     read_mesh: Callable[[], Mesh] | None = None
-    """the app's own mesh of the room, metres, in the poses' world; None without"""
+    """the app's own mesh of the room, meters, in the poses' world; None without"""
     depth_camera: DepthCamera | None = None
-    """the depth camera; None if depth is registered to the colour camera"""
+    """the depth camera; None if depth is registered to the color camera"""
     remarks: tuple[str, ...] = ()
     """assumptions and omissions, one sentence each"""
     listed: int = 0

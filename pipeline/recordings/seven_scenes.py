@@ -1,4 +1,4 @@
-"""7-Scenes style folders: `frame-%06d.color.png|jpg`, `.depth.png` (millimetres), `.pose.txt` or none.
+"""7-Scenes style folders: `frame-%06d.color.png|jpg`, `.depth.png` (millimeters), `.pose.txt` or none.
 
 The frame number counts at 30 Hz. Intrinsics from `camera-intrinsics.txt` or the set's default (depth camera).
 """
@@ -24,11 +24,11 @@ from pipeline.recordings.recording import (
 RATE_HZ = 30.0
 KINECT_SIZE = (480, 640)
 KINECT_DEPTH, KINECT_COLOR = (585.0, 585.0, 320.0, 240.0), (525.5, 525.5, 320.0, 240.0)
-"""fx, fy, cx, cy of the data set's Kinects at 640 x 480, pixels: the depth camera's as documented, the colour
+"""fx, fy, cx, cy of the data set's Kinects at 640 x 480, pixels: the depth camera's as documented, the color
 camera's as estimated from matches between its pictures and depth edges
 """
 KINECT_DEPTH_FROM_COLOR = np.array([[1, 0, 0, 0.025], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-"""the colour camera is 2.5 cm to the right of the depth camera"""
+"""the color camera is 2.5 cm to the right of the depth camera"""
 SAME_LENS_PX = 0.5
 """tolerance for given intrinsics to count as those of the data set's depth camera, as often"""
 NAME = re.compile(r"frame-([0-9]{1,18})\.(color\.(?:png|jpg|jpeg)|depth\.png|pose\.txt)\Z")
@@ -46,7 +46,7 @@ def open_recording(path: Path) -> Recording:
         raise no_depth(container.where, "there is no frame-*.depth.png")
     index = np.array(sorted(files["color"].keys() & files["depth"].keys()), int)
     if len(index) == 0:
-        raise no_frames(container.where, "no frame has colour and depth")
+        raise no_frames(container.where, "no frame has color and depth")
     first = int(index[0])
     sizes = container.color(files["color"][first]).shape[:2], container.meters(files["depth"][first]).shape
     kinect = sizes == (KINECT_SIZE, KINECT_SIZE)
@@ -78,7 +78,7 @@ def open_recording(path: Path) -> Recording:
 def _poses(
     container: FolderContainer, index: np.ndarray, names: dict[int, str], camera: DepthCamera | None
 ) -> Float[np.ndarray, "frame 7"] | None:
-    """Return the colour camera's poses (the data set has the depth camera's), NaN where lost."""
+    """Return the color camera's poses (the data set has the depth camera's), NaN where lost."""
     if not names:
         return None
     matrices = np.full((len(index), 4, 4), np.nan)

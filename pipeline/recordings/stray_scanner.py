@@ -63,7 +63,7 @@ def open_recording(path: Path) -> Recording:
     complete = depth.keys() & set(movie.complete.tolist())
     valid = np.array([int(number) in complete for number in rows.frame], bool)
     if not valid.any():
-        raise no_frames(container.where, "none has colour, depth and odometry")
+        raise no_frames(container.where, "none has color, depth and odometry")
     index = rows.frame[valid]
     timestamp_s = movie.timestamp_s[index] if rows.timestamp_s is None else rows.timestamp_s[valid]
     size = _depth(container, depth[int(index[0])], None).shape
@@ -145,7 +145,7 @@ def _intrinsics(
 def _depth(
     container: FolderContainer, name: str, size: tuple[int, int] | None
 ) -> Float[np.ndarray, "height width"]:
-    """Read uint16 millimetres from PNG, or `.npy` of older apps, as metres. Raises CAP-008."""
+    """Read uint16 millimeters from PNG, or `.npy` of older apps, as meters. Raises CAP-008."""
     if not name.endswith(".npy"):
         return container.meters(name, size)
     try:

@@ -10,9 +10,9 @@ from pipeline.recordings.depth_camera import DepthCamera
 from pipeline.recordings.recording import broken_metadata, intrinsics_from_coefficients, pose_from_matrix
 
 INTRINSICS = ("intrinsics.txt", "camera-intrinsics.txt", "camera_matrix.csv")
-"""3 x 3 or 4 x 4 matrix, or the four numbers fx fy cx cy, in colour pixels"""
+"""3 x 3 or 4 x 4 matrix, or the four numbers fx fy cx cy, in color pixels"""
 DEPTH_INTRINSICS, DEPTH_FROM_COLOR = "depth_intrinsics.txt", "depth_from_color.txt"
-"""intrinsics of a separate depth camera, in depth pixels, and its extrinsics: a 4 x 4 matrix, metres"""
+"""intrinsics of a separate depth camera, in depth pixels, and its extrinsics: a 4 x 4 matrix, meters"""
 
 
 def lines(container: Container, name: str) -> list[str]:
@@ -51,7 +51,7 @@ def coefficients(
     if name is not None:
         return read_coefficients(container, name), ()
     if default is None:
-        remedy = "write intrinsics.txt with the four numbers fx fy cx cy, in colour pixels"
+        remedy = "write intrinsics.txt with the four numbers fx fy cx cy, in color pixels"
         what = "the focal length of these pictures is unknown"
         raise InputError("CAP-011", what, container.where, remedy)
     fx, _, cx, cy = default
@@ -80,7 +80,7 @@ def depth_camera(
 ) -> tuple[DepthCamera | None, tuple[str, ...]]:
     """Return the depth camera of `depth_intrinsics.txt` and `depth_from_color.txt`, if any, and a remark.
 
-    ``sizes`` are (height, width) of colour and of depth as stored. Without the latter file the cameras have
+    ``sizes`` are (height, width) of color and of depth as stored. Without the latter file the cameras have
     the same pose, without the former the same lens. Raises CAP-004 for a matrix that is not a rigid motion.
     """
     color_size, depth_size = sizes
@@ -94,7 +94,7 @@ def depth_camera(
     if DEPTH_FROM_COLOR in container.names:
         depth_from_color = table(container, DEPTH_FROM_COLOR, 4, rows=4)
         if not np.isfinite(pose_from_matrix(depth_from_color[None])).all():
-            why = "it is no rigid motion: rotation and translation in metres, four rows"
+            why = "it is no rigid motion: rotation and translation in meters, four rows"
             raise broken_metadata(container.place(DEPTH_FROM_COLOR), why)
     found = DepthCamera(intrinsics, depth_from_color, depth_size)
     return found, (depth_camera_remark(found, color_intrinsics),)
@@ -103,5 +103,5 @@ def depth_camera(
 def depth_camera_remark(camera: DepthCamera, color_intrinsics: Float[np.ndarray, "3 3"]) -> str:
     """Describe the two cameras, for capture-check and the log."""
     depth_fx, color_fx, apart_mm = camera.intrinsics[0, 0], color_intrinsics[0, 0], 1000 * camera.baseline_m
-    apart = f"{apart_mm:.0f} mm from the colour camera (fx {color_fx:g})"
+    apart = f"{apart_mm:.0f} mm from the color camera (fx {color_fx:g})"
     return f"depth camera fx {depth_fx:g}, {apart}: depth is reprojected"

@@ -1,7 +1,7 @@
 """TUM RGB-D folders: `rgb.txt`, `depth.txt` and, if present, `groundtruth.txt`, associated by timestamps.
 
-`depth_scale.txt` holds the depth units per metre; without it, poses decide between the data set's 5000 and
-millimetres. Intrinsics from `intrinsics.txt` or the data set's default.
+`depth_scale.txt` holds the depth units per meter; without it, poses decide between the data set's 5000 and
+millimeters. Intrinsics from `intrinsics.txt` or the data set's default.
 """
 
 from collections.abc import Callable
@@ -27,11 +27,11 @@ DEFAULT_SIZE = (480, 640)
 QUOTED = 40
 """maximum characters of a line in an error"""
 PER_METER, OTHERS = 5000.0, (1000.0, 10_000.0)
-"""depth units per metre of the data set, and of other cameras"""
+"""depth units per meter of the data set, and of other cameras"""
 MAX_RESIDUAL_RATIO = 0.6
 """another unit is chosen if their residual is below this share of the other unit's"""
 NEAREST_S = 0.02
-"""maximum time difference between a colour picture, its depth and its pose, seconds"""
+"""maximum time difference between a color picture, its depth and its pose, seconds"""
 DEFAULT = (525.0, 525.0, 319.5, 239.5)
 """fx, fy, cx, cy that the data set recommends for 640 x 480, pixels"""
 
@@ -51,7 +51,7 @@ def open_recording(path: Path) -> Recording:
     present = np.array([set(pair) <= container.names for pair in pairs], bool)
     paired, pairs = paired[present], [pair for pair, there in zip(pairs, present, strict=True) if there]
     if not pairs:
-        raise no_frames(container.where, "no colour picture has depth within 20 ms")
+        raise no_frames(container.where, "no color picture has depth within 20 ms")
     color_size, depth_size = container.color(pairs[0][0]).shape[:2], container.meters(pairs[0][1]).shape
     default = DEFAULT if color_size == DEFAULT_SIZE else None
     coefficients, remarks = text_files.coefficients(container, default)
@@ -132,14 +132,14 @@ def _units_per_meter(
     timestamp_s: Float[np.ndarray, "frame"],
     view: Callable[[int, float], DepthPicture],
 ) -> tuple[float, tuple[str, ...]]:
-    """Return the units of `depth_scale.txt`, else millimetres if the poses fit them, else the data set's."""
+    """Return the units of `depth_scale.txt`, else millimeters if the poses fit them, else the data set's."""
     name = "depth_scale.txt"
     if name in container.names:
         per_meter = float(text_files.table(container, name, 1, rows=1)[0, 0])
         if not 0 < per_meter < np.inf:
-            raise broken_metadata(container.place(name), "the units per metre must be positive")
+            raise broken_metadata(container.place(name), "the units per meter must be positive")
         return per_meter, ()
-    assumed = PER_METER, (f"no {name}: {PER_METER:g} units per metre are assumed",)
+    assumed = PER_METER, (f"no {name}: {PER_METER:g} units per meter are assumed",)
     known = np.arange(0) if pose is None else np.flatnonzero(np.isfinite(pose).all(1))
     if pose is None or not len(known):
         return assumed
@@ -151,6 +151,6 @@ def _units_per_meter(
 
     best = min(OTHERS, key=residual)
     if residual(best) < min(1.0, MAX_RESIDUAL_RATIO * residual(PER_METER)):
-        fit = f"{best:g} units per metre fit the poses, the set's {PER_METER:g} do not"
+        fit = f"{best:g} units per meter fit the poses, the set's {PER_METER:g} do not"
         return best, (f"no {name}: {fit}",)
     return assumed

@@ -49,7 +49,7 @@ def up_from_room(
 
     Each of the four sides of the pictures is a hypothesis, refined by the room's planes (Manhattan world).
     The score rewards level surface seen from above (floor, seats) rather than below, and cameras without
-    roll. ``views`` are (depth in metres, intrinsics) of frames spread evenly.
+    roll. ``views`` are (depth in meters, intrinsics) of frames spread evenly.
     """
     seen = np.linspace(0, len(odometry_from_camera) - 1, len(views)).round().astype(int)
     normals = [

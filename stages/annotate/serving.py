@@ -52,7 +52,7 @@ class ClickSession:
         return {"reference": self.reference, "wanted": clicks.WANTED, "frames": frames, "pairs": pairs}
 
     def fits(self, pairs: list[ClickedPair]) -> dict[str, Any]:
-        """Return the residual of each pair in millimetres (null without depth), for frames with enough."""
+        """Return the residual of each pair in millimeters (null without depth), for frames with enough."""
         found = {}
         for name, recorded in self.recordings.items():
             for source_index, group in clicks.by_frame(pairs, name).items():

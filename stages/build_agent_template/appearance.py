@@ -24,9 +24,9 @@ def visibility(
     size: tuple[int, int],
     tolerance_m: float = 0.01,
 ) -> tuple[Float[np.ndarray, "view vertex"], Float[np.ndarray, "view vertex 2"]]:
-    """Return view weights of vertices (squared cosine to the normal; 0: occluded) and their colour pixels.
+    """Return view weights of vertices (squared cosine to the normal; 0: occluded) and their color pixels.
 
-    ``size`` is (height, width) of the colour pictures; those behind the mesh by the tolerance are occluded.
+    ``size`` is (height, width) of the color pictures; those behind the mesh by the tolerance are occluded.
     """
     caster = RayCaster(mesh_agent)
     normals = mesh_agent.vertex_normals()
@@ -59,7 +59,7 @@ def average_views(
     pictures: Sequence[Num[np.ndarray, "height width channel"]],
     stride_px: int,
 ) -> Float[np.ndarray, "vertex channel"]:
-    """Average pictures (cells of ``stride_px`` colour pixels) over views; unseen vertices copy neighbours."""
+    """Average pictures (cells of ``stride_px`` color pixels) over views; unseen vertices copy neighbors."""
     total = sum(
         w[:, None] * _bilinear(picture, at / stride_px)
         for w, at, picture in zip(weight, pixel, pictures, strict=True)
@@ -74,7 +74,7 @@ def average_views(
 def _bilinear(
     picture: Num[np.ndarray, "height width channel"], position: Float[np.ndarray, "point 2"]
 ) -> Float[np.ndarray, "point channel"]:
-    """Interpolate bilinearly at positions in cells, whose centres lie at half-integers."""
+    """Interpolate bilinearly at positions in cells, whose centers lie at half-integers."""
     height, width = picture.shape[:2]
     grid = np.clip(position - 0.5, 0, [width - BORDER_CELLS, height - BORDER_CELLS])
     low = np.floor(grid).astype(int)

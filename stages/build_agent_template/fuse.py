@@ -67,7 +67,7 @@ class Limb:
 
     frames: Int[np.ndarray, "chosen"]
     points_world: Float[np.ndarray, "point 3"]
-    """measured on it in all frames, metres"""
+    """measured on it in all frames, meters"""
 
 
 class Silhouettes:
@@ -127,7 +127,7 @@ def _fuse_frames(
 ) -> Silhouettes:
     """Fuse the animal's depth of some frames into a volume and count silhouettes.
 
-    Depth of low confidence counts where its neighbours agree.
+    Depth of low confidence counts where its neighbors agree.
     """
     counts = Silhouettes(volume.origin, volume.weight.shape, volume.voxel_m)
     for frame in frames:
@@ -140,7 +140,7 @@ def _fuse_frames(
 
 
 def _on_animal(clip: Clip, masks: Masks, turnaround: Turnaround, frame: int) -> Float[np.ndarray, "point 3"]:
-    """Return the points measured on the animal in one frame, in the turnaround's world, metres."""
+    """Return the points measured on the animal in one frame, in the turnaround's world, meters."""
     depth = clip.depth(frame)
     own = (depth_labels(masks[frame], clip.depth_size) == 255) & supported(depth)
     points_camera = cameras.back_project(depth, clip.depth_intrinsics[frame])[own].astype(float)
@@ -210,7 +210,7 @@ def _below_ground(volume: Volume, turnaround: Turnaround) -> Bool[np.ndarray, "x
 
 
 def _axes(volume: Volume) -> list[Float[np.ndarray, "cell"]]:
-    """Return the voxel coordinates along each axis, metres."""
+    """Return the voxel coordinates along each axis, meters."""
     return [volume.origin[axis] + np.arange(volume.weight.shape[axis]) * volume.voxel_m for axis in range(3)]
 
 

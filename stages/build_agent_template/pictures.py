@@ -16,7 +16,7 @@ VIEWS, SIZE_PX = 8, 220
 FOCAL, LIFTS_RAD, DISTANCE = 1.4, (0.25, 0.9), 3.2
 """the turntable's focal length in picture widths, elevations, and distance in radii of the mesh"""
 SATURATION, VALUES = 0.75, (0.7, 0.95)
-"""saturation and value of a bone's colour; neighbours alternate in value"""
+"""saturation and value of a bone's color; neighbors alternate in value"""
 
 
 def turntable(mesh: Mesh) -> UInt8[np.ndarray, "height width 3"]:

@@ -67,7 +67,7 @@ def register_turnaround(clip: Clip, masks: Masks) -> Turnaround:
 def depth_labels(
     labels: UInt8[np.ndarray, "height width"], size: tuple[int, int]
 ) -> UInt8[np.ndarray, "depth_height depth_width"]:
-    """Sample a mask (colour resolution) at the centres of the depth pixels."""
+    """Sample a mask (color resolution) at the centers of the depth pixels."""
     rows = ((np.arange(size[0]) + 0.5) * labels.shape[0] / size[0]).astype(int)
     columns = ((np.arange(size[1]) + 0.5) * labels.shape[1] / size[1]).astype(int)
     return labels[rows[:, None], columns]

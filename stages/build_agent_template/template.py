@@ -25,7 +25,7 @@ MIN_FRAMES = 10
 
 @dataclass(frozen=True)
 class CanonicalTemplate:
-    """The canonical animal (agent frame, metres) and the turnaround's cameras around it."""
+    """The canonical animal (agent frame, meters) and the turnaround's cameras around it."""
 
     mesh: Mesh
     features: Float[np.ndarray, "vertex 16"]

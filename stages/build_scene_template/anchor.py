@@ -21,7 +21,7 @@ MIN_REGISTERED = 0.6
 MAX_SCALE_DEVIATION = 0.06
 """Largest robust relative deviation of the ratio of depth to SfM depth; good models have 1-3 %."""
 MAX_GAP_M, MAX_GAP_RATIO = 0.06, 1.5
-"""The model is rejected if its depth gap (metres) exceeds the first, and the second times odometry's gap."""
+"""The model is rejected if its depth gap (meters) exceeds the first, and the second times odometry's gap."""
 MIN_RATIOS = 20
 """Least number of observations with depth for the scale."""
 HOPS = (1, 3, 8)
@@ -29,7 +29,7 @@ HOPS = (1, 3, 8)
 GAP_QUANTILE, MIN_OVERLAP = 0.75, 50
 """Quantile of a pair's depth differences, and least number of overlapping points of a pair."""
 MIN_DEPTH_M = 0.1
-"""Smaller depth counts as missing, metres."""
+"""Smaller depth counts as missing, meters."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class InitialTrajectory:
 
 
 def metric_scale(sparse: SparseModel, clip: Clip) -> tuple[float, float] | None:
-    """Return metres per model unit and its robust relative deviation, from depth; None if too few."""
+    """Return meters per model unit and its robust relative deviation, from depth; None if too few."""
     ratios = []
     for view, frame in enumerate(sparse.frame):
         row = np.flatnonzero(sparse.observed_key == view)
@@ -66,7 +66,7 @@ def metric_scale(sparse: SparseModel, clip: Clip) -> tuple[float, float] | None:
 
 
 def depth_gap(keyframes: list[Keyframe], world_from_camera: Float[np.ndarray, "key 4 4"]) -> float:
-    """Return the mean over keyframe pairs `HOPS` apart of a quantile of their depth differences, metres."""
+    """Return the mean over keyframe pairs `HOPS` apart of a quantile of their depth differences, meters."""
     gaps = []
     for hop in HOPS:
         for first in range(len(keyframes) - hop):

@@ -1,7 +1,7 @@
 """Clean a mesh with MeshLab's filters, as a separate process: ``clean_mesh.py IN.ply OUT.ply MIN_FACES``.
 
 pymeshlab is GPL-3, so it is used only through files. Removes connected components with fewer faces than
-MIN_FACES, duplicates, degenerate faces and non-manifold edges; keeps vertex colours and holes.
+MIN_FACES, duplicates, degenerate faces and non-manifold edges; keeps vertex colors and holes.
 """
 
 import sys
@@ -10,7 +10,7 @@ import pymeshlab
 
 
 def clean(source: str, target: str, min_faces: int) -> None:
-    """Read a PLY, clean it and write it with vertex colours."""
+    """Read a PLY, clean it and write it with vertex colors."""
     # The compiled module has no stubs; its members exist only at run time.
     meshes = pymeshlab.MeshSet(verbose=False)  # pyright: ignore[reportAttributeAccessIssue]
     meshes.load_new_mesh(source)

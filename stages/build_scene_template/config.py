@@ -32,11 +32,11 @@ class FusionConfig:
     """Resolution and reach of the depth fusion."""
 
     voxel_m: float = 0.025
-    """Edge of a voxel, metres."""
+    """Edge of a voxel, meters."""
     truncation_m: float = 0.1
-    """Truncation of the signed distance, metres; about three times the depth noise at the far end."""
+    """Truncation of the signed distance, meters; about three times the depth noise at the far end."""
     furthest_m: float = 4.5
-    """Depth beyond this is not fused, metres."""
+    """Depth beyond this is not fused, meters."""
     island_faces: int = 120
     """Smaller connected components are removed, faces."""
     align_rounds: int = 4

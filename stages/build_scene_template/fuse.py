@@ -1,4 +1,4 @@
-"""Fuse the walk-through's depth and colour to a surface, align every frame to it, clean it, add features."""
+"""Fuse the walk-through's depth and color to a surface, align every frame to it, clean it, add features."""
 
 import subprocess
 import sys
@@ -23,16 +23,16 @@ MAX_VOXELS = 150_000_000
 CONFIDENCE_WEIGHT = (0.2, 0.6, 1.0)
 """Fusion weight of low, medium and high confidence; depth edges and thin legs have only low confidence."""
 MIN_WEIGHT = 0.15
-"""Least weight of a surface voxel, in units of one view from one metre."""
+"""Least weight of a surface voxel, in units of one view from one meter."""
 EXTENT_STRIDE_PX, EXTENT_STEP, EXTENT_TRIM = 12, 4, 0.001
 """Pixel and keyframe strides for measuring the room's extent, and the quantile trimmed at each end."""
 ALIGN_REACH_M = (0.1, 0.04)
-"""Width of the robust weight in the first and last round of the alignment to the surface, metres."""
+"""Width of the robust weight in the first and last round of the alignment to the surface, meters."""
 ALIGN_POINTS, ALIGN_MIN_POINTS = 400_000, 40
 """Total of depth points, which bounds memory, and least number per frame."""
 NO_KEYFRAMES = np.zeros(0, int)
 MIN_DEPTH_M, SEEN_WITHIN_M = 0.2, 0.06
-"""A frame sees a vertex beyond the first distance if measured depth agrees within the second, metres."""
+"""A frame sees a vertex beyond the first distance if measured depth agrees within the second, meters."""
 
 
 def fuse(
@@ -71,7 +71,7 @@ def align_frames(
     config: FusionConfig,
     keyframes: Int[np.ndarray, "key"] = NO_KEYFRAMES,
 ) -> tuple[Float[np.ndarray, "frame 4 4"], Float[np.ndarray, "frame"]]:
-    """Align every frame to the surface, with odometry; also return each frame's median residual, metres.
+    """Align every frame to the surface, with odometry; also return each frame's median residual, meters.
 
     Depth noise is rescaled by its chi-square at the keyframes; they stay fixed if it is too large.
     """

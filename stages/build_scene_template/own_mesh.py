@@ -1,7 +1,7 @@
 """Use the mesh that comes with a recording, such as Polycam's, in place of a fused one.
 
 The walk-through's depth must confirm its pose and scale. Faces that no frame saw are removed (apps fill
-holes), and vertices are coloured by the frames.
+holes), and vertices are colored by the frames.
 """
 
 import numpy as np
@@ -17,14 +17,14 @@ from stages.build_scene_template.config import Config
 from stages.build_scene_template.template import REGISTERED_WITHIN_M, SceneTemplate, floor_height
 
 EDGE_M, SUBDIVISIONS = 0.05, 12
-"""Edge length (metres) to which edges are subdivided, in at most so many iterations, for vertex colours."""
+"""Edge length (meters) to which edges are subdivided, in at most so many iterations, for vertex colors."""
 MAX_SCALE_ERROR, MAX_GAP_M, MIN_AGREE = 0.03, 0.05, 0.7
-"""Bounds on relative scale error, median depth residual (metres) and share of depth that agrees; Polycam's
+"""Bounds on relative scale error, median depth residual (meters) and share of depth that agrees; Polycam's
 meshes have 1 %, 2 cm and 0.85."""
 SEEN_WITHIN_M, MIN_DEPTH_M = 0.08, 0.1
-"""Depth agreement of a seen vertex, and least valid depth, metres."""
+"""Depth agreement of a seen vertex, and least valid depth, meters."""
 SCALE_VIEWS, SCALE_STRIDE_PX, COLOR_VIEWS = 10, 4, 60
-"""Frames and pixel stride for measuring scale; frames for colouring and visibility."""
+"""Frames and pixel stride for measuring scale; frames for coloring and visibility."""
 
 
 def build(
@@ -88,7 +88,7 @@ def compare_depth(
 def seen_and_colored(
     clip: Clip, mesh: Mesh, world_from_camera: Float[np.ndarray, "frame 4 4"]
 ) -> tuple[Bool[np.ndarray, "vertex"], UInt8[np.ndarray, "vertex 3"]]:
-    """Return which vertices some frame's depth confirms, and their mean colour, weighted by 1 / depth."""
+    """Return which vertices some frame's depth confirms, and their mean color, weighted by 1 / depth."""
     total, weight = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
     for frame in subsampling.evenly(len(clip), COLOR_VIEWS):
         local = rigid.apply(rigid.inverse(world_from_camera[frame]), mesh.vertices.astype(float))

@@ -71,7 +71,7 @@ def checks(template: SceneTemplate) -> list[Check]:
     """Return the quality checks."""
     start = template.start
     surface = [
-        Check("metres known", float(template.scale != "relative"), "", 0.5, better="higher"),
+        Check("meters known", float(template.scale != "relative"), "", 0.5, better="higher"),
         Check("depth against the surface", float(np.nanmedian(template.gap_m) * 100), "cm, median", 2.0, 5.0),
         Check("frames that fit the surface", float(template.registered.mean()), "share", 0.95, 0.5, "higher"),
     ]
@@ -91,9 +91,9 @@ def checks(template: SceneTemplate) -> list[Check]:
 def _scale(template: SceneTemplate) -> str:
     """Return the source of metric scale, in words."""
     if template.scale == "relative":
-        return "relative: from pictures alone, lengths are no metres"
+        return "relative: from pictures alone, lengths are no meters"
     if template.scale != "measured":
-        return f"pictures alone, metres from the depth of {template.scale}"
+        return f"pictures alone, meters from the depth of {template.scale}"
     return "depth under COLMAP's tracks" if template.start.source == "colmap" else "odometry and depth"
 
 

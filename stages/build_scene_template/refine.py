@@ -20,15 +20,15 @@ from stages.build_scene_template.config import RefinementConfig
 DRIFT_RAD_S, DRIFT_M_S = np.deg2rad(0.5), 0.02
 """Odometry drift assumed by the pose graph, several times that of phones, so that depth dominates."""
 DEPTH_INFLATION = 4.0
-"""Factor on depth noise, since errors of neighbouring pixels are correlated."""
+"""Factor on depth noise, since errors of neighboring pixels are correlated."""
 STRIDE_PX = 10
 """Grid spacing of the depth pixels."""
 REACH_M = (0.15, 0.04)
-"""Width of the robust kernel in the first and last round, metres."""
+"""Width of the robust kernel in the first and last round, meters."""
 CANDIDATE_RATIO = 1.5
 """Largest point-to-plane distance of a correspondence, in reaches."""
 MIN_DEPTH_M = 0.1
-"""Smaller depth counts as missing, metres."""
+"""Smaller depth counts as missing, meters."""
 MIN_COSINE = 0.7
 """Least cosine between the normals of a correspondence; rejects edges and backs of thin walls."""
 FIRST_ROUNDS, FIRST_INFLATION = 6, 3.0
@@ -43,7 +43,7 @@ OVERLAP_STEP, MIN_OVERLAP = 7, 0.3
 
 @dataclass(frozen=True)
 class Keyframe:
-    """Subsampled points, full depth and normals of one keyframe (metres, camera frame)."""
+    """Subsampled points, full depth and normals of one keyframe (meters, camera frame)."""
 
     scan: depth_scans.Scan
     depth: Float[np.ndarray, "height width"]

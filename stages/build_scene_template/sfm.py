@@ -20,7 +20,7 @@ from pipeline.mapping.colmap import SparseModel, read_sparse_model
 from stages.build_scene_template.config import SfmConfig
 
 KEYFRAME_M, KEYFRAME_DEG = 0.12, 9.0
-"""Translation (metres) or rotation (degrees) between keyframes, by odometry."""
+"""Translation (meters) or rotation (degrees) between keyframes, by odometry."""
 KEYFRAME_S = 0.4
 """Time between keyframes where there is no odometry, seconds."""
 FIRST_OCTAVE = -1
@@ -28,23 +28,23 @@ FIRST_OCTAVE = -1
 PEAK_THRESHOLD = 0.004
 """SIFT's contrast threshold; plain walls need a low one (COLMAP's default is 0.0067)."""
 LOOP_M, LOOP_DEG = 1.0, 35.0
-"""Loop candidates by odometry: largest distance (metres) and angle between optical axes (degrees)."""
+"""Loop candidates by odometry: largest distance (meters) and angle between optical axes (degrees)."""
 FIRST_STEP, SECOND_STEP = 5, 3
 """Without odometry every fifth keyframe is matched with every third one."""
 DATABASE = "database.db"
 MIN_KEYFRAMES = 3
 """Least registered keyframes of an accepted model."""
 INLIER_M = 0.06
-"""RANSAC inlier threshold, metres: twice the depth noise at 4 m."""
+"""RANSAC inlier threshold, meters: twice the depth noise at 4 m."""
 MIN_INLIER_RATIO, MIN_MATCHES = 0.5, 8
 """Least inlier ratio and number of inliers among matches with depth."""
 MAX_DIFF_DEG, MAX_DIFF_M = 6.0, 0.3
-"""Largest difference from odometry, degrees and metres: allows drift, but not a repeated texture."""
+"""Largest difference from odometry, degrees and meters: allows drift, but not a repeated texture."""
 RANSAC_TRIPLETS = 80
 MIN_SIDE_M = 0.15
-"""Least side of a RANSAC sample's triangle, metres."""
+"""Least side of a RANSAC sample's triangle, meters."""
 MIN_DEPTH_M = 0.1
-"""Smaller depth counts as missing, metres."""
+"""Smaller depth counts as missing, meters."""
 
 
 def choose_keyframes(clip: Clip, config: SfmConfig) -> Int[np.ndarray, "key"]:
@@ -102,7 +102,7 @@ def reconstruct(clip: Clip, config: SfmConfig, workspace: Path, seed: int) -> Sp
 def back_project(
     clip: Clip, frame: int, pixel: Float[np.ndarray, "sample 2"]
 ) -> Float[np.ndarray, "sample 3"]:
-    """Back-project colour pixels to the camera frame; NaN where depth is unknown or of low confidence."""
+    """Back-project color pixels to the camera frame; NaN where depth is unknown or of low confidence."""
     return back_project_pixels(clip, frame, pixel, usable_depth(clip, frame, nearest_m=MIN_DEPTH_M))
 
 

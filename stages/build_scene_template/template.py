@@ -22,7 +22,7 @@ from stages.build_scene_template.config import Config
 MIN_POINTS = 100
 """Least number of depth points with a normal, and of faces of the fused mesh."""
 REGISTERED_WITHIN_M = 0.1
-"""Largest median depth residual of a registered frame, metres."""
+"""Largest median depth residual of a registered frame, meters."""
 UP_COSINE, FLOOR_SHARE = 0.9, 0.05
 """Least upward normal component of level surface, and quantile of its heights that is the floor's."""
 
@@ -36,7 +36,7 @@ class SceneTemplate:
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     registered: Bool[np.ndarray, "frame"]
     gap_m: Float[np.ndarray, "frame"]
-    """Median distance of each frame's depth from the surface, metres."""
+    """Median distance of each frame's depth from the surface, meters."""
     start: anchor.InitialTrajectory
     keyframe: Bool[np.ndarray, "frame"]
     """Frames whose cameras were jointly optimized."""
@@ -132,7 +132,7 @@ def floor_height(mesh: Mesh) -> float:
 def write_model(
     sparse: SparseModel | None, world_from_camera: Float[np.ndarray, "frame 4 4"], folder: Path
 ) -> None:
-    """Write COLMAP's model as text, aligned to the world by a similarity of camera centres."""
+    """Write COLMAP's model as text, aligned to the world by a similarity of camera centers."""
     folder.mkdir()
     if sparse is None:
         (folder / "README.txt").write_text("COLMAP found no model in this walk-through.\n")

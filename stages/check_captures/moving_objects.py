@@ -14,14 +14,14 @@ from pipeline.geometry import cameras, rigid
 from stages.check_captures.sampling import SampledFrame
 
 MARGIN_M, MARGIN_SHARE = 0.12, 0.03
-"""a point is in another frame's free space if depth there is larger by this, metres and share of depth"""
+"""a point is in another frame's free space if depth there is larger by this, meters and share of depth"""
 ANIMAL_M2 = (0.006, 0.6)
-"""smallest and largest visible surface of an animal, square metres"""
+"""smallest and largest visible surface of an animal, square meters"""
 LARGE_M2 = 0.1
-"""visible moving surface of a person or a large animal, square metres; drift and noise of walk-throughs whose
+"""visible moving surface of a person or a large animal, square meters; drift and noise of walk-throughs whose
 parts agree stay below, and so does a cat"""
 TWO_APART_M = 0.6
-"""clusters further apart than this are two animals, metres"""
+"""clusters further apart than this are two animals, meters"""
 VOTES = 2
 
 
@@ -75,7 +75,7 @@ def _range_around(depth: Float[np.ndarray, "height width"]) -> tuple[np.ndarray,
 def _clusters(
     shot: SampledFrame, marked: Bool[np.ndarray, "height width"]
 ) -> list[tuple[Float[np.ndarray, "3"], float]]:
-    """Return the centres (camera axes, metres) and surfaces (square metres) of connected regions."""
+    """Return the centers (camera axes, meters) and surfaces (square meters) of connected regions."""
     count, labels = cv2.connectedComponents(marked.astype(np.uint8), connectivity=8)
     points = cameras.back_project(shot.depth, shot.depth_intrinsics)
     area = shot.depth**2 / (shot.depth_intrinsics[0, 0] * shot.depth_intrinsics[1, 1])

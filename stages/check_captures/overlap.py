@@ -16,7 +16,7 @@ WITHIN_M = 0.06
 MIN_INLIERS = 10
 """minimum inliers to localize a frame"""
 AGREE = (15.0, 0.6)
-"""tolerances for consistent poses, degrees and metres"""
+"""tolerances for consistent poses, degrees and meters"""
 TRIALS = 300
 
 

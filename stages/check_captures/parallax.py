@@ -1,4 +1,4 @@
-"""Check that a video without depth can be mapped: neighbouring pictures overlap with parallax."""
+"""Check that a video without depth can be mapped: neighboring pictures overlap with parallax."""
 
 import itertools
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ MAX_ROTATION_SHARE = 0.9
 
 @dataclass(frozen=True)
 class Parallax:
-    """Overlap and parallax of pairs of neighbouring sampled pictures, shares 0..1."""
+    """Overlap and parallax of pairs of neighboring sampled pictures, shares 0..1."""
 
     linked: float
     """overlapping pairs"""
@@ -31,7 +31,7 @@ class Parallax:
 
 
 def parallax(shots: Sequence[SampledFrame]) -> Parallax:
-    """Match neighbouring pictures and compare epipolar geometry with a rotation."""
+    """Match neighboring pictures and compare epipolar geometry with a rotation."""
     described = [_described(shot) for shot in shots]
     links = [link for pair in itertools.pairwise(described) if (link := _link(*pair)) is not None]
     with_parallax = float(np.mean([turned < MAX_ROTATION_SHARE for turned in links])) if links else 0.0

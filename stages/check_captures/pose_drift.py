@@ -15,7 +15,7 @@ SAME_DIRECTION, NEAR_M = 0.8, 1.5
 
 
 def drift_m(shots: Sequence[SampledFrame]) -> float:
-    """Return the median disagreement of depth between frames at least 5 s apart, metres; NaN without any."""
+    """Return the median disagreement of depth between frames at least 5 s apart, meters; NaN without any."""
     if len(shots) < 2 or shots[0].odometry_from_camera is None:
         return np.nan
     pairs = [

@@ -115,7 +115,7 @@ def _of_pictures_alone(parallax: Parallax | None, role: Role) -> dict[str, str]:
     mapped = "there is no depth: the room is mapped from pictures"
     found = {"CAP-039": f"{mapped}; without a session that has depth its scale is relative"}
     if parallax is not None and (parallax.linked < MIN_LINKED or parallax.with_parallax < MIN_PARALLAX):
-        linked = f"{parallax.linked:.0%} of neighbouring pictures show the same things"
+        linked = f"{parallax.linked:.0%} of neighboring pictures show the same things"
         found["CAP-056"] = f"{linked}, {parallax.with_parallax:.0%} of these from elsewhere"
     return found
 

@@ -34,7 +34,7 @@ class SampledFrame:
     brightness: float
     intrinsics: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
     depth: Float[np.ndarray, "depth_height depth_width"] = field(default_factory=lambda: np.zeros((0, 0)))
-    """metres, 0 = unknown"""
+    """meters, 0 = unknown"""
     depth_intrinsics: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
     odometry_from_camera: Float[np.ndarray, "4 4"] | None = None
     beyond: float = 0.0
@@ -94,7 +94,7 @@ class RecordingSample:
 
     @property
     def depth_m(self) -> float:
-        """Median depth, metres; NaN without any."""
+        """Median depth, meters; NaN without any."""
         known = np.concatenate([shot.depth[shot.depth > 0] for shot in self.shots] or [np.zeros(0)])
         return float(np.median(known)) if len(known) else np.nan
 

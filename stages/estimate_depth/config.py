@@ -9,7 +9,7 @@ class Config:
     """Depth estimation for recordings without depth."""
 
     length_m: float = 0.5
-    """Length of the animal without its tail, metres; gives the height of its back."""
+    """Length of the animal without its tail, meters; gives the height of its back."""
     backend: Literal["contact", "depth_anything_v2", "depth_pro"] = "contact"
     """The animal's depth in sessions: by its contact with the map, or by a monocular network (`make extras`,
     and its checkpoint) scaled by the map's depth."""

@@ -31,12 +31,12 @@ SWEPT_PX, SOURCES, PLANES, ANGLES_DEG = 224, 4, 96, (3.0, 22.0)
 """Plane sweep of turnarounds: longer side of pictures, pixels; source frames; planes; range of triangulation
 angles at the middle of the view, degrees."""
 NEAREST_M, FARTHEST_SHARE = 0.25, 1.3
-"""Nearest plane, metres; farthest plane in units of the map's largest depth."""
+"""Nearest plane, meters; farthest plane in units of the map's largest depth."""
 MIN_AGREEING = 2
 """Other frames that must agree on a depth; one more makes it certain."""
 
 DepthNet = Callable[[int, Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]], np.ndarray]
-"""Depth of one frame by a network, metres, given the map's depth and where it is valid."""
+"""Depth of one frame by a network, meters, given the map's depth and where it is valid."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class FrameDepth:
     """Depth of one frame at the size of its view."""
 
     depth: Float[np.ndarray, "height width"]
-    """Metres, 0 = unknown."""
+    """Meters, 0 = unknown."""
     confidence: UInt8[np.ndarray, "height width"]
     """2 from the map, or confirmed by several frames; 1 at edges, or inferred; 0 unknown."""
     inferred: bool

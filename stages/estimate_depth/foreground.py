@@ -23,7 +23,7 @@ MIN_GAP_S = 0.7
 SLACK_PX, SOFTNESS_PX = 2, 0.8
 """Tolerated misalignment and standard deviation of the blur, pixels of the small picture."""
 HIGH_THRESHOLD, LOW_THRESHOLD = 22.0, 9.0
-"""Hysteresis thresholds of colour difference (sum over 8-bit CIE Lab channels)."""
+"""Hysteresis thresholds of color difference (sum over 8-bit CIE Lab channels)."""
 MIN_SEEN, WALK_SHARE, MIN_TIMES, TIMES_SHARE = 2, 0.5, 2, 0.1
 """Least pictures of other times that see a pixel; share of walk-through pictures that must differ; least
 number and share of other times that must: an animal may rest at one place for most of a recording."""
@@ -33,14 +33,14 @@ OPENING, CLOSING = np.ones((3, 3), np.uint8), np.ones((7, 7), np.uint8)
 
 @dataclass(frozen=True)
 class ColorView:
-    """A view with its colours (CIE Lab), blurred against misalignment."""
+    """A view with its colors (CIE Lab), blurred against misalignment."""
 
     view: View
     lab: Float[np.ndarray, "height width 3"]
 
 
 def color_view(color: UInt8[np.ndarray, "height width 3"], view: View) -> ColorView:
-    """Add colours to a view."""
+    """Add colors to a view."""
     small = cv2.resize(color, view.gray.shape[::-1], interpolation=cv2.INTER_AREA)
     lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32)
     return ColorView(view, cv2.GaussianBlur(lab, (3, 3), SOFTNESS_PX))
@@ -49,7 +49,7 @@ def color_view(color: UInt8[np.ndarray, "height width 3"], view: View) -> ColorV
 def difference(
     target: ColorView, source: ColorView
 ) -> tuple[Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
-    """Return the colour difference to a source, beyond the slack, and where the source sees the surface."""
+    """Return the color difference to a source, beyond the slack, and where the source sees the surface."""
     warped = views.warp(target.view, source.view)
     shown = cameras.sample_bilinear(source.lab, warped.there)
     known = warped.known

@@ -23,7 +23,7 @@ MIN_MATCHES = 6
 MIN_INLIERS, MIN_SHARE = 25, 0.25
 """Inliers and inlier ratio of a reliable pose."""
 INLIER_SHARE = 0.008
-"""RANSAC threshold, share of the picture's longer side: map points are accurate to centimetres."""
+"""RANSAC threshold, share of the picture's longer side: map points are accurate to centimeters."""
 MAX_EVALUATIONS = 30
 """Largest number of residual evaluations."""
 LOSS_PX = 1.0
@@ -36,7 +36,7 @@ MIN_DISTORTION_PX = 0.5
 
 @dataclass(frozen=True)
 class Lens:
-    """A centred pinhole camera with the first radial distortion coefficient (COLMAP's k1)."""
+    """A centered pinhole camera with the first radial distortion coefficient (COLMAP's k1)."""
 
     focal_px: float
     radial: float
@@ -88,7 +88,7 @@ class PnPResult:
 
     @property
     def reliable(self) -> bool:
-        """Return whether the inliers suffice to trust the pose without neighbours."""
+        """Return whether the inliers suffice to trust the pose without neighbors."""
         return len(self.matches.pixel) >= MIN_INLIERS and self.inlier_ratio >= MIN_SHARE
 
 

@@ -1,4 +1,4 @@
-"""Align monocular depth to metres: per-frame scale and shift from the map's depth."""
+"""Align monocular depth to meters: per-frame scale and shift from the map's depth."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -8,7 +8,7 @@ ROUNDS = 8
 MIN_PIXELS = 50
 """Least map pixels for alignment."""
 NEAREST_M, FARTHEST_M = 0.1, 20.0
-"""Range of valid depth, metres."""
+"""Range of valid depth, meters."""
 
 
 def aligned(
@@ -18,7 +18,7 @@ def aligned(
 ) -> Float[np.ndarray, "height width"]:
     """Return metric depth from relative inverse depth: 1 / depth = scale * inverse + shift.
 
-    Scale and shift are fitted to the map's depth (metres) where ``counts``, with Cauchy weights scaled by the
+    Scale and shift are fitted to the map's depth (meters) where ``counts``, with Cauchy weights scaled by the
     median residual. Returns 0 where depth is invalid, and everywhere if too little counts or scale <= 0.
     """
     if counts.sum() < MIN_PIXELS:

@@ -1,8 +1,8 @@
 """Cameras of a plain video in the map: landmarks, tracking between frames, and joint optimization.
 
-Pictures with enough landmarks are localized by them. The others are tracked from their neighbours by optical
+Pictures with enough landmarks are localized by them. The others are tracked from their neighbors by optical
 flow on the map's surface. Then all frames are optimized jointly, by flow to warped pictures of the
-walk-through and flow between neighbours.
+walk-through and flow between neighbors.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,7 +26,7 @@ from stages.estimate_depth.views import View
 WALK_VIEWS = 2
 """Pictures of the walk-through that each frame is compared with: those with most overlap."""
 NEIGHBOURS = (1, 3)
-"""Frame gaps of the flow between neighbours."""
+"""Frame gaps of the flow between neighbors."""
 PROBES = 60
 """Sample pixels that measure the overlap with pictures of the walk-through."""
 MIN_RATIO, GOOD_RATIO = 0.35, 0.7
@@ -39,7 +39,7 @@ SIGMA_PX, INLIER_PX = 8.0, 2.5
 """Standard deviation of flow, whose errors are correlated over hundreds of pixels, and RANSAC threshold, in
 pixels of the small pictures."""
 PASSES, REACH_M = 2, (0.1, 0.05, 0.05)
-"""Passes of matching, and scales of the robust weight within each, metres."""
+"""Passes of matching, and scales of the robust weight within each, meters."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Tracked:
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     """NaN for frames without a pose."""
     by_landmarks: Bool[np.ndarray, "frame"]
-    """Localized by landmarks; the others are tracked from their neighbours."""
+    """Localized by landmarks; the others are tracked from their neighbors."""
     lens: Lens
     """Of the small pictures, refined with the cameras."""
 
@@ -133,7 +133,7 @@ def _view(frame: int, footage: TrackingInput, pose, room: MapViews) -> View:
 
 
 def _track_one(frame, footage: TrackingInput, poses, room: MapViews, seed) -> None:
-    """Track one frame, in place, from its nearest neighbour, by the hypothesis with most inliers."""
+    """Track one frame, in place, from its nearest neighbor, by the hypothesis with most inliers."""
     known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     other = int(known[np.abs(known - frame).argmin()])
     source, best = _view(other, footage, poses[other], room), None
@@ -149,7 +149,7 @@ def _track_one(frame, footage: TrackingInput, poses, room: MapViews, seed) -> No
 
 
 def _hypotheses(frame, other, footage: TrackingInput, poses, room: MapViews, seed) -> Iterator[np.ndarray]:
-    """Yield pose hypotheses: constant velocity, matched keypoints, and the neighbour's pose."""
+    """Yield pose hypotheses: constant velocity, matched keypoints, and the neighbor's pose."""
     beyond = 2 * other - frame
     if 0 <= beyond < len(poses) and np.isfinite(poses[beyond, 0, 0]):
         yield poses[other] @ rigid.inverse(poses[beyond]) @ poses[other]
@@ -192,7 +192,7 @@ class _FlowFactor:
     """`MAP`, or a camera."""
     pixel: Float[np.ndarray, "match 2"]
     points: Float[np.ndarray, "match 3"]
-    """In the world, or in the second camera, metres."""
+    """In the world, or in the second camera, meters."""
 
 
 def _optimize(

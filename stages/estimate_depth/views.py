@@ -1,6 +1,6 @@
 """Warping pictures of a known surface between cameras.
 
-A `View` is a small grey picture with its camera and the surface's depth. `warp` maps one view into another's
+A `View` is a small gray picture with its camera and the surface's depth. `warp` maps one view into another's
 camera, and `flow_matches` measures the remaining displacement by optical flow.
 """
 
@@ -21,7 +21,7 @@ STRIDE_PX, MARGIN_PX = 8, 5
 MAX_FLOW_PX = 20.0
 """Largest valid flow between aligned pictures, pixels."""
 OCCLUDED_SHARE, OCCLUDED_M = 0.03, 0.03
-"""Depth difference at which a point is occluded: share of its depth plus metres."""
+"""Depth difference at which a point is occluded: share of its depth plus meters."""
 MIN_KNOWN = 0.05
 """Least overlap of two pictures for matching, share."""
 CLAHE_CLIP, CLAHE_TILES = 4.0, (6, 8)
@@ -37,7 +37,7 @@ class View:
     intrinsics: Float[np.ndarray, "3 3"]
     world_from_camera: Float[np.ndarray, "4 4"]
     depth: Float[np.ndarray, "height width"]
-    """Of the surface, metres; 0 where there is none."""
+    """Of the surface, meters; 0 where there is none."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Optical flow by dense inverse search (DIS, Kroeger et al. 2016), chained over growing gaps.
 
-Coarse-to-fine search loses small things that move against the camera, so neighbouring frames are searched
+Coarse-to-fine search loses small things that move against the camera, so neighboring frames are searched
 twice, from coarse levels and on the finest level only, and each place keeps what matches better. Search fails
 altogether when the picture moves far, so longer gaps chain two flows of half the gap and search again on the
 finest level from there. Make one `Estimator` per video; `flows` yields pair after pair and keeps no more than
@@ -38,7 +38,7 @@ Dense = Float[np.ndarray, "dense_height dense_width 2"]
 
 @dataclass(frozen=True)
 class Flow:
-    """Flow of one pair of frames, in colour pixels, at the cell centres (4j + 2, 4i + 2)."""
+    """Flow of one pair of frames, in color pixels, at the cell centers (4j + 2, 4i + 2)."""
 
     flow: Float[np.ndarray, "height width 2"]
     confidence: UInt8[np.ndarray, "height width"]
@@ -62,7 +62,7 @@ class Estimator:
         self._pixel = _index_grid(*self.dense_size)
 
     def reduce(self, color: UInt8[np.ndarray, "height width 3"]) -> Gray:
-        """Turn a colour picture into the gray one that is searched."""
+        """Turn a color picture into the gray one that is searched."""
         gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
         height, width = self.dense_size
         return cv2.resize(gray, (2 * width, 2 * height), interpolation=cv2.INTER_AREA)

@@ -27,12 +27,12 @@ class Review:
     agreement: float
     """share of vectors on which both directions agree"""
     speed_px: float
-    """mean length of the certain vectors, colour pixels"""
+    """mean length of the certain vectors, color pixels"""
     strip: UInt8[np.ndarray, "height width 3"] | None
 
 
 def review(folder: Path, gap: int, color: Callable[[int], UInt8[np.ndarray, "height width 3"]]) -> Review:
-    """Summarise the forward flow of one gap as it was written; ``color(i)`` gives frame i."""
+    """Summarize the forward flow of one gap as it was written; ``color(i)`` gives frame i."""
     flows, confidences = open_flow(folder, gap), open_confidence(folder, gap)
     if len(flows) == 0:
         return Review(gap, float("nan"), float("nan"), None)
@@ -49,7 +49,7 @@ def review(folder: Path, gap: int, color: Callable[[int], UInt8[np.ndarray, "hei
 
 
 def report_quality(folder: Path, reviews: Sequence[Review]) -> None:
-    """Write the stage's own judgement."""
+    """Write the stage's own judgment."""
     checks = []
     for each in reviews:
         name, least = f"both directions agree, {each.gap} apart", 100 * MIN_AGREEMENT[each.gap]
@@ -62,8 +62,8 @@ def report_quality(folder: Path, reviews: Sequence[Review]) -> None:
             pictures.append(qa.Picture(f"gap_{each.gap}", each.strip, caption))
     qa.write(
         folder,
-        good="one smooth colour for the moving camera, another inside the animal, dark only at edges",
-        bad="speckles of all colours, large dark areas in the middle",
+        good="one smooth color for the moving camera, another inside the animal, dark only at edges",
+        bad="speckles of all colors, large dark areas in the middle",
         checks=checks,
         pictures=pictures,
     )
@@ -72,7 +72,7 @@ def report_quality(folder: Path, reviews: Sequence[Review]) -> None:
 def flow_wheel(
     flow: Float[np.ndarray, "height width 2"], full_px: float
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Colour vectors: hue is direction, brightness is length up to ``full_px``."""
+    """Color vectors: hue is direction, brightness is length up to ``full_px``."""
     flow = flow.astype(np.float32)
     hue = np.degrees(np.arctan2(flow[..., 1], flow[..., 0])) % 360 / 2
     value = np.clip(np.linalg.norm(flow, axis=-1) / full_px, 0, 1) * 255
@@ -81,7 +81,7 @@ def flow_wheel(
 
 
 def _key(height: int, edge: int = 96) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw what colours mean: a disc with, at each place, the colour of motion towards it, bright if fast."""
+    """Draw what colors mean: a disc with, at each place, the color of motion towards it, bright if fast."""
     key = np.full((height, edge, 3), 255, np.uint8)
     along = np.arange(edge) - (edge - 1) / 2
     towards = np.stack(np.meshgrid(along, along), axis=-1)

@@ -1,4 +1,4 @@
-"""Measure behaviour beside simple baselines, and put all metrics of a build together."""
+"""Measure behavior beside simple baselines, and put all metrics of a build together."""
 
 from pipeline.workflow import cli
 from stages.evaluate import stage

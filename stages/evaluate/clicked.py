@@ -19,7 +19,7 @@ from stages.evaluate.reading import BuildFolders
 from stages.evaluate.registration import put_cameras
 
 TRUSTED_M = 0.10
-"""frames whose clicks disagree by more than this are left out, metres"""
+"""frames whose clicks disagree by more than this are left out, meters"""
 NO_CLICKS = "the true poses of this capture are not known; click some with `make annotate`"
 NAMES = tuple(
     f"registration/{unit}_{which}"

@@ -19,7 +19,7 @@ class Config:
     """Samples per window (K of the paper), the best of which counts."""
     trials: int = 4
     """Trials of `samples` goals per window, averaged: over 1,000 windows the sampling error is
-    then half a centimetre, a tenth of the interval."""
+    then half a centimeter, a tenth of the interval."""
     plan_windows: int = 120
     """Evenly spaced test windows for paths and bodies; goals are scored on all."""
     time_plans: bool = True

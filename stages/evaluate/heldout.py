@@ -63,7 +63,7 @@ class HeldoutView:
 
     color: UInt8[np.ndarray, "height width 3"]
     depth: Float[np.ndarray, "height width"]
-    """metres, 0 = nothing"""
+    """meters, 0 = nothing"""
     true: HeldoutShot
 
     @classmethod
@@ -160,7 +160,7 @@ def picture_quality(view: HeldoutView) -> list[float]:
 def compared_colors(
     view: HeldoutView,
 ) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width 3"]]:
-    """Return our colours, their exposure compensated, and the true ones; 0..1."""
+    """Return our colors, their exposure compensated, and the true ones; 0..1."""
     true = view.true.color.astype(np.float64) / 255
     return exposed(view.color.astype(np.float64) / 255, true, view.depth > 0), true
 
@@ -176,7 +176,7 @@ def exposed(
     true: Float[np.ndarray, "height width 3"],
     drawn: Bool[np.ndarray, "height width"],
 ) -> Float[np.ndarray, "height width 3"]:
-    """Compensate exposure by one affine map of colours, fitted on what was drawn; 0..1."""
+    """Compensate exposure by one affine map of colors, fitted on what was drawn; 0..1."""
     if drawn.sum() < 16:
         return ours
     source = np.concatenate([ours[drawn], np.ones((int(drawn.sum()), 1))], axis=1)

@@ -1,6 +1,6 @@
 """Single frames of real sessions placed on the map without odometry: our localizer and a simple baseline.
 
-It shows that the built-in world is not easy: SIFT points of the walk-through with PnP (colour only).
+It shows that the built-in world is not easy: SIFT points of the walk-through with PnP (color only).
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ class SiftMap:
 
 
 def metrics_of(name: str, errors: PoseErrors) -> Metrics:
-    """Summarise errors of single frames; frames without a pose count as failures."""
+    """Summarize errors of single frames; frames without a pose count as failures."""
     metrics = Metrics()
     metrics.put(f"{name}rotation_deg_median", median(errors.degrees), FAILED)
     metrics.put(f"{name}translation_m_median", median(errors.meters), FAILED)

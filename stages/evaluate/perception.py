@@ -48,7 +48,7 @@ def overlaps(masks: Masks, truth: RecordingTruth) -> Overlaps:
 
 
 def mask_metrics(sessions: Sequence[Overlaps], turnaround: Overlaps | None) -> Metrics:
-    """Summarise overlaps of all sessions; the turnaround, which is easier, is separate."""
+    """Summarize overlaps of all sessions; the turnaround, which is easier, is separate."""
     metrics = Metrics()
     iou = np.concatenate([each.iou for each in sessions]) if sessions else np.zeros(0)
     resting = np.concatenate([each.resting for each in sessions]) if sessions else np.zeros(0, bool)
@@ -68,7 +68,7 @@ PERSON_SEEN = 0.01
 
 
 def people_metrics(sessions: Sequence[tuple[RecordingTruth, Float[np.ndarray, "frame person 3"]]]) -> Metrics:
-    """Compare where people stand (camera frame, metres) with the true visitor, over the floor and the phone.
+    """Compare where people stand (camera frame, meters) with the true visitor, over the floor and the phone.
 
     The nearest of the tracks counts; `people/unseen` is the share of tracked frames that show nobody.
     """
@@ -95,7 +95,7 @@ def people_metrics(sessions: Sequence[tuple[RecordingTruth, Float[np.ndarray, "f
 
 @dataclass(frozen=True)
 class FlowPair:
-    """Ours and true flow of the same pair of frames, colour pixels."""
+    """Ours and true flow of the same pair of frames, color pixels."""
 
     ours: Float[np.ndarray, "height width 2"]
     true: Float[np.ndarray, "height width 2"]
@@ -107,7 +107,7 @@ def flow_pairs(
     true: TrueFlow,
     masks: Bool[np.ndarray, "frame row column"],
 ) -> list[FlowPair]:
-    """Pair up flow of gap 1; the agent's cells are those whose centre it covers."""
+    """Pair up flow of gap 1; the agent's cells are those whose center it covers."""
     stride = masks.shape[1] // ours.shape[1]
     agent = masks[:, stride // 2 :: stride, stride // 2 :: stride][:, : ours.shape[1], : ours.shape[2]]
     return [
@@ -118,7 +118,7 @@ def flow_pairs(
 
 def flow_metrics(pairs: Sequence[FlowPair]) -> Metrics:
     """Return end-point errors, of ours and of predicting no motion at all."""
-    metrics, why = Metrics(), "no truth for neighbouring frames"
+    metrics, why = Metrics(), "no truth for neighboring frames"
     ours, zero, agent = [], [], []
     for pair in pairs:
         known = np.isfinite(pair.true).all(-1)

@@ -37,7 +37,7 @@ class Reconstructed:
 
 @dataclass(frozen=True, kw_only=True)
 class BuildFolders(Reconstructed):
-    """Where the artifacts before behaviour stand; per-recording ones by id."""
+    """Where the artifacts before behavior stand; per-recording ones by id."""
 
     masks: Mapping[str, Path]
     flow: Mapping[str, Path]

@@ -22,7 +22,7 @@ from stages.evaluate.reading import BuildFolders
 LOCALIZED = 40
 """frames that vote where registration places the phone"""
 AGREE = (5.0, 0.2)
-"""degrees and metres within which two frames mean the same place"""
+"""degrees and meters within which two frames mean the same place"""
 MIN_VOTES = 4
 UNPLACED = "the held-out phone was neither clicked (`make annotate`) nor could registration place it"
 NO_MASKS = "the held-out phone of a real capture has no masks"

@@ -166,7 +166,7 @@ def drawn_by_fields(
     device: devices.Device,
 ) -> tuple[list[HeldoutView], list[HeldoutView]]:
     """Draw the reconstruction as the synchronized session saw it: ``shots`` on its surfaces, ``integrated``
-    by integrating the fields along rays, as the paper measures depth (without colour). Nothing where the
+    by integrating the fields along rays, as the paper measures depth (without color). Nothing where the
     session was refused.
     """
     if motion is None:
@@ -227,7 +227,7 @@ def track_distances(
     turnaround: RecordingWithTruth,
     frames: TruthAlignment,
 ) -> list[Float[np.ndarray, "point"]]:
-    """Return distances, metres per visible frame, of surface points matched to truth in the turnaround."""
+    """Return distances, meters per visible frame, of surface points matched to truth in the turnaround."""
     skin = _skin(folders)[1].only(TRACKS.load(folders.reconstruction / "tracks.npz")["vertex_index"])
     partner = surfaces.matched_once(skin.vertices, _at_rest(turnaround, frames))
     distances = []

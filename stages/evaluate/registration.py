@@ -11,7 +11,7 @@ from stages.evaluate.reliability import reliability_metrics
 
 REFUSED, REFUSED_TENTH = "more than half of the frames have no pose", "a tenth of the frames has no pose"
 GOOD = (2.0, 0.05)
-"""degrees and metres within which a pose counts as right"""
+"""degrees and meters within which a pose counts as right"""
 GOOD_ROOT = (20.0, 0.08)
 """likewise for the animal's root: what its localizer is held to"""
 FLIPPED_DEG = 90.0
@@ -22,7 +22,7 @@ COVERAGES = (0.5, 0.8)
 def camera_metrics(
     errors: Mapping[str, PoseErrors], confidence: Mapping[str, Float[np.ndarray, "frame"]], registered: int
 ) -> Metrics:
-    """Summarise camera errors of all sessions, and of the frames that were most certain."""
+    """Summarize camera errors of all sessions, and of the frames that were most certain."""
     metrics, all_errors = Metrics(), joined(list(errors.values()))
     put_cameras(metrics, all_errors)
     metrics.put("registration/videos_registered", registered)
@@ -41,14 +41,14 @@ def camera_metrics(
 
 
 def is_right(errors: PoseErrors, within: tuple[float, float] = GOOD) -> Bool[np.ndarray, "frame"]:
-    """Return which poses are within so many degrees and metres of truth."""
+    """Return which poses are within so many degrees and meters of truth."""
     return (errors.degrees <= within[0]) & (errors.meters <= within[1])
 
 
 def root_metrics(
     name: str, errors: Sequence[PoseErrors], placed: Sequence[Bool[np.ndarray, "frame"]] | None = None
 ) -> Metrics:
-    """Summarise the agent's root over the frames in which it is truly visible; ``placed`` marks where it is
+    """Summarize the agent's root over the frames in which it is truly visible; ``placed`` marks where it is
     known; by default where a pose is given.
     """
     metrics, all_errors = Metrics(), joined(list(errors))

@@ -1,4 +1,4 @@
-"""The stage: the metrics of the reconstruction, and a behaviour model -> all metrics, the quality page."""
+"""The stage: the metrics of the reconstruction, and a behavior model -> all metrics, the quality page."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,13 +32,13 @@ class Inputs:
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "cpu") -> Metrics:
-    """Add behaviour to the metrics of the reconstruction, write all into `out`, and return them."""
+    """Add behavior to the metrics of the reconstruction, write all into `out`, and return them."""
     metrics = Metrics.read(inputs.reconstruction_metrics)
     data = BehaviorData.load(inputs.behavior_data)
     scenes = Scenes.load(inputs.behavior_data, data.videos)
     sampling = PlanSamplingConfig()
     ours, on_cpu = (Ats.load(inputs.behavior, scenes, sampling, device=each) for each in (device, "cpu"))
-    progress.log("evaluate: behaviour")
+    progress.log("evaluate: behavior")
     metrics.add(behavior.behavior_metrics(data, ours, config))
     progress.log("evaluate: penetration and foot slide")
     metrics.add(physical.physical_metrics(data, ours, inputs.reconstruction, seed=config.seed))

@@ -25,7 +25,7 @@ def matched_once(
 
 
 def track_metrics(distances: Sequence[Float[np.ndarray, "point"]]) -> Metrics:
-    """Summarise distances of followed points over all frames; unknown poses count as failures."""
+    """Summarize distances of followed points over all frames; unknown poses count as failures."""
     metrics = Metrics()
     every = np.concatenate(distances) if len(distances) else np.zeros(0)
     metrics.put("reconstruction/agent_track_m_median", median(every), REFUSED)

@@ -52,7 +52,7 @@ class RecordingTruth:
         )
 
     def vertices_world(self, frame: int) -> Float[np.ndarray, "vertex 3"]:
-        """Return the true surface's vertices of one frame, metres, in the truth's world."""
+        """Return the true surface's vertices of one frame, meters, in the truth's world."""
         return self.vertices[frame].astype(np.float64) + self.world_from_agent[frame, :3, 3]
 
 
@@ -75,16 +75,16 @@ def read_depth(folder: Path, name: str, source_index: Int[np.ndarray, "frame"]) 
 
 @dataclass(frozen=True)
 class TrueFlow:
-    """True flow of neighbouring extracted frames, at the stored grid."""
+    """True flow of neighboring extracted frames, at the stored grid."""
 
     first: Int[np.ndarray, "pair"]
     """extracted frame; the flow leads to the next one"""
     flow: Float[np.ndarray, "pair height width 2"]
-    """colour pixels, NaN where the point is not seen in both"""
+    """color pixels, NaN where the point is not seen in both"""
 
 
 def read_flow(folder: Path, name: str, source_index: Int[np.ndarray, "frame"]) -> TrueFlow | None:
-    """Read ``<name>.flow.npz`` and keep the pairs that extraction made neighbours; None without a file."""
+    """Read ``<name>.flow.npz`` and keep the pairs that extraction made neighbors; None without a file."""
     path = folder / f"{name}.flow.npz"
     if not path.exists():
         return None

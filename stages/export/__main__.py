@@ -2,8 +2,8 @@
 
 Reads finished artifacts, computes nothing anew. Formats: glb (Blender, Unity, Unreal, three.js), splats (3D
 Gaussian viewers), usd (Omniverse, Isaac, Houdini), bvh (animation tools), mjcf (MuJoCo), tables (pandas, R),
-movement and nwb (behaviour analysis), nerfstudio and colmap (training of radiance fields). Each writes
-`export.json`: the library that wrote it, what is lost in millimetres, and the tool that it was opened with.
+movement and nwb (behavior analysis), nerfstudio and colmap (training of radiance fields). Each writes
+`export.json`: the library that wrote it, what is lost in millimeters, and the tool that it was opened with.
 `take` adds a generated motion; `body` puts the motions on the body of another build.
 """
 

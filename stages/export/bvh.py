@@ -27,7 +27,7 @@ def write(folder: Path, agent: Agent) -> ExportRecord:
         lost.append(read_places(file, names) - truth)
     lost_mm = 1000 * np.linalg.norm(np.concatenate(lost), axis=-1)
     measured = {"flat_mean": round(float(lost_mm.mean()), 4), "flat_max": round(float(lost_mm.max()), 4)}
-    remark = "metres, +y up, rotations in the order Z X Y; give 1.0 as the scale; distances of bones' centres"
+    remark = "meters, +y up, rotations in the order Z X Y; give 1.0 as the scale; distances of bones' centers"
     loss = agent.retargeting_loss_mm | measured
     return ExportRecord("own writer", loss, "own reader, with forward kinematics", remark)
 
@@ -47,7 +47,7 @@ def flat(action: Action, names: list[str]) -> str:
 
 
 def read_places(path: Path, names: list[str]) -> Float[np.ndarray, "frame joint 3"]:
-    """Read a file by forward kinematics and return the positions of the named joints, metres."""
+    """Read a file by forward kinematics and return the positions of the named joints, meters."""
     head, _, body = path.read_text().partition("MOTION")
     rows = np.array([[float(value) for value in line.split()] for line in body.strip().splitlines()[2:]])
     stack: list[np.ndarray] = []

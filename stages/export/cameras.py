@@ -24,7 +24,7 @@ _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def write_nerfstudio(folder: Path, frames: list[CameraFrame]) -> ExportRecord:
-    """Write `transforms.json` (OpenGL camera-to-world), pictures, depth in millimetres, masks of the room."""
+    """Write `transforms.json` (OpenGL camera-to-world), pictures, depth in millimeters, masks of the room."""
     for name in ("images", "depth", "masks"):
         (folder / name).mkdir()
     entries = []
@@ -46,8 +46,8 @@ def write_nerfstudio(folder: Path, frames: list[CameraFrame]) -> ExportRecord:
         )  # fmt: skip
     table = {"camera_model": "OPENCV", "k1": 0, "k2": 0, "p1": 0, "p2": 0, "frames": entries}
     (folder / "transforms.json").write_text(json.dumps(table, indent=1) + "\n")
-    depth = "depth PNG in millimetres, 0 = unknown, at the picture's size"
-    remark = f"OpenGL cameras, metres, +y up; {depth}; masks are black on the animal"
+    depth = "depth PNG in millimeters, 0 = unknown, at the picture's size"
+    remark = f"OpenGL cameras, meters, +y up; {depth}; masks are black on the animal"
     return ExportRecord("own writer", {}, "own reader", remark)
 
 
@@ -81,7 +81,7 @@ def write_colmap(folder: Path, frames: list[CameraFrame], room: Mesh) -> ExportR
 
 
 def _opened(model: Path, frames: list[CameraFrame]) -> float:
-    """Open the model with COLMAP and return the largest error of camera positions, metres."""
+    """Open the model with COLMAP and return the largest error of camera positions, meters."""
     found = pycolmap.Reconstruction(str(model))
     places = {image.name: image.projection_center() for image in found.images.values()}
     assert len(places) == len(frames), (len(places), len(frames))

@@ -18,5 +18,5 @@ def write(folder: Path, agent: Agent, scene: bytes) -> ExportRecord:
     for content in (data, scene):
         opened = trimesh.load_scene(io.BytesIO(content), file_type="glb")
         assert len(opened.geometry) == 1, "one surface a file"
-    remark = "metres, +y up; joints are siblings under one root; 4 influences a vertex; one action per motion"
+    remark = "meters, +y up; joints are siblings under one root; 4 influences a vertex; one action per motion"
     return ExportRecord(version("pygltflib"), agent.loss_mm, version("trimesh"), remark)

@@ -15,7 +15,7 @@ from stages.export.reading import Agent, Occupancy
 from stages.export.writing import ExportRecord, extra, version
 
 GREY = 150
-"""of an animal without colours, 0..255"""
+"""of an animal without colors, 0..255"""
 ZUP_FROM_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
@@ -34,7 +34,7 @@ def write(folder: Path, agent: Agent, occupancy: Occupancy) -> ExportRecord:
     loss["bodies"] = round(1000 * _posed(mujoco, folder / "agent.xml", motions, agent.actions[0].name), 4)
     loss["room_voxel"] = 1000 * occupancy.voxel_m
     driven = "drive data.mocap_pos and data.mocap_quat with motions.npz"
-    remark = f"metres, +z up; {driven}; the room's boxes are as coarse as its voxels"
+    remark = f"meters, +z up; {driven}; the room's boxes are as coarse as its voxels"
     return ExportRecord(version("mujoco"), loss, version("mujoco"), remark)
 
 
@@ -104,7 +104,7 @@ def _room(room: Int[np.ndarray, "box 2 3"], occupancy: Occupancy) -> list[str]:
 
 
 def _posed(mujoco: Any, path: Path, motions: dict[str, np.ndarray], name: str) -> float:
-    """Compile the file, pose it, and return the largest error of body positions, metres."""
+    """Compile the file, pose it, and return the largest error of body positions, meters."""
     compiled = mujoco.MjModel.from_xml_path(str(path))
     assert compiled.nskin == 1, "the animal's skin"
     data = mujoco.MjData(compiled)

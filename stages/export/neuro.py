@@ -1,4 +1,4 @@
-"""Files of behavioural science: movement's netCDF (poses over time) and Neurodata Without Borders."""
+"""Files of behavioral science: movement's netCDF (poses over time) and Neurodata Without Borders."""
 
 import datetime
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ _UNKNOWN_DATE = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 
 
 def keypoints(session: Motion) -> Float[np.ndarray, "frame bone 3"]:
-    """Return the bones' centres in the world, metres; NaN where the animal is unknown."""
+    """Return the bones' centers in the world, meters; NaN where the animal is unknown."""
     return (session.world_from_agent[:, None] @ session.agent_from_bone)[..., :3, 3]
 
 
@@ -43,7 +43,7 @@ def write_movement(folder: Path, sessions: Mapping[str, Motion]) -> ExportRecord
         with xarray.open_dataset(path, engine="h5netcdf") as opened:
             found = np.swapaxes(opened.position.values[..., 0], 1, 2)
         worst_mm = max(worst_mm, float(np.nanmax(np.abs(found - places))) * 1000)
-    remark = "metres, world frame (+y up); confidence is the frame's"
+    remark = "meters, world frame (+y up); confidence is the frame's"
     return ExportRecord(version("xarray"), {"largest": worst_mm}, version("h5netcdf"), remark)
 
 
@@ -53,14 +53,14 @@ def write_nwb(folder: Path, sessions: Mapping[str, Motion]) -> ExportRecord:
     behavior = extra("pynwb.behavior", "pynwb")
     worst_mm = 0.0
     for video, session in sessions.items():
-        file = pynwb.NWBFile("behaviour of one animal, from video", video, _UNKNOWN_DATE)
-        about = "where animal and observer are, metres, world frame, +y up"
+        file = pynwb.NWBFile("behavior of one animal, from video", video, _UNKNOWN_DATE)
+        about = "where animal and observer are, meters, world frame, +y up"
         module = file.create_processing_module("behavior", about)
         time = {"timestamps": session.timestamp_s}
         place = session.world_from_agent[:, :3, 3]
         series = [
             behavior.SpatialSeries(
-                name=name, data=data, reference_frame="x, y up, z of the room; metres", unit="meters", **time
+                name=name, data=data, reference_frame="x, y up, z of the room; meters", unit="meters", **time
             )
             for name, data in (("agent", place), ("observer", session.world_from_camera[:, :3, 3]))
         ]

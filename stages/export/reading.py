@@ -20,7 +20,7 @@ from pipeline.geometry.subsampling import evenly
 
 @dataclass(frozen=True)
 class Agent:
-    """The skinned animal, agent frame, metres; its motions, named."""
+    """The skinned animal, agent frame, meters; its motions, named."""
 
     mesh: Mesh
     skin: Skin
@@ -60,7 +60,7 @@ class CameraFrame:
 
     @property
     def depth(self) -> Float[np.ndarray, "height width"]:
-        """Metres along z, 0 where unknown."""
+        """Meters along z, 0 where unknown."""
         return images.read_depth(self.frames / f"depth/{self.index:06d}.exr")
 
     @property

@@ -21,4 +21,4 @@ def write(folder: Path, clouds: dict[str, Float[np.ndarray, "point 62"]]) -> Exp
         gaussian_ply.write(folder / f"{name}.ply", valid)
         assert len(gaussians.load_ply(folder / f"{name}.ply")) == len(valid)
     reader = "the project's own reader; the layout is that of the 3DGS reference viewer"
-    return ExportRecord("own writer", {}, reader, "metres, +y up")
+    return ExportRecord("own writer", {}, reader, "meters, +y up")

@@ -1,4 +1,4 @@
-"""Tables of behaviour: one row per frame of every session, as CSV and, with pyarrow, as Parquet."""
+"""Tables of behavior: one row per frame of every session, as CSV and, with pyarrow, as Parquet."""
 
 import csv
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ COLUMNS = (
 
 
 def rows(session: Motion) -> Float[np.ndarray, "frame 15"]:
-    """Return the columns above: metres, seconds, world frame, wxyz; NaN where the animal is unknown."""
+    """Return the columns above: meters, seconds, world frame, wxyz; NaN where the animal is unknown."""
     known = np.all(np.isfinite(session.world_from_agent), axis=(1, 2))
     position = session.world_from_agent[:, :3, 3]
     quaternion = np.full((len(known), 4), np.nan)
@@ -46,5 +46,5 @@ def write(folder: Path, sessions: Mapping[str, Motion]) -> ExportRecord:
     columns = {"video": videos, **dict(zip(COLUMNS, every.T, strict=True))}
     parquet.write_table(arrow.table(columns), folder / "frames.parquet")
     assert parquet.read_table(folder / "frames.parquet").num_rows == len(every)
-    remark = "metres, seconds, world frame (+y up), quaternion wxyz"
+    remark = "meters, seconds, world frame (+y up), quaternion wxyz"
     return ExportRecord(version("pyarrow"), {}, version("pyarrow"), remark)

@@ -29,7 +29,7 @@ def write(folder: Path, agent: Agent, room: Mesh) -> ExportRecord:
     stage.SetDefaultPrim(_mesh(pxr, stage, "/scene", room).GetPrim())
     stage.Save()
     library, loss = version("usd-core"), agent.loss_mm | {"joints": round(worst_mm, 4)}
-    return ExportRecord(library, loss, f"UsdSkel of {library}", "metres, +y up, time codes in frames")
+    return ExportRecord(library, loss, f"UsdSkel of {library}", "meters, +y up, time codes in frames")
 
 
 def _stage(pxr: Any, path: Path) -> Any:
@@ -101,7 +101,7 @@ def _keys(pxr: Any, animation: Any, joints: list[str], action: Action) -> None:
 
 
 def _opened(pxr: Any, path: Path, action: Action) -> float:
-    """Open the file and return the largest error of joint positions in one pose, metres."""
+    """Open the file and return the largest error of joint positions in one pose, meters."""
     stage = pxr.Usd.Stage.Open(str(path))
     cache = pxr.UsdSkel.Cache()
     cache.Populate(pxr.UsdSkel.Root(stage.GetPrimAtPath("/agent")), pxr.Usd.PrimDefaultPredicate)

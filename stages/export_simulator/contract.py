@@ -93,7 +93,7 @@ def controls(sampling: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def loss_mm(residual_m: Float[np.ndarray, "frame vertex"]) -> dict[str, float]:
-    """Sum up distances, in millimetres."""
+    """Sum up distances, in millimeters."""
     residual_mm = residual_m * 1000
     values = {"mean": residual_mm.mean(), "p99": np.percentile(residual_mm, 99), "max": residual_mm.max()}
     return {name: round(float(value), 3) for name, value in values.items()}

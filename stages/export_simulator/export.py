@@ -69,7 +69,7 @@ def fit_weights(
 ) -> tuple[Skin, Float[np.ndarray, "frame vertex"]]:
     """Fit four weights a vertex to recorded poses that differ most.
 
-    Returns them with the distance, metres, that they leave in poses that were not fitted.
+    Returns them with the distance, meters, that they leave in poses that were not fitted.
     """
     recorded = np.concatenate([motion.agent_from_bone for motion in motions])
     chosen = weight_refit.farthest_poses(recorded, FITTED_POSES)

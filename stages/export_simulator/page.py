@@ -83,7 +83,7 @@ def _assembled(contract: Mapping[str, Any], tags: list[str], connect: str) -> st
     bundle = resources.files("stages.export_simulator").joinpath(_BUNDLE)
     name = html.escape(str(contract["name"]))
     pieces = {
-        "@@TITLE@@": f"{name}: a behaviour simulator",
+        "@@TITLE@@": f"{name}: a behavior simulator",
         "@@NAME@@": name,
         "@@CONNECT@@": connect,
         "@@NOTICES@@": bundle.joinpath("NOTICES.txt").read_text(),

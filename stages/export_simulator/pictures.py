@@ -22,7 +22,7 @@ _EXTENT = (0.002, 0.998)
 _HEAT_SIZE = (360, 480)
 """height and width of a view of the room, pixels"""
 _PALE = 0.45
-"""share of the room's colours that is left under what is laid over it"""
+"""share of the room's colors that is left under what is laid over it"""
 
 
 def heat_maps(mesh: Mesh, floor_m: float, motions: list[SessionClip]) -> UInt8[np.ndarray, "height width 3"]:

@@ -31,7 +31,7 @@ class SplatClouds:
 
 @dataclass(frozen=True)
 class BehaviorAssets:
-    """The behaviour models as files, and the scene's features they perceive."""
+    """The behavior models as files, and the scene's features they perceive."""
 
     contract: dict[str, Any]
     """of the sampler"""
@@ -77,7 +77,7 @@ def support_contract(range_m: Float[np.ndarray, "2 2"]) -> dict[str, Any] | None
 def supported_share(
     volume: Mapping[str, Shaped[np.ndarray, "..."]], roots: Float[np.ndarray, "frame 3"]
 ) -> float | None:
-    """Return the share (0..1) of roots (world, metres) with a carrying voxel beneath them; None where
+    """Return the share (0..1) of roots (world, meters) with a carrying voxel beneath them; None where
     nothing carries. ``volume`` holds the arrays of a `volume.npz`.
     """
     carries = volume["allowed"] >= SUPPORTED
@@ -101,7 +101,7 @@ def behavior_assets(
 ) -> BehaviorAssets:
     """Read the sampler's contract, the four networks, and the scene's features that they perceive.
 
-    ``volume`` is a `volume.npz`, ``roots_world`` where the animal has been in it (metres). Raises InputError
+    ``volume`` is a `volume.npz`, ``roots_world`` where the animal has been in it (meters). Raises InputError
     EXP-002 for a variant that the page's sampler does not know.
     """
     contract = json.loads((behavior / "behavior.json").read_bytes())

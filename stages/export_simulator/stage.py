@@ -1,4 +1,4 @@
-"""Export a reconstruction and its behaviour model as a page, and as animated files for other programs."""
+"""Export a reconstruction and its behavior model as a page, and as animated files for other programs."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -20,7 +20,7 @@ _STEPS = 8192.0  # places and sizes are rounded to 0.06 mm: finer digits do not 
 
 @dataclass(frozen=True)
 class RoomExtent:
-    """The room as a place to move in: world frame, metres."""
+    """The room as a place to move in: world frame, meters."""
 
     floor_m: float
     bounds_m: Float[np.ndarray, "2 3"]
@@ -63,13 +63,13 @@ class SkinnedSplats:
     """The animal's Gaussians at rest, agent frame, and what moves them."""
 
     rows: bytes
-    """32 bytes each: place, size, colour with opacity, rotation"""
+    """32 bytes each: place, size, color with opacity, rotation"""
     skin: bytes
     """8 bytes each: four bones, four weights in 255ths"""
 
 
 def splat_rows(gaussians: Float[np.ndarray, "point 62"], max_points: int) -> bytes:
-    """Shrink Gaussian rows to 32 bytes: place, size, colour with opacity, rotation; faint ones go first."""
+    """Shrink Gaussian rows to 32 bytes: place, size, color with opacity, rotation; faint ones go first."""
     return _packed(gaussians[_weightiest(gaussians, max_points)])
 
 

@@ -30,7 +30,7 @@ class Surroundings:
     motions: list[SessionClip]
     """To begin from and to replay."""
     roots_world: Float[np.ndarray, "frame 3"]
-    """Where the animal has been, metres."""
+    """Where the animal has been, meters."""
     labels: dict[str, str] = field(default_factory=dict)
     """Of motions, where they are not recordings."""
     remark: str | None = None

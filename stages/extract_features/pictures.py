@@ -1,4 +1,4 @@
-"""The quality page of the features: the first three channels as colours, beside the pictures."""
+"""The quality page of the features: the first three channels as colors, beside the pictures."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ HEIGHT_PX = 200
 
 
 def report_quality(folder: Path, clip: Clip, features: Float[np.ndarray, "frame height width 16"]) -> None:
-    """Write the stage's own judgement."""
+    """Write the stage's own judgment."""
     shown = subsampling.evenly(len(clip), SHOWN_FRAMES)
     size = (HEIGHT_PX, max(round(clip.color_size[1] * HEIGHT_PX / clip.color_size[0]), 1))
     colors = np.clip(128 + 220 * features[shown][..., :3].astype(np.float32), 0, 255).astype(np.uint8)
@@ -25,8 +25,8 @@ def report_quality(folder: Path, clip: Clip, features: Float[np.ndarray, "frame 
     similarity = float(np.median(steady))
     qa.write(
         folder,
-        good="the same thing has the same colour in all pictures and in all recordings",
-        bad="colours flicker between neighbouring pictures, or all is one colour",
-        checks=[qa.Check("cosine similarity of neighbouring frames", similarity, "", 0.5, None, "higher")],
+        good="the same thing has the same color in all pictures and in all recordings",
+        bad="colors flicker between neighboring pictures, or all is one color",
+        checks=[qa.Check("cosine similarity of neighboring frames", similarity, "", 0.5, None, "higher")],
         pictures=[qa.Picture("features", sheet, "frames and their first three channels")],
     )

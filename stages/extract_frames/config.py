@@ -36,7 +36,7 @@ class Config:
     max_side_px: int = 640
     """Larger pictures are divided by a whole number until their longer side fits, pixels."""
     max_depth_m: float = 6.0
-    """Depth beyond this is unknown, metres; phone LiDAR reaches about 5."""
+    """Depth beyond this is unknown, meters; phone LiDAR reaches about 5."""
     min_depth_valid: float = 0.2
     """Frames with a smaller share (0..1) of known depth are left out."""
     jpeg_quality: int = 95

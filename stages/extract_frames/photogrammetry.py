@@ -1,6 +1,6 @@
 """Poses, intrinsics and depth of a video without depth, filmed in a static room.
 
-Keyframes (`structure`) are posed by COLMAP, `plane_sweep` gives depth, `scaling` metres where a recording
+Keyframes (`structure`) are posed by COLMAP, `plane_sweep` gives depth, `scaling` meters where a recording
 with depth shows the same room. Keyframes that were not registered are left out and reported.
 """
 
@@ -34,7 +34,7 @@ MIN_AGREEING = 2
 MIN_MAPPED = 0.3
 """minimum share of keyframes in the largest model"""
 TYPICAL_DEPTH_M = 2.0
-"""median depth to which a model without metric scale is scaled: a room's, metres"""
+"""median depth to which a model without metric scale is scaled: a room's, meters"""
 SEED = 0
 """seed for COLMAP"""
 KEYFRAME_JPEG_QUALITY = 98
@@ -166,7 +166,7 @@ def _unit_m(
     depth: list[np.ndarray],
     measured: Mapping[str, Recording],
 ) -> tuple[float, str]:
-    """Return metres per unit of the model, and the id of the recording that gave them, or `relative`."""
+    """Return meters per unit of the model, and the id of the recording that gave them, or `relative`."""
     gray = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]
     mapped = [
         sift.lift(sift.describe(picture, scaling.POINTS), solved.intrinsics, each, view.intrinsics)
@@ -223,8 +223,8 @@ def _summary(recording: Recording, rows: np.ndarray, solved: Structure, scale: s
     seconds = ", ".join(f"{recording.timestamp_s[row]:.1f}" for row in lost[:LISTED])
     left_out = f"; {len(lost)} were not registered, at {seconds}{' ...' if len(lost) > LISTED else ''} s"
     split = f", the largest of {solved.models} models" if solved.models > 1 else ""
-    relative = "the scale is relative: lengths are no metres"
-    metres = relative if scale == extraction.RELATIVE else f"metres from the depth of {scale}"
+    relative = "the scale is relative: lengths are no meters"
+    metres = relative if scale == extraction.RELATIVE else f"meters from the depth of {scale}"
     focal_source = "given" if recording.intrinsics is not None else "calibrated"
     mapped = f"mapped from {len(solved.sparse.frame)} of {len(rows)} pictures{split}"
     lens = f"focal length {solved.intrinsics[0, 0]:.0f} px ({focal_source})"

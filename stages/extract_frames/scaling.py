@@ -23,7 +23,7 @@ FRAMES = 24
 POINTS = 800
 """SIFT points per frame"""
 WITHIN_M = 0.08
-"""inlier threshold of the fit, metres: the noise of phone depth at a few metres"""
+"""inlier threshold of the fit, meters: the noise of phone depth at a few meters"""
 MIN_EXTENT_M = 5 * WITHIN_M
 """minimum extent of the inliers along some axis for a reliable scale"""
 MIN_POINTS = 15
@@ -38,7 +38,7 @@ RATE_HZ, MAX_DEPTH_M, MAX_SIDE_PX, JPEG_QUALITY = 10.0, 5.0, 640, 50
 
 
 def meters_per_unit(mapped: Sequence[SiftPoints], measured: Recording, seed: int) -> float | None:
-    """Return metres per unit of the map by one recording with depth, None if too few pairs agree."""
+    """Return meters per unit of the map by one recording with depth, None if too few pairs agree."""
     scales = []
     for frame in _described(measured):
         scales += [scale for known in mapped if (scale := _scale(known, frame, seed)) is not None]
@@ -63,7 +63,7 @@ def _described(recording: Recording) -> Iterator[SiftPoints]:
 
 
 def _scale(known: SiftPoints, frame: SiftPoints, seed: int) -> float | None:
-    """Return metres per unit by one pair of frames, None with too few inliers."""
+    """Return meters per unit by one pair of frames, None with too few inliers."""
     mine, theirs = sift.matches(frame.descriptors, known.descriptors).T
     if len(mine) < MIN_POINTS:
         return None

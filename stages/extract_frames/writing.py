@@ -154,7 +154,7 @@ def _check_of_poses(plan: ExtractionPlan) -> qa.Check:
     check = plan.pose_check
     if plan.scale != MEASURED:
         relative = plan.scale == RELATIVE
-        scale = "relative: lengths are no metres" if relative else f"metres from the depth of {plan.scale}"
+        scale = "relative: lengths are no meters" if relative else f"meters from the depth of {plan.scale}"
         name = f"scale known ({check.reason}; {scale})"
         return qa.Check(name, float(not relative), "", warn=0.5, better="higher")
     residual_mm = 1000 * check.residual_m if check.verdict in ("documented", "other") else None

@@ -12,7 +12,7 @@ Describe = Callable[[np.ndarray, int], np.ndarray]
 FRAMES_PER_RECORDING = 16
 """Frames described per recording: a minute at one every four seconds, so that each recording counts alike."""
 STRIDE_PX = 16
-"""Distance between sampled descriptors, colour pixels: about their own size, nearer ones repeat each
+"""Distance between sampled descriptors, color pixels: about their own size, nearer ones repeat each
 other."""
 
 

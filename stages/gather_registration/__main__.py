@@ -1,4 +1,4 @@
-"""Gather the poses of all sessions, and summarise which were registered or rejected, and why."""
+"""Gather the poses of all sessions, and summarize which were registered or rejected, and why."""
 
 from pipeline.workflow import cli
 from stages.gather_registration import stage

@@ -1,4 +1,4 @@
-"""Summarise registered and rejected recordings, and draw all paths in one picture."""
+"""Summarize registered and rejected recordings, and draw all paths in one picture."""
 
 from dataclasses import dataclass
 
@@ -60,7 +60,7 @@ def checks(outcomes: list[SessionOutcome]) -> list[Check]:
 
 
 def paths(outcomes: list[SessionOutcome]) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw all registered paths from above: phones thin, animals thick, one colour a recording."""
+    """Draw all registered paths from above: phones thin, animals thick, one color a recording."""
     image = np.full((EDGE_PX, EDGE_PX, 3), views.BACKGROUND, np.uint8)
     registered = {each.video: each.poses for each in outcomes if each.poses is not None}
     if not registered:

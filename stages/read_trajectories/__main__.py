@@ -1,8 +1,8 @@
-"""Read one table of an animal's motion, so that behaviour can be learned without recordings.
+"""Read one table of an animal's motion, so that behavior can be learned without recordings.
 
 Takes a CSV table (columns id, time, x, y, z, heading; optionally observer_x, observer_y, observer_z, kind), a
 folder with `trajectory.csv` and `obstacles.csv` (occupied cells: x, z, optionally bottom, top), an NPZ file
-of joint positions ([frame joint 3], one array per clip), or a built-in life. Metres, seconds, radians, +y up,
+of joint positions ([frame joint 3], one array per clip), or a built-in life. Meters, seconds, radians, +y up,
 heading about +y from +z.
 """
 

@@ -1,7 +1,7 @@
 """Root and bone poses from motion capture joint positions, for any skeleton.
 
 Nobody says which joint hangs on which: joints that keep their distance are joined (a minimum spanning tree
-over how much distances vary), and each joint's bone points to its neighbour away from the root.
+over how much distances vary), and each joint's bone points to its neighbor away from the root.
 """
 
 import numpy as np

@@ -14,4 +14,4 @@ class Config:
     front_joint: int = 3
     """Joint ahead of it: neck or shoulders."""
     cell_m: float = 0.1
-    """Side of the obstacle map's cells in metres."""
+    """Side of the obstacle map's cells in meters."""

@@ -15,7 +15,7 @@ FLOOR, OBSTACLE = 0, 1
 MARGIN_M = 1.0
 HEADROOM_M = 1.0
 OBSTACLE_TOP_M = 1.0
-"""Default height of obstacles, metres above the floor: that of furniture."""
+"""Default height of obstacles, meters above the floor: that of furniture."""
 MAX_VOXELS = 10_000_000
 
 
@@ -26,11 +26,11 @@ def no_scene() -> FeatureVolume:
 
 
 def volume_from_csv(path: Path, visited: Float[np.ndarray, "frame 3"], cell_m: float) -> FeatureVolume:
-    """Read occupied cells (x, z, optionally bottom and top; metres). Raises TRJ-001 as `columns` does."""
+    """Read occupied cells (x, z, optionally bottom and top; meters). Raises TRJ-001 as `columns` does."""
     table = columns(path, ("x", "z"))
     x, z = numbers(path, table, "x"), numbers(path, table, "z")
     if not (np.isfinite(x).all() and np.isfinite(z).all()):
-        remedy = "give both of every occupied cell, metres"
+        remedy = "give both of every occupied cell, meters"
         raise InputError("TRJ-001", "has cells without x or z", str(path), remedy)
     floor = float(np.nanmin(visited[:, 1])) if len(visited) else 0.0
     floor = 0.0 if 0.0 <= floor < HEADROOM_M else floor
@@ -49,7 +49,7 @@ def volume_from_csv(path: Path, visited: Float[np.ndarray, "frame 3"], cell_m: f
     if size.prod() > MAX_VOXELS:
         span = " x ".join(f"{metres:g}" for metres in high - low)
         what = f"tracks and obstacles span {span} m, too much for cells of {cell_m:g} m"
-        raise InputError("TRJ-001", what, str(path), "write metres; or set cell_m in the recipe")
+        raise InputError("TRJ-001", what, str(path), "write meters; or set cell_m in the recipe")
     shape = size.astype(int)
     kind = np.full(shape, -1)
     kind[:, :2] = FLOOR

@@ -15,7 +15,7 @@ FASTEST_RAD_S = 10.0
 
 
 def pictures(motion: MeasuredMotion) -> list[Picture]:
-    """Draw the trajectory (blue) from above over obstacles (grey)."""
+    """Draw the trajectory (blue) from above over obstacles (gray)."""
     figure, axes = plots.panels(1, 1, width_in=5, height_in=4)
     volume, axis = motion.volume, axes[0, 0]
     plots.floor_plan(axis, (volume.occupancy[:, 3:] == 1).any(1), volume.origin[[0, 2]], volume.voxel_m)

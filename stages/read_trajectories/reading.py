@@ -1,4 +1,4 @@
-"""Recognise the format of a table of motion and read it into a `MeasuredMotion`."""
+"""Recognize the format of a table of motion and read it into a `MeasuredMotion`."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ VOLUME_KEYS = ("volume/features", "volume/occupancy", "volume/origin", "volume/v
 MAX_BYTES = 2 << 30  # limit for all arrays of a file, which are read at once
 FLOOR_QUANTILE = 0.002
 MAX_DISTANCE_M = 10_000.0
-"""Maximum distance from the origin: beyond it float32 resolves only millimetres."""
+"""Maximum distance from the origin: beyond it float32 resolves only millimeters."""
 
 
 def read(path: Path, config: Config) -> MeasuredMotion:
@@ -29,7 +29,7 @@ def read(path: Path, config: Config) -> MeasuredMotion:
         away_m = float(np.nanmax(np.abs(pose[:, :3, 3]), initial=0.0))
         if away_m > MAX_DISTANCE_M:
             what = f"{who} is up to {away_m / 1000:.4g} km away from the origin"
-            remedy = "write metres; subtract one origin near the animal from all positions"
+            remedy = "write meters; subtract one origin near the animal from all positions"
             raise InputError("TRJ-001", what, str(path), remedy)
     return motion
 
@@ -86,7 +86,7 @@ def _from_joints(path: Path, stored: dict[str, np.ndarray], config: Config) -> M
     ]
     if not clips or not all(fitting):
         shapes = ", ".join(f"{name} {value.shape}" for name, value in stored.items())
-        remedy = "store [frame joint 3] in metres, +y up, one array per clip"
+        remedy = "store [frame joint 3] in meters, +y up, one array per clip"
         raise InputError("TRJ-001", f"arrays {shapes} are no joint positions", str(path), remedy)
     joints = np.concatenate(clips)
     if not np.isfinite(joints).all():

@@ -56,7 +56,7 @@ def numbers(path: Path, table: dict[str, list[str]], name: str) -> Float[np.ndar
         found = np.array([float(value) if value else np.nan for value in table[name]])
         return np.where(np.isinf(found), np.nan, found)
     except ValueError as error:
-        what, remedy = f"column {name} is not numeric: {error}", "one number per cell, metres or seconds"
+        what, remedy = f"column {name} is not numeric: {error}", "one number per cell, meters or seconds"
         raise InputError("TRJ-001", what, str(path), remedy) from error
 
 

@@ -42,9 +42,9 @@ OUTLIER_MASK_WEIGHT = 0.05
 WHOLE_QUANTILE = 0.8
 """quantile of the masks' areas that stands for the whole animal in view"""
 WHOLE_SHARE = 0.6
-"""masks count fully from this share of that area on, as seen from one metre"""
+"""masks count fully from this share of that area on, as seen from one meter"""
 MIN_MASK_WEIGHT = 0.03
-"""lower bound of that weight: where the animal is occluded, neighbouring frames constrain it better"""
+"""lower bound of that weight: where the animal is occluded, neighboring frames constrain it better"""
 GRID_CHANNELS = 4
 """channels of each grid"""
 KNOT_FRAMES = 10
@@ -167,7 +167,7 @@ def build(
 
 
 def corner(point: Float[np.ndarray, "3"]) -> Corner:
-    """Return a corner of a box as plain numbers, metres."""
+    """Return a corner of a box as plain numbers, meters."""
     x, y, z = (float(value) for value in point)
     return x, y, z
 
@@ -261,7 +261,7 @@ def interpolated(
 
 
 def measured_box(videos: Sequence[RegisteredVideo], max_points: int = 200_000) -> tuple[Corner, Corner]:
-    """Return the box (world, metres) of about ``max_points`` measured points, without strays, and cameras."""
+    """Return the box (world, meters) of about ``max_points`` measured points, without strays, and cameras."""
     step = max(7, sum(len(video.store.scene) for video in videos) // max_points)
     stores = (usable_rays(video).scene for video in videos)
     rays = [store.at(torch.nonzero(store.depth > 0)[:, 0][::step]) for store in stores]

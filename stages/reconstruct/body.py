@@ -20,7 +20,7 @@ from stages.reconstruct.rays import AGENT, THUMBNAIL, Rays
 from stages.reconstruct.scene import Terms
 
 DECIMETRE = 0.1
-"""unit of most losses of the posed surface, metres"""
+"""unit of most losses of the posed surface, meters"""
 REACH_M = 0.05
 """signed distances on the agent are truncated here"""
 OUTLIER_M = 0.1
@@ -30,7 +30,7 @@ ROOT_M, ROOT_RAD = 0.05, 0.05
 EDGE_M = 0.01
 """tolerance at the masks' edges"""
 STILL = 0.01
-"""smoothing of the L1 norm of bone and root steps, radians and decimetres"""
+"""smoothing of the L1 norm of bone and root steps, radians and decimeters"""
 TOUCH_M, STRIDE_M = 0.02, 0.06
 """distance at which soles are in contact; motion between frames beyond which they are not held"""
 COVER_M = 0.015
@@ -40,10 +40,10 @@ MARGIN_M = 0.03
 NEAREST_M = 0.1
 """points nearer to the camera than this are not in view"""
 OUTSIDE_WEIGHT, UNCOVERED_WEIGHT, FREE_WEIGHT, PENETRATION_WEIGHT = 2.0, 2.0, 0.5, 2.0
-"""weights per decimetre: posed surface outside the mask, uncovered masked pixels, surface in free space,
+"""weights per decimeter: posed surface outside the mask, uncovered masked pixels, surface in free space,
 penetration of the scene. Tuned on the built-in cat; all are multiplied by `LossWeights.posed_surface`"""
 RIGIDITY_WEIGHT, REST_WEIGHT, SMOOTH_WEIGHT, STILL_WEIGHT = 5.0, 0.05, 0.3, 0.1
-"""weights of gaps at joints (per decimetre), twists from rest, accelerations, and the L1 norm of steps: an
+"""weights of gaps at joints (per decimeter), twists from rest, accelerations, and the L1 norm of steps: an
 animal mostly rests. All are multiplied by `LossWeights.motion_prior`"""
 COMMON_REST = 20.0
 """additional weight of the mean twist of all bones: the root has to explain it"""
@@ -164,14 +164,14 @@ def surface_terms(
 def penetration_depth_m(
     problem: Problem, pose: Pose, points_agent: Float[Tensor, "frame point 3"]
 ) -> Float[Tensor, "frame point"]:
-    """Return the penetration depth of points into the scene, metres."""
+    """Return the penetration depth of points into the scene, meters."""
     return functional.relu(-height_m(problem, pose, rigid_torch.apply(pose.world_from_agent, points_agent)))
 
 
 def height_m(
     problem: Problem, pose: Pose, world: Float[Tensor, "frame point 3"]
 ) -> Float[Tensor, "frame point"]:
-    """Return the signed distance of world points to the scene of each frame's video, metres.
+    """Return the signed distance of world points to the scene of each frame's video, meters.
 
     Fused geometry is truncated and treats unseen space as free, so the floor plane is added.
     """
@@ -184,7 +184,7 @@ def height_m(
 def silhouette_residual_m(
     points_camera: Float[Tensor, "frame point 3"], masked: Rays
 ) -> Float[Tensor, "frame ray"]:
-    """Return the distance of each masked ray to the nearest projected point, metres beyond `COVER_M`."""
+    """Return the distance of each masked ray to the nearest projected point, meters beyond `COVER_M`."""
     target = masked.direction[:, :2].view(len(points_camera), -1, 2)
     depth = points_camera[..., 2:].clamp_min(NEAREST_M)
     image_point = points_camera[..., :2] / depth
@@ -262,7 +262,7 @@ def _sampled(
     mode: Literal["bilinear", "nearest"],
     padding: Literal["border", "zeros"],
 ) -> Float[Tensor, "frame point"]:
-    """Sample thumbnails at colour pixels; bilinear sampling is differentiable in the pixel."""
+    """Sample thumbnails at color pixels; bilinear sampling is differentiable in the pixel."""
     size = torch.tensor(images.shape[:0:-1], device=pixel.device, dtype=torch.float32) * THUMBNAIL
     place = (pixel / size * 2 - 1).clamp(-4, 4)[:, :, None]
     read = functional.grid_sample(

@@ -19,9 +19,9 @@ class FieldSizes:
     """Sizes of the fields."""
 
     scene_voxel_m: tuple[float, ...] = (0.32, 0.16, 0.08)
-    """cell sizes of the scene's grids, metres; `mlp` encodes wavelengths down to twice the finest"""
+    """cell sizes of the scene's grids, meters; `mlp` encodes wavelengths down to twice the finest"""
     agent_voxel_m: tuple[float, ...] = (0.06, 0.03, 0.015)
-    """cell sizes of the agent's grids, metres"""
+    """cell sizes of the agent's grids, meters"""
     encoding: Literal["grid", "mlp"] = "grid"
     """multi-resolution dense grids, or the paper's MLP with positional encoding"""
     width: int = 64
@@ -35,7 +35,7 @@ class SceneFusion:
     """How depth is fused into the scene's geometry."""
 
     voxel_m: float = 0.03
-    """edge of a voxel, metres"""
+    """edge of a voxel, meters"""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class LossWeights:
     eikonal: float = 0.05
     """gradients of signed distance have length 1"""
     cycle: float = 1.0
-    """cycle consistency of backward and forward warp, per decimetre"""
+    """cycle consistency of backward and forward warp, per decimeter"""
     template: float = 10.0
     """distance of the agent's field from its template, in shape and color"""
     posed_surface: float = 1.0
@@ -126,7 +126,7 @@ class LearningRates:
     heads: float = 4e-3
     """the fields' networks and codes"""
     camera: float = 5e-5
-    """corrections of cameras, metres and radians"""
+    """corrections of cameras, meters and radians"""
 
 
 @dataclass(frozen=True)

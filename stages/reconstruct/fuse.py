@@ -30,7 +30,7 @@ TRUNCATION_VOXELS = 2.0
 MASK_MARGIN_PX = 10
 """margin around the agent's mask that is ignored, color pixels"""
 MIN_WEIGHT = 0.1
-"""TSDF weight below which a voxel is unseen: one frame from one metre is 1"""
+"""TSDF weight below which a voxel is unseen: one frame from one meter is 1"""
 MAX_WEIGHT = 6e4
 """TSDF weights are clamped here, just below the largest half float"""
 CHANGE_RANGE = (0.3, 0.7)
@@ -92,7 +92,7 @@ class SceneFuser:
     """Averages the volumes of all videos, then splits them into sparse blocks."""
 
     def __init__(self, box: Box, voxel_m: float, scratch: Path | None = None):
-        """Prepare for volumes in ``box`` (lower and upper corner, metres)."""
+        """Prepare for volumes in ``box`` (lower and upper corner, meters)."""
         self.scratch, self.voxel_m, self.low = scratch, voxel_m, np.asarray(box[0], float)
         self.size = np.ceil((np.asarray(box[1]) - self.low) / (voxel_m * CELLS)).astype(int)
         self.shared = self.empty()

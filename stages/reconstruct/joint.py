@@ -112,7 +112,7 @@ class JointLoss:
 def sample_points(
     pose: Pose, rays: Rays, depth: Float[Tensor, "ray sample"]
 ) -> tuple[Float[Tensor, "ray sample 3"], Float[Tensor, "frame point 3"]]:
-    """Return samples of rays ``[frame * ray]`` in the world, and per frame in the agent's frame, metres."""
+    """Return samples of rays ``[frame * ray]`` in the world, and per frame in the agent's frame, meters."""
     points_camera = (rays.direction[:, None] * depth[..., None]).view(len(pose.frame), -1, 3)
     world = rigid_torch.apply(pose.world_from_camera, points_camera).view(*depth.shape, 3)
     return world, rigid_torch.apply(pose.agent_from_camera, points_camera)

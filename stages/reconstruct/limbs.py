@@ -16,7 +16,7 @@ from pipeline.geometry import rigid_torch
 MIN_SHARE = 1e-9
 """added to shared skinning weight, so that averages over it are finite"""
 MIN_SKIN = 0.02
-"""shared skin from which two bones are neighbours"""
+"""shared skin from which two bones are neighbors"""
 DETOUR = 1.5
 """cost of a path from the middle to a bone with none between, relative to its squared length"""
 LOW, GROUND = 0.45, 0.15
@@ -31,7 +31,7 @@ def shared_skin(weights: Float[Tensor, "point bone"]) -> Float[Tensor, "bone bon
 
 
 def joined(share: Float[Tensor, "bone bone"], most: int | None = None) -> Bool[Tensor, "bone bone"]:
-    """Return which bones share skin: each with one neighbour at least and ``most`` of its own choice."""
+    """Return which bones share skin: each with one neighbor at least and ``most`` of its own choice."""
     ranked = share.argsort(dim=1, descending=True)
     chosen = torch.zeros_like(share, dtype=torch.bool).scatter_(1, ranked[:, :most], True)
     chosen = (chosen & (share > MIN_SKIN)).scatter_(1, ranked[:, :1], True)
@@ -47,7 +47,7 @@ class KinematicTree:
     parent: Int[Tensor, "bone"]
     """of each bone in that order, as a place in that order; the middle's is itself"""
     joint: Float[Tensor, "bone 3"]
-    """where each bone in that order meets its parent, at rest, agent frame, metres"""
+    """where each bone in that order meets its parent, at rest, agent frame, meters"""
 
     @classmethod
     def of(

@@ -35,7 +35,7 @@ LAST_RATE = 0.05
 CLIP_NORM = 10.0
 """largest norm of the gradient"""
 MOTION_RATE, SKIN_RATE = 5e-4, 2e-3
-"""learning rates of the second phase: of root and bones, metres and radians, and of the skin"""
+"""learning rates of the second phase: of root and bones, meters and radians, and of the skin"""
 JOINT_SCENE, JOINT_AGENT, JOINT_CAMERA = 0.25, 0.2, 0.3
 """shares of the first phase's learning rates in the second: fields and cameras are nearly right"""
 STANCE_SHARE = 0.5

@@ -28,7 +28,7 @@ ROOT_SHARE = 0.25
 POSED_RAYS, POSED_POINTS = 96, 384
 """masked rays and surface points per frame and step"""
 SLOW_RATE, FRAME_RATE = 2e-2, 1e-2
-"""learning rates, metres and radians: of root and knots, and of per-frame bones and rotations"""
+"""learning rates, meters and radians: of root and knots, and of per-frame bones and rotations"""
 MOMENTUM = (0.8, 0.99)
 """Adam's betas, shorter than usual because steps are few"""
 RAISED_RAD = math.radians(30)

@@ -20,7 +20,7 @@ TRUSTED = 0.1
 """frames with a lower mask weight are left out of runs of consecutive frames"""
 MAX_PRECISE = 100.0
 """prior precision of a camera registered with certainty, relative to one at even odds; losses alone err by a
-millimetre and 0.05 degrees"""
+millimeter and 0.05 degrees"""
 MAX_JOINTS = 4
 """maximum number of joints per bone"""
 SOLE, SOLES = 0.07, 32
@@ -131,7 +131,7 @@ class Joints:
     first: Int[Tensor, "joint"]
     second: Int[Tensor, "joint"]
     place: Float[Tensor, "joint 3"]
-    """at rest, agent frame, metres"""
+    """at rest, agent frame, meters"""
 
     @classmethod
     def of(cls, points: Float[Tensor, "point 3"], weights: Float[Tensor, "point bone"]) -> "Joints":
@@ -151,7 +151,7 @@ class TemplateSurface:
     normal: Float[Tensor, "point 3"]
     around: Float[Tensor, "sample 3"]
     distance: Float[Tensor, "sample"]
-    """signed, metres, of ``around``"""
+    """signed, meters, of ``around``"""
     color: Float[Tensor, "sample 3"]
     """of the nearest surface point"""
     feature: Float[Tensor, "sample 16"]

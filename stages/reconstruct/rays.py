@@ -36,7 +36,7 @@ MIN_SLOPE = 0.15
 EDGE_M, EDGE_SHARE = 0.1, 0.05
 """depth that changes by more than this within 3 pixels, plus this share of itself, is an edge"""
 THUMBNAIL = 4
-"""downsampling factor of thumbnails from colour pixels"""
+"""downsampling factor of thumbnails from color pixels"""
 FAR_PX = 255.0
 """distances from the mask are clamped here"""
 NEAREST_M = 0.15
@@ -53,16 +53,16 @@ class Rays:
     direction: Float[Tensor, "ray 3"]
     """camera axes, z = 1"""
     depth: Float[Tensor, "ray"]
-    """metres along z; 0 = unknown"""
+    """meters along z; 0 = unknown"""
     slope: Float[Tensor, "ray"]
-    """|normal . direction|: metres towards the surface per metre of depth"""
+    """|normal . direction|: meters towards the surface per meter of depth"""
     color: UInt8[Tensor, "ray 3"]
     feature: Int8[Tensor, "ray 16"]
     """unit-length features times 127"""
     label: UInt8[Tensor, "ray"]
     """255 agent, 0 not, 128 unknown"""
     flow_px: Float[Tensor, "ray 2"]
-    """where the pixel is ``flow_gap`` frames later, colour pixels, absolute"""
+    """where the pixel is ``flow_gap`` frames later, color pixels, absolute"""
     flow_confidence: UInt8[Tensor, "ray"]
     flow_gap: Int8[Tensor, "ray"]
 
@@ -79,13 +79,13 @@ class Views:
     """Intrinsics and thumbnails of each frame; smaller ones lie in the upper left corner."""
 
     intrinsics: Float[Tensor, "frame 3 3"]
-    """colour pixels"""
+    """color pixels"""
     size_px: Float[Tensor, "frame 2"]
-    """width and height of the picture, colour pixels"""
+    """width and height of the picture, color pixels"""
     depth: Float[Tensor, "frame height width"]
-    """metres, half precision; 0 = unknown"""
+    """meters, half precision; 0 = unknown"""
     outside_px: Float[Tensor, "frame height width"]
-    """colour pixels outside the mask, negative inside, half precision; `FAR_PX` = farther or no mask"""
+    """color pixels outside the mask, negative inside, half precision; `FAR_PX` = farther or no mask"""
     occluder: Float[Tensor, "frame height width"]
     """depth of possible occluders of the agent (`occluder_depth`)"""
     agent_seen: Bool[Tensor, "frame"]
@@ -104,7 +104,7 @@ class RayStore:
 
     @functools.cached_property
     def farthest_m(self) -> float:
-        """The largest measured depth, metres."""
+        """The largest measured depth, meters."""
         return float(self.views.depth.max())
 
 
@@ -183,7 +183,7 @@ def _padded(views: Views, height: int, width: int) -> Views:
 def occluder_depth(
     depth: Float[np.ndarray, "height width"], outside_px: Float[np.ndarray, "height width"]
 ) -> Float[np.ndarray, "height width"]:
-    """Fill unknown depth of a thumbnail with the smallest depth of neighbours off the agent."""
+    """Fill unknown depth of a thumbnail with the smallest depth of neighbors off the agent."""
     off_agent = np.where((depth > 0) & (outside_px > 0), depth, np.inf)
     nearest = minimum_filter(off_agent.astype(np.float32), 3, mode="constant", cval=np.inf)
     return np.where((depth > 0) | np.isinf(nearest), depth, nearest).astype(depth.dtype)
@@ -192,7 +192,7 @@ def occluder_depth(
 def trusted_depth(
     clip: Clip, frame: int
 ) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
-    """Return depth, metres (0 where its confidence is 0 or at edges), and each pixel's slope."""
+    """Return depth, meters (0 where its confidence is 0 or at edges), and each pixel's slope."""
     depth = usable_depth(clip, frame, nearest_m=NEAREST_M)
     if clip.mapped:
         depth[clip.confidence(frame) < MIN_CONFIDENCE] = 0
@@ -210,7 +210,7 @@ def trusted_depth(
 
 
 def thin_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
-    """Return depth, metres (0 = unknown), supported by neighbours; keeps edges: thin limbs are edges."""
+    """Return depth, meters (0 = unknown), supported by neighbors; keeps edges: thin limbs are edges."""
     depth = clip.depth(frame).astype(np.float32)
     if clip.mapped:
         depth[clip.confidence(frame) < MIN_CONFIDENCE] = 0
@@ -226,7 +226,7 @@ def near_agent(mask: UInt8[np.ndarray, "height width"], ring_px: int) -> Bool[np
 def mask_distance_px(
     mask: UInt8[np.ndarray, "height width"], small: tuple[int, int]
 ) -> Float[np.ndarray, "small_height small_width"]:
-    """Return the signed distance of a thumbnail's pixels to the mask's edge, colour pixels, negative inside.
+    """Return the signed distance of a thumbnail's pixels to the mask's edge, color pixels, negative inside.
 
     It is computed at full resolution and then averaged.
     """

@@ -136,5 +136,5 @@ def read_template(folder: Path) -> AgentTemplate:
 
 
 def read_floor(folder: Path) -> float:
-    """Read the floor's height in the world, metres."""
+    """Read the floor's height in the world, meters."""
     return float(json.loads((folder / "world.json").read_text())["floor"])

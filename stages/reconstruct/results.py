@@ -101,7 +101,7 @@ def interpolate_gaps(
 
 
 def scene_surface(problem: Problem) -> Mesh:
-    """Return the shared scene's surface in the world, metres, where measured points are near."""
+    """Return the shared scene's surface in the world, meters, where measured points are near."""
     mesh = marching_cubes.extract_scene(problem.scene, -1, problem.scene.lattice_m)
     near, _ = KDTree(measured_points(problem)).query(mesh.vertices, distance_upper_bound=SEEN_WITHIN_M)
     return marching_cubes.keep_vertices(mesh, np.isfinite(near))
@@ -109,7 +109,7 @@ def scene_surface(problem: Problem) -> Mesh:
 
 @torch.no_grad()
 def measured_points(problem: Problem) -> Float[np.ndarray, "point 3"]:
-    """Return a subsample of the measured points of the scene, world, metres."""
+    """Return a subsample of the measured points of the scene, world, meters."""
     rays = problem.store.scene
     index = torch.nonzero(rays.depth > 0)[:, 0]
     rays = rays.at(index[:: max(1, len(index) // MAX_POINTS)])
@@ -166,7 +166,7 @@ def skin_weights(problem: Problem, mesh: Mesh) -> Float[np.ndarray, "vertex bone
 def track_points(
     mesh: Mesh, number: int = 200
 ) -> tuple[Int[np.ndarray, "point"], Float[np.ndarray, "point 3"]]:
-    """Choose vertices of the agent by farthest-point sampling: their indices and rest positions, metres."""
+    """Choose vertices of the agent by farthest-point sampling: their indices and rest positions, meters."""
     chosen = [int(np.argmax(mesh.vertices[:, 2]))]
     distance = np.linalg.norm(mesh.vertices - mesh.vertices[chosen[0]], axis=-1)
     for _ in range(min(number, len(mesh.vertices)) - 1):

@@ -1,4 +1,4 @@
-"""The scene's losses: signed distance around measured depth, colour and features at it, and rendered rays."""
+"""The scene's losses: signed distance around measured depth, color and features at it, and rendered rays."""
 
 from collections.abc import Callable
 
@@ -33,7 +33,7 @@ EIKONAL_STEP_M = 0.04
 EIKONAL_SHARE = 8
 """one ray in so many is used for the eikonal loss"""
 DRIFT_WEIGHT, ANCHOR_WEIGHT, CAMERA_M = 0.1, 0.05, 0.01
-"""weights of differences between neighbouring camera knots and of their size; unit of both, 0.6 degrees"""
+"""weights of differences between neighboring camera knots and of their size; unit of both, 0.6 degrees"""
 
 
 def swap_probability(progress: float, batches: RayBatches) -> float:
@@ -57,13 +57,13 @@ def swap_codes(
 
 
 def world_rays(motion: MotionTable, rays: Rays) -> tuple[Float[Tensor, "ray 3"], Float[Tensor, "ray 3"]]:
-    """Return origins and directions (one metre of depth long) in the world."""
+    """Return origins and directions (one meter of depth long) in the world."""
     pose = motion.world_from_camera(rays.frame)
     return pose[:, :3, 3], (pose[:, :3, :3] @ rays.direction[..., None])[..., 0]
 
 
 def sample_depths(rays: Rays, reach_m: float, generator: Generator) -> Float[Tensor, "ray sample"]:
-    """Return depth samples in metres: the measured one, `NEAR` around it, `FREE` in the free space before."""
+    """Return depth samples in meters: the measured one, `NEAR` around it, `FREE` in the free space before."""
     depth = rays.depth[:, None]
     place = torch.rand(len(rays), NEAR, generator=generator).to(depth.device)
     around = place * (reach_m / rays.slope[:, None].clamp_min(MIN_SLOPE) + BEHIND_M) - BEHIND_M
@@ -125,7 +125,7 @@ def rendered_terms(
     weights: LossWeights,
     depth: Float[Tensor, "ray sample"],
 ) -> Terms:
-    """Return the volume rendering losses of rays with samples at ``depth``, metres."""
+    """Return the volume rendering losses of rays with samples at ``depth``, meters."""
     origin, direction = world_rays(problem.motion, rays)
     points = origin[:, None] + direction[:, None] * depth[..., None]
     scene = scene_layer(problem, points, problem.video[rays.frame], code_of)
@@ -159,7 +159,7 @@ def scene_density(
     code_of: Int[Tensor, "ray"],
     min_beta_m: float = 0.0,
 ) -> Float[Tensor, "ray sample"]:
-    """Return the scene's density along rays, per metre; arguments as of `scene_layer` and `Field.density`."""
+    """Return the scene's density along rays, per meter; arguments as of `scene_layer` and `Field.density`."""
     field, (rays, samples) = problem.scene, points.shape[:2]
     distance = field.distance_at(
         points.reshape(-1, 3), video.repeat_interleave(samples), code_of.repeat_interleave(samples)
@@ -170,7 +170,7 @@ def scene_density(
 def render_depths(
     rays: Rays, surface_m: Float[Tensor, "ray"], samples: int, generator: Generator
 ) -> Float[Tensor, "ray sample"]:
-    """Place samples of rendered rays, z in metres: half around a surface, half before it."""
+    """Place samples of rendered rays, z in meters: half around a surface, half before it."""
     end = surface_m[:, None]
     near = end + (strata(rays, samples // 2, generator) * 2 - 1) * REACH_M
     before = (end - REACH_M - RAY_START_M).clamp_min(0.01) * strata(rays, samples - samples // 2, generator)
@@ -184,12 +184,12 @@ def surface_depths(
     density_of: Callable[[Int[Tensor, "ray"], Float[Tensor, "ray sample"]], Float[Tensor, "ray sample"]],
     generator: Generator,
 ) -> Float[Tensor, "ray"]:
-    """Return measured depth, and where it is unknown the z at which accumulated opacity reaches 0.5, metres.
+    """Return measured depth, and where it is unknown the z at which accumulated opacity reaches 0.5, meters.
 
     Args:
         rays: with or without measured depth.
         farthest_m: end of the `SEARCH_SAMPLES` uniform samples; returned for rays that hit nothing.
-        density_of: density per metre of some of the rays, given by their indices, at z in metres.
+        density_of: density per meter of some of the rays, given by their indices, at z in meters.
         generator: random numbers of the stratified samples.
     """
     surface, unknown = rays.depth.clone(), torch.nonzero(rays.depth <= 0)[:, 0]
@@ -207,7 +207,7 @@ def surface_depths(
 def uniform_depths(
     rays: Rays, farthest_m: float, samples: int, generator: Generator
 ) -> Float[Tensor, "ray sample"]:
-    """Return stratified samples up to ``farthest_m``, z in metres."""
+    """Return stratified samples up to ``farthest_m``, z in meters."""
     return RAY_START_M + (farthest_m - RAY_START_M) * strata(rays, samples, generator)
 
 

@@ -29,7 +29,7 @@ CANDIDATES = 6
 DEPTH_TOLERANCE = 0.05
 """a point is visible if it agrees with the measured depth within this share of its depth"""
 BASE_GRADIENT = 0.02
-"""added to color differences between neighbours, 0..1"""
+"""added to color differences between neighbors, 0..1"""
 MAX_SPACING_QUANTILE = 0.9
 """spacings are clipped to this quantile: Gaussians at isolated points stay small"""
 UNIFORM_SHARE = 0.4
@@ -43,9 +43,9 @@ RIDGE = 0.001
 NEAREST_M = 0.2
 """near plane: nearer points are ignored"""
 NEIGHBOURS = 6
-"""neighbours over which a point's color gradient is averaged"""
+"""neighbors over which a point's color gradient is averaged"""
 SPACING_NEIGHBOUR, MIN_SPACING_M = 4, 0.001
-"""a point's spacing is the distance to this neighbour, with this lower bound"""
+"""a point's spacing is the distance to this neighbor, with this lower bound"""
 MORTON_CELL_M, MORTON_BITS = 0.005, 20
 """cell size of the Morton curve, and bits per axis"""
 
@@ -223,7 +223,7 @@ def subsample(
     number: int,
     rng: np.random.Generator,
 ) -> tuple[Int[np.ndarray, "chosen"], Float[np.ndarray, "chosen"]]:
-    """Choose about ``number`` points; return their indices and their spacing on the same surface, metres.
+    """Choose about ``number`` points; return their indices and their spacing on the same surface, meters.
 
     The color error at spacing s is about (gradient * s)^2 times the observation weight. For a fixed number of
     points it is minimal at a density proportional to the gradient and the square root of the weight. Points

@@ -25,15 +25,15 @@ from stages.refine_gaussians.config import GaussianWeights
 from stages.refine_gaussians.views import DrawnVideo, Target, flow_lattice, read
 
 RATES = {"means": 5e-4, "rotation": 2e-3, "log_scale": 1e-2, "opacity_logit": 3e-2, "band0": 1e-2}
-"""learning rates of Adam: metres, quaternions, log metres, logits, spherical harmonics"""
+"""learning rates of Adam: meters, quaternions, log meters, logits, spherical harmonics"""
 EXPOSURE_RATE, MOTION_RATE = 2e-3, 3e-4
-"""learning rates of exposures, and of root and bones, metres and radians"""
+"""learning rates of exposures, and of root and bones, meters and radians"""
 BETA2 = 0.99
 """Adam's second beta for motion, which has no momentum: frames not in the step must not move"""
 LAST_RATE = 0.1
 """final learning rate as a share of the initial one"""
 DEPTH_UNIT_M, MOTION_UNIT = 0.2, 0.1
-"""units of the depth loss, and of the motion loss (metres and radians)"""
+"""units of the depth loss, and of the motion loss (meters and radians)"""
 MAX_FLOW_PX = 100.0
 """rendered flow is clamped to this, in rendered pixels: points beside the camera project anywhere"""
 MAX_FLOW_LOSS, MIN_COVERAGE = 4.0, 0.5

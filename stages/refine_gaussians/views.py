@@ -57,7 +57,7 @@ class Target:
 
     color: Float[Tensor, "height width 3"]
     depth: Float[Tensor, "height width"]
-    """metres; 0 = unknown"""
+    """meters; 0 = unknown"""
     agent: Bool[Tensor, "height width"]
     known: Bool[Tensor, "height width"]
     """the mask is not unknown"""
@@ -111,7 +111,7 @@ def read(video: DrawnVideo, frame: int, size: tuple[int, int], device: str) -> T
 def flow_lattice(
     rows: int, columns: int, color_size: tuple[int, int], size: tuple[int, int]
 ) -> tuple[Int[Tensor, "row 1"], Int[Tensor, "1 column"]]:
-    """Return the drawn pixel (row, column) nearest to each cell centre of the flow; sizes: height, width."""
+    """Return the drawn pixel (row, column) nearest to each cell center of the flow; sizes: height, width."""
     row = (torch.arange(rows) * STRIDE_PX + STRIDE_PX / 2) * size[0] / color_size[0]
     column = (torch.arange(columns) * STRIDE_PX + STRIDE_PX / 2) * size[1] / color_size[1]
     return row.long().clamp_max(size[0] - 1)[:, None], column.long().clamp_max(size[1] - 1)[None]

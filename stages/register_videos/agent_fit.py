@@ -21,38 +21,38 @@ POINTS, MODEL_POINTS = 220, 700
 LEAF_POINTS = 32
 """Leaf size of the k-d tree, the fastest here."""
 COARSE_ROUNDS, FIRST_REACH_M, REACH_M = 5, 0.18, 0.07
-"""Gauss-Newton steps from every initial pose, and initial and final width of the robust kernel, metres, which
+"""Gauss-Newton steps from every initial pose, and initial and final width of the robust kernel, meters, which
 rejects moving legs and tail."""
 TILT_SIGMA_RAD, UPRIGHT_SIGMA_RAD = float(np.deg2rad(15.0)), 1e-4
 """Prior standard deviation of the root's tilt, if it may tilt and if it must stay upright, radians."""
 STAND_POINTS, STAND_REACH_M, STAND_COST_M = 40.0, 0.12, 0.012
 """Prior that the animal stands on the surface below: equivalent depth points, width of its robust
-kernel (animals jump and lie down), and largest cost, metres."""
+kernel (animals jump and lie down), and largest cost, meters."""
 COLOR_WEIGHT_M, OUTSIDE_WEIGHT_M, TRUNCATION = 0.06, 0.05, 1.5
-"""Cost of a full-scale colour difference, and of a template wholly outside the mask, metres; truncation of
+"""Cost of a full-scale color difference, and of a template wholly outside the mask, meters; truncation of
 distances, in reaches."""
 POINT_WEIGHT = 0.15
 """Weight of the point-to-point term relative to point-to-plane; prevents sliding."""
 PRIOR_POINTS, POINT_SIGMA_M, DAMPING = 20, 0.03, 1e-6
-"""Equivalent points of the upright prior, their noise (metres), and damping of a step."""
+"""Equivalent points of the upright prior, their noise (meters), and damping of a step."""
 PREDICTED_POINTS, DEPARTURE_COST_M = 40, 0.002
-"""Equivalent points of a predicted pose, and cost of a deviation by one sigma, metres."""
+"""Equivalent points of a predicted pose, and cost of a deviation by one sigma, meters."""
 MIN_POINTS, MIN_ERODED_PX, MIN_DEPTH_M = 25, 60, 0.1
-"""Least depth points of an observation, least pixels of the eroded mask, least valid depth (metres)."""
+"""Least depth points of an observation, least pixels of the eroded mask, least valid depth (meters)."""
 RADIUS, FULL_VIEW, DEPTH_SHARE = 0.75, 0.3, 0.1
 """In body lengths: largest distance of points from their median, silhouette area in full view (squared), and
-distance from the visible side to the centre."""
+distance from the visible side to the center."""
 BACK_QUANTILE = 0.8
 """Quantile of the template's heights that is its back's; head and tail may be higher."""
 STANDING_STEP = 8
 """Stride of the points below which the surface height is measured."""
 BEHIND_M = 0.05
-"""Depth farther than the template by this is behind it, metres."""
+"""Depth farther than the template by this is behind it, meters."""
 
 
 @dataclass(frozen=True)
 class AgentModel:
-    """The subsampled template: points, normals and colours in the agent frame, with a k-d tree."""
+    """The subsampled template: points, normals and colors in the agent frame, with a k-d tree."""
 
     points_agent: Float[np.ndarray, "point 3"]
     normals_agent: Float[np.ndarray, "point 3"]
@@ -80,7 +80,7 @@ class StandingSurface:
 
 @dataclass(frozen=True)
 class AgentObservation:
-    """One frame's observation of the animal; metres, colours 0..1."""
+    """One frame's observation of the animal; meters, colors 0..1."""
 
     frame: int
     points_world: Float[np.ndarray, "point 3"]
@@ -178,7 +178,7 @@ def _contact_depth(
 def initial_poses(
     observation: AgentObservation, model: AgentModel, headings: int
 ) -> Float[np.ndarray, "pose 4 4"]:
-    """Return upright poses at evenly spaced headings, centred slightly behind the visible points."""
+    """Return upright poses at evenly spaced headings, centered slightly behind the visible points."""
     yaw = 2 * np.pi * np.arange(headings) / headings
     rotation = rigid.rotation_from_yaw(yaw)
     middle = np.median(observation.points_world, axis=0)
@@ -187,7 +187,7 @@ def initial_poses(
 
 
 def _offset_to_center(points_world, eye, model):
-    """Return the horizontal offset from the visible side of the body to its centre."""
+    """Return the horizontal offset from the visible side of the body to its center."""
     away = (np.median(points_world, axis=0) - eye) * (1, 0, 1)
     return DEPTH_SHARE * model.length_m * away / max(np.linalg.norm(away), 1e-6)
 
@@ -226,7 +226,7 @@ class PosePrior:
 
     world_from_agent: Float[np.ndarray, "4 4"]
     sigma: tuple[float, float]
-    """Standard deviations of rotation and position, radians and metres."""
+    """Standard deviations of rotation and position, radians and meters."""
 
     def twist(self, world_from_agent: Float[np.ndarray, "pose 4 4"]) -> Float[np.ndarray, "pose 6"]:
         """Return the twists from the predicted pose, in standard deviations."""
@@ -251,9 +251,9 @@ class PriorFit:
 
     world_from_agent: Float[np.ndarray, "4 4"]
     cost_m: float
-    """`cost` of the pose, metres."""
+    """`cost` of the pose, meters."""
     total_m: float
-    """The same plus the cost of deviation from the prediction, metres."""
+    """The same plus the cost of deviation from the prediction, meters."""
 
 
 def fit_near(observation: AgentObservation, model: AgentModel, prior: PosePrior, *, rounds: int) -> PriorFit:
@@ -329,7 +329,7 @@ def _add_standing_prior(poses, hessian, gradient, standing_m):
 def cost(
     observation: AgentObservation, model: AgentModel, world_from_agent: Float[np.ndarray, "pose 4 4"]
 ) -> Float[np.ndarray, "pose"]:
-    """Return each pose's cost, metres: truncated distance, standing, colour, template outside mask."""
+    """Return each pose's cost, meters: truncated distance, standing, color, template outside mask."""
     local = rigid.apply(rigid.inverse(world_from_agent), observation.points_world[None])
     distance, nearest = model.tree.query(local)
     seen, expected = observation.color - observation.color.mean(0), model.color[nearest]

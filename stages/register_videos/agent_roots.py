@@ -22,7 +22,7 @@ from stages.register_videos.headings import RootHypotheses
 MAX_HYPOTHESES, MIN_HEADING_DIFFERENCE_DEG = 5, 25.0
 """Largest number of hypotheses per frame, and least difference of their headings, degrees."""
 COST_SCALE_M = 0.004
-"""Fit cost that counts as one unit of the Viterbi cost, metres."""
+"""Fit cost that counts as one unit of the Viterbi cost, meters."""
 FINE_ROUNDS = 12
 """Gauss-Newton steps of the remaining hypotheses."""
 LOCALIZER_EVERY_FRAMES, LOCALIZER_WEIGHT = 2, 8.0
@@ -32,9 +32,9 @@ MAX_LOCALIZED, LOCALIZER_SIGMA_RAD = 2, float(np.deg2rad(30.0))
 SMOOTHING_PASSES, SMOOTHING_REACH = 2, 3
 """Passes of the smoothing, and its reach in time constants."""
 OUTLIER_SCALE = (0.35, 0.1)
-"""Residual (radians, metres) at which a neighbour's weight is halved."""
+"""Residual (radians, meters) at which a neighbor's weight is halved."""
 MIN_SHARE, COST_DECAY_M, SLOPE_RIDGE_S2 = 0.05, 0.02, 1e-4
-"""Least weight by visibility, cost scale of weights (metres), ridge on the slope (s^2)."""
+"""Least weight by visibility, cost scale of weights (meters), ridge on the slope (s^2)."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Roots:
     world_from_agent: Float[np.ndarray, "frame 4 4"]
     visible: Bool[np.ndarray, "frame"]
     cost_m: Float[np.ndarray, "frame"]
-    """Cost of the pose (`agent_fit.cost`), metres; NaN where not visible."""
+    """Cost of the pose (`agent_fit.cost`), meters; NaN where not visible."""
     share: Float[np.ndarray, "frame"]
     """Visible share, 0..1 (`AgentObservation.share`)."""
 
@@ -150,7 +150,7 @@ def smooth(
 ) -> Float[np.ndarray, "frame 4 4"]:
     """Smooth visible roots by robust local linear regression on SE(3).
 
-    Weights depend on time difference (``smooth_s``, seconds), cost (metres), visibility and residual.
+    Weights depend on time difference (``smooth_s``, seconds), cost (meters), visibility and residual.
     """
     known = np.flatnonzero(np.isfinite(cost_m))
     result, time, best = world_from_agent.copy(), timestamp_s[known], np.nanmin(cost_m, initial=np.inf)

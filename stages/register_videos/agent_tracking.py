@@ -15,20 +15,20 @@ from stages.register_videos.agent_fit import AgentModel, AgentObservation, PoseP
 
 RELIABLE_SHARE, TYPICAL_QUANTILE, MAX_EXCESS_M = 0.25, 0.3, 0.012
 """A frame is reliable if its visible share is at least the lower of this and the median, and its cost exceeds
-the typical one (a quantile over the recording) by at most this, metres."""
+the typical one (a quantile over the recording) by at most this, meters."""
 MIN_SHARE, LOST_EXCESS_M = 0.03, 0.036
-"""A track ends at a smaller visible share or a larger excess over the typical cost, metres."""
+"""A track ends at a smaller visible share or a larger excess over the typical cost, meters."""
 MAX_GAP_S = 1.0
 """Longest gap between frames that is bridged by prediction, seconds."""
 PREDICTION_SIGMA, MIN_SPEED = (float(np.deg2rad(5.0)), 0.01), (float(np.deg2rad(100.0)), 0.4)
-"""Standard deviation of a prediction (radians, metres), and its least growth per second, that of a walking
+"""Standard deviation of a prediction (radians, meters), and its least growth per second, that of a walking
 cat; faster animals raise it."""
 ROUNDS = 12
 """Gauss-Newton steps."""
 
 
 def excess_cost(cost_m: Float[np.ndarray, "frame"]) -> Float[np.ndarray, "frame"]:
-    """Return the excess of each cost over the typical one, metres; infinite where unknown."""
+    """Return the excess of each cost over the typical one, meters; infinite where unknown."""
     known = np.isfinite(cost_m)
     if not known.any():
         return np.full(len(cost_m), np.inf)
@@ -36,7 +36,7 @@ def excess_cost(cost_m: Float[np.ndarray, "frame"]) -> Float[np.ndarray, "frame"
 
 
 def typical_cost(cost_m: Float[np.ndarray, "frame"]) -> float:
-    """Return the typical cost of a good fit in this recording, metres."""
+    """Return the typical cost of a good fit in this recording, meters."""
     return float(np.nanquantile(cost_m, TYPICAL_QUANTILE))
 
 
@@ -102,7 +102,7 @@ class Tracker:
             yield frame, fit
 
     def _typical_speed(self, reliable: Bool[np.ndarray, "frame"]) -> tuple[float, float]:
-        """Return median speeds (rad/s, m/s) between reliable neighbours, at least `MIN_SPEED`."""
+        """Return median speeds (rad/s, m/s) between reliable neighbors, at least `MIN_SPEED`."""
         first = np.flatnonzero(reliable[:-1] & reliable[1:])
         if not len(first):
             return MIN_SPEED

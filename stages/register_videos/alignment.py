@@ -27,11 +27,11 @@ MAX_POINTS, MIN_POINTS = 400_000, 40
 """Depth points per recording, and as many correspondences of flow and of features, which bounds memory; least
 number per frame."""
 DEPTH_INFLATION = 8.0
-"""Factor on depth noise, since neighbouring errors are correlated and furniture moves."""
+"""Factor on depth noise, since neighboring errors are correlated and furniture moves."""
 VOTE_SIGMA_M = 0.15
-"""Standard deviation of one patch match of a vote, metres."""
+"""Standard deviation of one patch match of a vote, meters."""
 FIRST_REACH_M, LAST_REACH_M = 0.3, 0.04
-"""Width of the robust kernel in the first and last round, metres."""
+"""Width of the robust kernel in the first and last round, meters."""
 VOTE_ROUNDS, PICTURE_ROUNDS = 3, 3
 """Gauss-Newton steps by votes alone, and per pass with picture correspondences."""
 FEATURE_PASSES = 2
@@ -41,7 +41,7 @@ MASK_MARGIN_PX = 7
 MIN_STATIC_POINTS = 20
 """Least static depth points for measuring a frame's fit."""
 NEAR_M, FIT_M = 0.5, 0.05
-"""Depth farther from the surface than the first is ignored as foreign; within the second it fits, metres."""
+"""Depth farther from the surface than the first is ignored as foreign; within the second it fits, meters."""
 
 
 @dataclass(frozen=True)
@@ -50,15 +50,15 @@ class AlignedCameras:
 
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     pose_covariance: Float[np.ndarray, "frame 6 6"]
-    """Covariance of each camera's right-hand twist (rotation in radians, translation in metres)."""
+    """Covariance of each camera's right-hand twist (rotation in radians, translation in meters)."""
     gap_m: Float[np.ndarray, "frame"]
-    """Median distance of static depth from the surface, metres; NaN where unknown."""
+    """Median distance of static depth from the surface, meters; NaN where unknown."""
     fit: Float[np.ndarray, "frame"]
     """Share of static depth within 5 cm of the surface, among that within 50 cm; NaN where unknown."""
 
     @property
     def median_gap_m(self) -> float:
-        """Return the median frame's gap, metres; NaN where no frame was measured."""
+        """Return the median frame's gap, meters; NaN where no frame was measured."""
         return _median(self.gap_m)
 
     @property

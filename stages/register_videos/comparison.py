@@ -13,18 +13,18 @@ from pipeline.mapping.picture_agreement import beats, correlated
 from pipeline.metrics.silhouettes import silhouette_iou
 
 BLUR_PX = 9.0
-"""Neighbourhood of the local contrast normalization, standard deviation in half-size pixels."""
+"""Neighborhood of the local contrast normalization, standard deviation in half-size pixels."""
 MIN_VARIANCE = 9.0
-"""Floor of the local variance of grey values."""
+"""Floor of the local variance of gray values."""
 MEAN_GREY, GREY_PER_SIGMA = 128, 48
-"""Output grey value of the local mean, and grey values per standard deviation."""
+"""Output gray value of the local mean, and gray values per standard deviation."""
 SHARE_FLOOR = 1e-3
 """Added to the share of known pixels, against division by zero."""
 FIT_M, MIN_SHARE = 0.05, 0.1
-"""Pixels are compared where depth and rendering agree within the first, metres; frames with a smaller share
+"""Pixels are compared where depth and rendering agree within the first, meters; frames with a smaller share
 of such pixels have no score."""
 SMOOTHING_PX = 1.5
-"""Blur before correlation, half-size pixels, to match the template's smooth colours."""
+"""Blur before correlation, half-size pixels, to match the template's smooth colors."""
 
 SIZES, SIZE_FRAMES = (0.8, 0.9, 1.1, 1.25), 40
 """Other sizes of the animal's template that are compared with its own, and number of frames compared."""
@@ -36,7 +36,7 @@ class RenderedComparison:
 
     intrinsics: Float[np.ndarray, "3 3"]
     depth: Float[np.ndarray, "height width"]
-    """Of the template, metres, 0 = none."""
+    """Of the template, meters, 0 = none."""
     rendered: Float[np.ndarray, "height width 3"]
     recorded: UInt8[np.ndarray, "height width 3"]
     known: Bool[np.ndarray, "height width"]
@@ -50,7 +50,7 @@ def compare(
     size = (clip.color_size[0] // 2, clip.color_size[1] // 2)
     intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size)
     depth, hits = render_view(caster, world_from_camera, intrinsics, *size)
-    assert caster.mesh.color is not None, "templates have colours"
+    assert caster.mesh.color is not None, "templates have colors"
     rendered = hits.interpolate(caster.mesh, caster.mesh.color).reshape(*size, 3)
     recorded = cv2.resize(clip.color(frame), size[::-1], interpolation=cv2.INTER_AREA)
     free = cv2.resize((masks[frame] == 0).astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST) > 0
@@ -60,7 +60,7 @@ def compare(
 def local_contrast_normalization(
     color: Num[np.ndarray, "height width 3"], known: Bool[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width"]:
-    """Normalize grey values by their local mean and standard deviation (Jarrett et al. 2009)."""
+    """Normalize gray values by their local mean and standard deviation (Jarrett et al. 2009)."""
     gray = cv2.cvtColor(color.astype(np.float32), cv2.COLOR_RGB2GRAY)
     weight = known.astype(np.float32)
     share = _blur(weight) + SHARE_FLOOR

@@ -19,13 +19,13 @@ from stages.register_videos.comparison import ncc
 from stages.register_videos.config import ConfidenceConfig
 
 TOL_RAD, TOL_M = np.deg2rad(2.0), 0.05
-"""Largest error of a correct camera pose, radians and metres."""
+"""Largest error of a correct camera pose, radians and meters."""
 DECOY_RANGE = (1.5, 10.0)
 """Range of the decoys' errors, in multiples of `TOL_RAD` and `TOL_M`."""
 ATTEMPTS = 3
 """Decoys per frame whose best score counts, since alignment also chose the best pose in reach."""
 AVERAGING_S = 1.0
-"""Standard deviation of the Gaussian that averages scores, seconds: neighbouring errors are correlated."""
+"""Standard deviation of the Gaussian that averages scores, seconds: neighboring errors are correlated."""
 UNANCHORED_FACTOR = 0.2
 """Factor on the confidence of frames without a vote in their odometry segment."""
 MIN_SCORED = 20
@@ -33,7 +33,7 @@ MIN_SCORED = 20
 DRAWS = 400
 """Monte Carlo samples of a pose's covariance."""
 COST_SCALE_M, ENOUGH_SHARE = 0.012, 0.15
-"""Roots: standard deviation of the excess cost (metres), and visible share of full confidence."""
+"""Roots: standard deviation of the excess cost (meters), and visible share of full confidence."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ class VoteConfig:
     agree_deg: float = 8.0
     """Votes agree within this rotation, degrees ..."""
     agree_m: float = 0.3
-    """... and this distance, metres; room for the odometry's drift."""
+    """... and this distance, meters; room for the odometry's drift."""
     max_tilt_deg: float = 10.0
     """Poses that contradict gravity by more than this do not vote, degrees."""
 

@@ -1,6 +1,6 @@
 """Feature-metric correspondences between a frame's features and the template's, rendered from its pose.
 
-Feature-metric alignment minimises sum |F_observed(pi(T X)) - F_template(X)|^2 over the camera T (the paper's
+Feature-metric alignment minimizes sum |F_observed(pi(T X)) - F_template(X)|^2 over the camera T (the paper's
 Eq. 6; PixLoc, Sarlin et al. 2021). Its Gauss-Newton step on each cell of the feature grid is written as
 correspondences of `pipeline.mapping.pose_optimization`: one along each eigenvector of the cell's structure
 tensor, weighted by its eigenvalue.
@@ -19,7 +19,7 @@ from pipeline.geometry.meshes import RayCaster, render_view
 from pipeline.mapping.pose_optimization import MAP, Correspondences
 
 SIGMA = 4.0
-"""Standard deviation of a unit-length feature; channels and neighbouring cells have correlated errors. On
+"""Standard deviation of a unit-length feature; channels and neighboring cells have correlated errors. On
 the toy's two sessions positions gain 0.3 mm of 4.0 and 4.6 mm; at 1 one session turns by 0.07 degrees."""
 MAX_STEP_CELLS = 1.0
 """Longest step, cells: the linear range of features."""
@@ -28,7 +28,7 @@ MIN_EIGENVALUE = 0.005
 MIN_NORM = 0.5
 """Least norm of rendered features; shorter ones mix in unseen vertices."""
 MAX_DEPTH_ERROR_M = 0.12
-"""Largest difference of measured and template depth, metres; rejects moved objects."""
+"""Largest difference of measured and template depth, meters; rejects moved objects."""
 MIN_CELLS = 20
 """Least number of comparable cells."""
 

@@ -19,7 +19,7 @@ STRIDE_PX, MARGIN_PX = 9, 4
 MAX_FLOW_PX = 12
 """Longest valid flow, half-size pixels."""
 MAX_DEPTH_ERROR_M = 0.12
-"""Largest difference of measured depth at the flow's end and template depth at its start, metres."""
+"""Largest difference of measured depth at the flow's end and template depth at its start, meters."""
 MIN_KNOWN_SHARE, MIN_PAIRS = 0.1, 20
 """Least share of pixels that show the template, and least number of matches."""
 OUTSIDE_PX = 1e3

@@ -18,7 +18,7 @@ HEADINGS = 36
 HEADING_SIGMA_DEG, MAX_FRAME_COST = 20.0, 12.0
 """Heading difference between hypothesis and grid that costs one unit, and largest cost of one frame."""
 MOTION_WEIGHT, WALKING_M_S = 4.0, (0.25, 0.6)
-"""Cost of walking tail first, ramping up between these speeds, m/s: the centre of visible points also moves
+"""Cost of walking tail first, ramping up between these speeds, m/s: the center of visible points also moves
 when an animal turns on the spot."""
 REVERSED_SHARE = 0.6
 """The template's head and tail are swapped if that saves this share of the cost of always walking tail first,
@@ -43,7 +43,7 @@ class RootHypotheses:
     world_from_agent: Float[np.ndarray, "hypothesis 4 4"]
     cost: Float[np.ndarray, "hypothesis"]
     min_misfit: float
-    """Cost of the best pose by shape and colour alone."""
+    """Cost of the best pose by shape and color alone."""
     share: float
     """Visible share, 0..1."""
     center_world: Float[np.ndarray, "3"]

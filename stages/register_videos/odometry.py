@@ -21,7 +21,7 @@ from stages.register_videos.config import VoteConfig
 from stages.register_videos.votes import FrameVotes, are_close
 
 DRIFT_RAD_S, DRIFT_M_S = np.deg2rad(0.15), 0.01
-"""Drift of a phone's odometry, radians and metres per second."""
+"""Drift of a phone's odometry, radians and meters per second."""
 NEAR_S = 6.0
 """Votes are compared with others within this time, seconds."""
 ACROSS_JUMP = 1e-3

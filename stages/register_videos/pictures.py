@@ -20,7 +20,7 @@ DEPTH_EDGE_M, OUTLINE_STEP = 0.08, 1.0
 HEADING_M = 0.2
 """length of the line that shows where the animal faces"""
 STEP_FRAMES, MIN_STEP_M = 5, 0.2
-"""an animal walks if it moves farther than `WALK_M`, metres, within `WALK_FRAMES`"""
+"""an animal walks if it moves farther than `WALK_M`, meters, within `WALK_FRAMES`"""
 CAPTIONS = {
     "edges": "Template edges (magenta) and the placed animal (orange) over frames.",
     "bird": "From above: the phone's path (blue), the animal's (orange, yellow towards its head).",
@@ -56,7 +56,7 @@ def status(
 
 
 def nearest_frame(walk: Float[np.ndarray, "walk 4 4"], world_from_camera: Float[np.ndarray, "4 4"]) -> int:
-    """Return the walk-through's frame of the nearest camera: a metre counts as much as a radian."""
+    """Return the walk-through's frame of the nearest camera: a meter counts as much as a radian."""
     distance_m = np.linalg.norm(walk[:, :3, 3] - world_from_camera[:3, 3], axis=1)
     return int(np.argmin(distance_m + rigid.rotation_angle(walk[:, :3, :3], world_from_camera[:3, :3])))
 

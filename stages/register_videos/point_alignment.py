@@ -28,7 +28,7 @@ MATCHED_PICTURES, MIN_SHARED = 6, 0.15
 """Pictures matched with each frame, and least covisibility: share of the frame's points in view times the
 cosine between optical axes."""
 REACH_SHARE, REACH_M = 0.03, 0.15
-"""Largest reprojection error (share of the picture's width) and depth error (metres) of matches."""
+"""Largest reprojection error (share of the picture's width) and depth error (meters) of matches."""
 
 
 @dataclass(frozen=True)

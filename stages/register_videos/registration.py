@@ -38,7 +38,7 @@ MIN_RECOGNIZED = 0.2
 FLOOR_QUANTILE = 0.02
 """Quantile of the template's heights that is the floor's."""
 EYE_HEIGHT_M = 1.5
-"""Camera height for the initialization in the middle of the room, metres."""
+"""Camera height for the initialization in the middle of the room, meters."""
 
 
 @dataclass(frozen=True)
@@ -236,14 +236,14 @@ def rejection_reason(
     if (votes.probability[inliers] >= config.gate.min_certainty).sum() >= MIN_VOTES:
         return None
     if inliers.sum() < MIN_RECOGNIZED * votes.queries:
-        evidence = f"only {inliers.sum()} of {votes.queries} frames were recognised and agree"
+        evidence = f"only {inliers.sum()} of {votes.queries} frames were recognized and agree"
     elif appearance < config.gate.min_appearance:
         evidence = f"only {appearance:.0%} of the frames look more like the room than like wrong places in it"
     else:
         return None
     return (
         f"the room has the same shape but looks different: {evidence}, "
-        "and hardly a frame was recognised with certainty"
+        "and hardly a frame was recognized with certainty"
     )
 
 

@@ -24,7 +24,7 @@ _PICTURE_BYTES = 10_000_000
 _SMALLEST_PX = 160
 _JPEG_QUALITY, _BLURRED_JPEG_QUALITY = 85, 80
 _BLUR_PX = 24
-"""size of blocks that become one colour"""
+"""size of blocks that become one color"""
 _STRIP = 2.4
 """minimum aspect ratio of a strip"""
 

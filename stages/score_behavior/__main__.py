@@ -1,4 +1,4 @@
-"""Score one trial of a behaviour method on the test windows, end to end and fed with the truth.
+"""Score one trial of a behavior method on the test windows, end to end and fed with the truth.
 
 Writes one number per window and score, with the exact list of windows, so that tables can draw intervals over
 methods, seeds and episodes. Where there are scripted approaches, also how often the model's animal flees.

@@ -68,7 +68,7 @@ def flight_shares(
         root, person = recorded.world_from_agent[twin, :, :, :3, 3], recorded.observer[twin, :, -1]
         for name, sampling in samplings.items():  # with the same noise
             path = replace(ats, sampling=sampling).paths(context, count, np.random.default_rng(seed)).path
-            assert path is not None, "a behaviour model samples paths"
+            assert path is not None, "a behavior model samples paths"
             now, seen = (np.repeat(each[:, None], count, axis=1) for each in (root[:, past - 1], person))
             found[f"flees/{name}"] = flees(path, now, seen).mean(1)
         found[f"flees/{TRUE[twin]}"] = flees(root[:, past:], root[:, past - 1], person).astype(float)

@@ -51,7 +51,7 @@ def scores(
         paths = alone.paths(context, scoring.samples, rng)
         found["networks/path_minade_m"] = [SCORES["path_minade_m"](paths, future)]
         for protocol, made in (("end_to_end", samples), ("networks", paths)):
-            assert made.path is not None, "a behaviour model samples paths"
+            assert made.path is not None, "a behavior model samples paths"
             found[f"{protocol}/solid"] = [scenes.inside_solid(made.path, context.video).mean((1, 2))]
         if family != "one_stage":  # has no levels to condition on the truth
             _add(found, "truth_fed", fed_with_truth(alone, context, future, scoring.samples, rng), future)

@@ -5,5 +5,5 @@ depth point, how many other frames saw through it. In sessions, `locate` groups 
 tracks the one animal-sized group; `turnaround` finds what stands on the floor where the optical axes meet.
 `appearance` learns the animal's look from these first masks, so that it is also found where it never moved;
 `evidence` and `refine` turn both into sharp masks (`segmenter`). Without depth, `follow` propagates a prompt
-by colour and flow.
+by color and flow.
 """

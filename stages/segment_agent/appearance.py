@@ -35,7 +35,7 @@ LABEL_TRUST_SHARE = 0.5
 CONTRADICTION_LOG_ODDS = 4.0
 """log-odds against a label from which on it is ignored"""
 ANIMAL_CROP_SHARE = 0.7
-"""share of the other crops that are centred near the animal"""
+"""share of the other crops that are centered near the animal"""
 HARD_NEGATIVE_SHARE = 0.2
 """share of crops around false positives, after a third of the steps"""
 RESCALED_SHARE, SCALE_RANGE = 0.5, (0.5, 1.5)
@@ -55,7 +55,7 @@ class Example:
 
 
 class Appearance(nn.Module):
-    """A U-Net of 80,000 weights from colours to the log-odds that a pixel shows the animal."""
+    """A U-Net of 80,000 weights from colors to the log-odds that a pixel shows the animal."""
 
     def __init__(self, widths: tuple[int, int, int, int] = (16, 24, 32, 48), channels: int = 3) -> None:
         super().__init__()
@@ -70,7 +70,7 @@ class Appearance(nn.Module):
     def forward(
         self, color: Float[Tensor, "batch channel height width"]
     ) -> Float[Tensor, "batch height width"]:
-        """Return log-odds of pictures whose colours are -1..1 and whose sides are multiples of 16."""
+        """Return log-odds of pictures whose colors are -1..1 and whose sides are multiples of 16."""
         return LOGIT_SCALE * self.out(self.trunk(color))[:, 0]
 
     def trunk(
@@ -162,7 +162,7 @@ def fold_batch_norms(network: Appearance) -> Appearance:
 def _hard_negatives(network: Appearance, example: Example) -> UInt8[np.ndarray, "height width"]:
     """Return sampling weights of background pixels that look like the animal: 10 x (log-odds + 2), 0..255.
 
-    Confident detections may be the animal, so they get 0; so does all where the labelled animal is not found.
+    Confident detections may be the animal, so they get 0; so does all where the labeled animal is not found.
     """
     log_odds = network.log_odds(example.color)
     if (example.labels == 255).any() and (log_odds[example.labels == 255] > 0).mean() < 0.5:
@@ -177,7 +177,7 @@ def _choose_crop(
     crop_px: int,
     rng: np.random.Generator,
 ) -> tuple[Example, tuple[int, int]]:
-    """Choose an example and a crop centre (row, column): a hard negative, near the animal, or anywhere."""
+    """Choose an example and a crop center (row, column): a hard negative, near the animal, or anywhere."""
     if hard_negatives is not None and rng.random() < HARD_NEGATIVE_SHARE:
         total = np.array([weight.sum(dtype=np.int64) for weight in hard_negatives])
         if total.any():
@@ -198,7 +198,7 @@ def _choose_crop(
 def _rescaled(
     example: Example, middle: tuple[int, int], crop_px: int, scaled: float, rng: np.random.Generator
 ) -> tuple[Example, tuple[int, int]]:
-    """Rescale an example and its crop centre with probability ``scaled``."""
+    """Rescale an example and its crop center with probability ``scaled``."""
     if scaled == 0 or rng.random() >= scaled:
         return example, middle
     scale = float(np.exp(rng.uniform(*np.log(SCALE_RANGE))))
@@ -234,14 +234,14 @@ def _crop(
 
 
 def to_batch(color: UInt8[np.ndarray, "height width channel"]) -> Float[Tensor, "1 channel row column"]:
-    """Return a picture as network input: colours -1..1, padded to sides that are multiples of 16."""
+    """Return a picture as network input: colors -1..1, padded to sides that are multiples of 16."""
     height, width = color.shape[:2]
     padded = np.pad(color, [(0, -height % ALIGNED_PX), (0, -width % ALIGNED_PX), (0, 0)], mode="edge")
     return normalized(padded)[None]
 
 
 def normalized(color: UInt8[np.ndarray, "height width channel"]) -> Float[Tensor, "channel height width"]:
-    """Scale colours to -1..1, channels first."""
+    """Scale colors to -1..1, channels first."""
     return torch.from_numpy(np.ascontiguousarray(color.transpose(2, 0, 1))).float() / 127.5 - 1
 
 

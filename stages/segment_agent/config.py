@@ -37,9 +37,9 @@ class AnimalConfig:
     """Limits on the animal's size and speed."""
 
     largest_m: float = 1.3
-    """Largest extent of an animal, metres; groups up to twice as large get half the score."""
+    """Largest extent of an animal, meters; groups up to twice as large get half the score."""
     speed_m_s: float = 2.5
-    """Speed up to which tracking charges no cost, metres per second."""
+    """Speed up to which tracking charges no cost, meters per second."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Per-pixel evidence of a window for the animal: free space first, and colour change on static surfaces.
+"""Per-pixel evidence of a window for the animal: free space first, and color change on static surfaces.
 
 `motion_evidence` serves sessions; `turnaround` has the evidence of turnarounds.
 """
@@ -26,24 +26,24 @@ class Evidence:
     """clearly moving, at depth steps too"""
     room: Bool[np.ndarray, "height width"]
     color_log_odds: Float[np.ndarray, "height width"] | float = 0.0
-    """part of `log_odds` due to colour change alone: thin paws and tails, but also gloss and shadows"""
+    """part of `log_odds` due to color change alone: thin paws and tails, but also gloss and shadows"""
 
 
 MOVING, ROOM = 3.0, 3.0
 """log-odds of a point in space that is free at other times; the same against it on a static surface"""
 STEP_M, STEP_SPREAD_M = 0.022, 0.008
-"""depth step in front of a static surface at even log-odds, and the step per unit of log-odds, metres"""
+"""depth step in front of a static surface at even log-odds, and the step per unit of log-odds, meters"""
 COLOR_CHANGE_WEIGHT = 1.0
-"""log-odds per standard deviation of colour change of a static surface"""
+"""log-odds per standard deviation of color change of a static surface"""
 UNTRUSTED_STATIC, UNTRUSTED_BEHIND, UNTRUSTED_MOVING = 0.5, 0.25, 0.6
 """certainty of depth of low confidence or at a step (other depth has 1): on static surfaces, elsewhere on the
 background (the sensor may have missed a tail), and in space that is free at other times"""
 UNKNOWN = 0.05
-"""certainty where nothing is known: the neighbourhood decides"""
+"""certainty where nothing is known: the neighborhood decides"""
 SURE_ROOM = 0.66
 """share of `ROOM` beyond which a point is certainly background"""
 MIN_STATIC_PX, MIN_NOISE = 50, 3.0
-"""static pixels required to compare colours, and the least noise assumed (JPEG), grey levels"""
+"""static pixels required to compare colors, and the least noise assumed (JPEG), gray levels"""
 HALF_CERTAIN_VOTES = 5.0
 """number of references at which a static surface is half certain: one or two may have seen the animal"""
 MISALIGNMENT_PX = 2
@@ -55,7 +55,7 @@ EvidenceOf = Callable[[int, Window, Sphere], Evidence]
 def motion_evidence(references: References) -> EvidenceOf:
     """Evidence for sessions: space that is free at other times is animal, surfaces seen by others are room.
 
-    On such static surfaces a depth step towards the camera or a colour change speaks for the animal: paws and
+    On such static surfaces a depth step towards the camera or a color change speaks for the animal: paws and
     tails are too thin for the depth sensor.
     """
 
@@ -82,7 +82,7 @@ def motion_evidence(references: References) -> EvidenceOf:
 
 
 def prefer_first(first: EvidenceOf, second: EvidenceOf) -> EvidenceOf:
-    """Combine evidence: the first where it favours the animal, elsewhere the second."""
+    """Combine evidence: the first where it favors the animal, elsewhere the second."""
 
     def evidence_of(frame: int, window: Window, sphere: Sphere) -> Evidence:
         preferred, other = first(frame, window, sphere), second(frame, window, sphere)
@@ -95,9 +95,9 @@ def prefer_first(first: EvidenceOf, second: EvidenceOf) -> EvidenceOf:
 def color_change(
     window: Window, votes: Votes, static: Bool[np.ndarray, "height width"]
 ) -> Float[np.ndarray, "height width"]:
-    """Return the colour change of static surfaces against other times, in noise levels (0..6), less shadows.
+    """Return the color change of static surfaces against other times, in noise levels (0..6), less shadows.
 
-    A shadow or an exposure change scales all channels alike, and a shadow only darkens. Colours within the
+    A shadow or an exposure change scales all channels alike, and a shadow only darkens. Colors within the
     range found up to `MISALIGNMENT_PX` away count as unchanged, since textures never align exactly.
     """
     if static.sum() < MIN_STATIC_PX:

@@ -1,4 +1,4 @@
-"""Masks of a recording without depth, from one box: colour and flow only.
+"""Masks of a recording without depth, from one box: color and flow only.
 
 GrabCut segments the prompted frame, initialized with what moves against the background if enough does.
 `propagation` then propagates this mask through the recording.
@@ -30,7 +30,7 @@ to be used"""
 def follow(
     footage: Footage, prompt: Prompt, learning: LearningConfig, rng: np.random.Generator
 ) -> Iterator[Mask]:
-    """Yield one mask per frame at colour resolution."""
+    """Yield one mask per frame at color resolution."""
     coarse = Footage(footage.clip, footage.flow, min(HEIGHT_PX, footage.height_px))
     first = segment_prompt(footage, prompt, rng)
     first = cv2.resize(first, coarse.size[::-1], interpolation=cv2.INTER_AREA)

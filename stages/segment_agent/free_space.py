@@ -1,7 +1,7 @@
 """Free space: a point that other frames saw through is not part of the static room.
 
 `References` keeps a fixed number of depth pictures spread over the recording, before and after any frame, so
-that a resting animal is recognised by the times when its place was empty. Voting costs O(references) a frame.
+that a resting animal is recognized by the times when its place was empty. Voting costs O(references) a frame.
 """
 
 import math
@@ -32,7 +32,7 @@ MAX_NOISE_M = 0.15
 MIN_PAIRS, MAD_TO_SIGMA, MIN_NOISE_M = 200, 1.48, 0.002
 """differences required per range bin, MAD to sigma, and the least deviation of any sensor"""
 BLUR_PX = 1.2
-"""standard deviation of the blur before colours are compared, so that small pose errors are tolerated"""
+"""standard deviation of the blur before colors are compared, so that small pose errors are tolerated"""
 INNER_WIDTH_PX = 320
 """picture width per pixel of window radius for `interior_depth`; narrower pictures are phones', whose
 confidence marks steps"""
@@ -44,14 +44,14 @@ INNER_STEP_SHARE = 0.12
 class DepthNoise:
     """Depth noise of one recording, sensor and poses together.
 
-    Standard deviation in metres = constant_m + quadratic * z^2, z in metres, as for triangulation.
+    Standard deviation in meters = constant_m + quadratic * z^2, z in meters, as for triangulation.
     """
 
     constant_m: float = 0.005
     quadratic: float = 0.0025
 
     def sigma_m(self, z: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-        """Return the standard deviation at a distance, metres."""
+        """Return the standard deviation at a distance, meters."""
         return self.constant_m + self.quadratic * z**2
 
 
@@ -67,7 +67,7 @@ class References:
     frame: Int[np.ndarray, "reference"]
     noise: DepthNoise
     ignored: Callable[[int, Float[np.ndarray, "*shape 3"]], Bool[np.ndarray, "*shape"]] | None = None
-    """which points (world, metres) of a frame belong to people and never count as moving"""
+    """which points (world, meters) of a frame belong to people and never count as moving"""
 
 
 @dataclass(frozen=True)
@@ -79,16 +79,16 @@ class Votes:
     gap_m: Float[np.ndarray, "*shape"]
     """mean distance from the point back to the agreeing references' surfaces"""
     color: Float[np.ndarray, "*shape 3"]
-    """mean colour (0..255) of those surfaces"""
+    """mean color (0..255) of those surfaces"""
 
 
 def clean_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
-    """Read usable depth without flying pixels at depth steps (metres, 0 = unknown)."""
+    """Read usable depth without flying pixels at depth steps (meters, 0 = unknown)."""
     return usable_depth(clip, frame, keep_steps=False)
 
 
 def interior_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
-    """Read depth away from steps, holes and low confidence (metres, 0 = unknown)."""
+    """Read depth away from steps, holes and low confidence (meters, 0 = unknown)."""
     depth = clean_depth(clip, frame)
     kernel = np.ones((2 * (depth.shape[1] // INNER_WIDTH_PX) + 1,) * 2, np.uint8)
     low, high = cv2.erode(depth, kernel), cv2.dilate(depth, kernel)
@@ -102,7 +102,7 @@ def world_points(
     depth: Float[np.ndarray, "height width"],
     stride: int,
 ) -> Float[np.ndarray, "row column 3"]:
-    """Back-project every ``stride``-th depth pixel to the world, metres; NaN where depth is 0."""
+    """Back-project every ``stride``-th depth pixel to the world, meters; NaN where depth is 0."""
     every = np.s_[stride // 2 :: stride, stride // 2 :: stride]
     pixel, depth = cameras.pixel_grid(*depth.shape)[every], depth[every]
     rays = cameras.unproject(pixel, clip.depth_intrinsics[frame])
@@ -146,7 +146,7 @@ def measure_noise(
 ) -> DepthNoise:
     """Fit the depth noise to differences between overlapping depth pictures.
 
-    A robust deviation (1.48 times the median) per half metre of range, then non-negative least squares. The
+    A robust deviation (1.48 times the median) per half meter of range, then non-negative least squares. The
     default if too little overlaps.
     """
     ranges, errors = [], []
@@ -191,7 +191,7 @@ def masked(references: References, hidden: Callable[[int], Bool[np.ndarray, "hei
 def vote(
     references: References, points_world: Float[np.ndarray, "*shape 3"], frame: int, surfaces: bool = False
 ) -> Votes:
-    """Let the other references vote on points (world, metres; NaN: none); colours only with ``surfaces``."""
+    """Let the other references vote on points (world, meters; NaN: none); colors only with ``surfaces``."""
     known = np.isfinite(points_world[..., 0])
     points = np.ascontiguousarray(points_world[known], np.float32)
     other = np.flatnonzero((references.frame != frame) & _in_view(references, points))

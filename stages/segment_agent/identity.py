@@ -100,7 +100,7 @@ class Identities(Appearance):
     def logits(
         self, color: Float[Tensor, "batch 3 height width"]
     ) -> Float[Tensor, "batch class height width"]:
-        """Return the classes' logits of pictures whose colours are -1..1 and sides multiples of 16."""
+        """Return the classes' logits of pictures whose colors are -1..1 and sides multiples of 16."""
         return LOGIT_SCALE * self.out(self.trunk(color))
 
     @torch.no_grad()
@@ -212,7 +212,7 @@ def _weights(classes: Int[Tensor, "batch height width"], count: int) -> Float[Te
 def _composited_crop(
     own: Sequence[Sequence[Portrait]], animal: int, side: int, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Return a random crop of an animal, sometimes with another pasted over it, with augmented colours."""
+    """Return a random crop of an animal, sometimes with another pasted over it, with augmented colors."""
     color, classes = _random_crop(own[animal][int(rng.integers(len(own[animal])))], side, rng)
     if rng.random() < PASTE_SHARE:
         other = int(rng.choice([index for index in range(len(own)) if index != animal]))

@@ -132,6 +132,6 @@ def opened_motion(votes: Votes, share: float) -> Bool[np.ndarray, "row column"]:
 def resample_nearest(
     picture: Shaped[np.ndarray, "height width"], size: tuple[int, int], chosen: tuple[slice, slice]
 ) -> Shaped[np.ndarray, "row column"]:
-    """Sample a picture at chosen pixels of a grid of another ``size`` (height, width), nearest neighbour."""
+    """Sample a picture at chosen pixels of a grid of another ``size`` (height, width), nearest neighbor."""
     pixel = cameras.pixel_grid(*size)[chosen] * np.divide(picture.shape, size)[::-1]
     return cameras.sample_nearest(picture, pixel)

@@ -24,7 +24,7 @@ the second is used if nothing travels by the first"""
 TRAVEL_M = 0.2
 """distance that a mover must travel to be certainly an animal: things moved by people stay in place"""
 JUMP_M = 0.1
-"""free jump of a candidate's centre: another part of the animal may be seen"""
+"""free jump of a candidate's center: another part of the animal may be seen"""
 EXCESS_M = 0.3
 """excess distance whose cost equals the score of a full candidate"""
 MIN_VOTES, MIN_SHARE = 2, 0.05
@@ -57,7 +57,7 @@ class Candidate:
     centre_world: Float[np.ndarray, "3"]
     area_m2: float
     radius_m: float
-    """95th percentile of the points' distances from the centre"""
+    """95th percentile of the points' distances from the center"""
     probability: float = 1.0
     """mean probability of its points"""
 

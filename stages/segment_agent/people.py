@@ -47,7 +47,7 @@ WALKER = AnimalConfig(largest_m=4.0, speed_m_s=2.5)
 
 @dataclass(frozen=True)
 class People:
-    """Tracks of people in a recording's own world, metres, +y up."""
+    """Tracks of people in a recording's own world, meters, +y up."""
 
     axis_world: Float[np.ndarray, "person frame 2"]
     """x and z of the body's middle; NaN where a person is not seen"""
@@ -66,7 +66,7 @@ class People:
     def feet_in_camera(
         self, world_from_camera: Float[np.ndarray, "frame 4 4"]
     ) -> Float[np.ndarray, "frame person 3"]:
-        """Return the places on the floor where people stand, camera frame, metres; NaN where not seen."""
+        """Return the places on the floor where people stand, camera frame, meters; NaN where not seen."""
         x, z = self.axis_world[..., 0].T, self.axis_world[..., 1].T
         feet = np.stack([x, np.full_like(x, self.floor_m), z], axis=-1)
         return rigid.apply(rigid.inverse(world_from_camera)[:, None], feet[..., None, :])[..., 0, :]
@@ -155,7 +155,7 @@ def _persistent(
     picked: Sequence[UprightMover | None], timestamp_s: Float[np.ndarray, "frame"]
 ) -> Bool[np.ndarray, "frame"]:
     """Return the frames of a track that certainly show a person: segments that are often tall enough, and
-    neighbouring segments that the same person can have reached."""
+    neighboring segments that the same person can have reached."""
     seen = np.array([frame for frame, mover in enumerate(picked) if mover is not None], int)
     person = np.zeros(len(picked), bool)
     if not len(seen):

@@ -20,7 +20,7 @@ which a box is a click"""
 
 @dataclass(frozen=True)
 class Prompt:
-    """A box of colour pixels (x0, y0, x1, y1) in one frame, with the animal in its middle."""
+    """A box of color pixels (x0, y0, x1, y1) in one frame, with the animal in its middle."""
 
     frame: int
     box_px: tuple[float, float, float, float]

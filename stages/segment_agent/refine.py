@@ -1,7 +1,7 @@
-"""Refine coarse evidence to a sharp mask by colour and image edges.
+"""Refine coarse evidence to a sharp mask by color and image edges.
 
 Evidence is a log-odds image of a window around the animal; a guided filter transfers image edges to it where
-depth is missing. `ColorHistogram` models the animal's colours over the recording; the room's come from the
+depth is missing. `ColorHistogram` models the animal's colors over the recording; the room's come from the
 window.
 """
 
@@ -23,7 +23,7 @@ class Edges:
 
 
 EDGE = 0.1
-"""standard deviation of colour (0..1) below which the guided filter smooths"""
+"""standard deviation of color (0..1) below which the guided filter smooths"""
 BINS, AB_RANGE = 12, 96
 """histogram bins along each axis of Lab, and the range of a and b that they cover"""
 MIN_COLORS, PRIOR, PRIOR_BINS = 50, 0.02, 200
@@ -35,19 +35,19 @@ SURE_SHARE, HOLE_SHARE = 0.05, 0.05
 
 
 class ColorHistogram:
-    """Lab colour histogram of the animal over a whole recording."""
+    """Lab color histogram of the animal over a whole recording."""
 
     def __init__(self) -> None:
         self._counts = np.zeros((BINS, BINS, BINS), np.float32)
 
     def learn(self, color: UInt8[np.ndarray, "pixel 3"]) -> None:
-        """Add the colours of pixels that surely show the animal."""
+        """Add the colors of pixels that surely show the animal."""
         np.add.at(self._counts, _bin(color), 1.0)
 
     def log_likelihood_ratio(
         self, color: UInt8[np.ndarray, "height width 3"], room: Bool[np.ndarray, "height width"]
     ) -> Float[np.ndarray, "height width"]:
-        """Return log p(colour | animal) / p(colour | room), within +-2; ``room`` marks certain background."""
+        """Return log p(color | animal) / p(color | room), within +-2; ``room`` marks certain background."""
         if min(self._counts.sum(), room.sum()) < MIN_COLORS:
             return np.zeros(color.shape[:2], np.float32)
         counts = np.zeros_like(self._counts)
@@ -64,7 +64,7 @@ def sharpen(
     color: UInt8[np.ndarray, "height width 3"],
     edges: Edges,
 ) -> Float[np.ndarray, "height width"]:
-    """Filter log-odds guided by the image: uncertain pixels follow neighbours of similar colour."""
+    """Filter log-odds guided by the image: uncertain pixels follow neighbors of similar color."""
     guide = cv2.GaussianBlur(color, (3, 3), 0).astype(np.float32) / 255
     both = np.dstack([evidence * certainty, certainty]).astype(np.float32)
     filtered = cv2.ximgproc.guidedFilter(guide, both, edges.radius_px, EDGE**2)
@@ -117,7 +117,7 @@ def _fill_holes(inside: UInt8[np.ndarray, "height width"], limit: float) -> UInt
 
 
 def _bin(color: UInt8[np.ndarray, "pixel 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Lab bins; lightness is coarser than colour to tolerate shading."""
+    """Return Lab bins; lightness is coarser than color to tolerate shading."""
     lab = cv2.cvtColor(np.ascontiguousarray(color.reshape(1, -1, 3)), cv2.COLOR_RGB2LAB)[0].astype(np.int32)
     light = lab[:, 0] * (BINS - 1) // 255
     tone = np.clip((lab[:, 1:] - 128) * BINS // AB_RANGE + BINS // 2, 0, BINS - 1)

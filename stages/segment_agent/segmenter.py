@@ -15,7 +15,7 @@ from stages.segment_agent.refine import ColorHistogram, Edges
 from stages.segment_agent.windows import Sphere, Window, crop_window, working_picture, working_size
 
 COLOR_WEIGHT = 0.7
-"""weight of the colours' log-likelihood ratio"""
+"""weight of the colors' log-likelihood ratio"""
 APPEARANCE_WEIGHT, APPEARANCE_WEIGHT_BLIND = 0.3, 0.6
 """weight of the appearance's log-odds where geometry is known, and where it is not"""
 APPEARANCE_ALONE, APPEARANCE_AGAINST = 3.0, 4.0
@@ -51,7 +51,7 @@ UNKNOWN = 0.3
 
 @dataclass(frozen=True)
 class Mask:
-    """One frame's result at colour resolution."""
+    """One frame's result at color resolution."""
 
     labels: UInt8[np.ndarray, "height width"]
     visible: bool
@@ -72,7 +72,7 @@ class Segmenter:
     edges: Edges = field(default_factory=Edges)
 
     def masks(self, frames: Iterable[int]) -> Iterator[Mask]:
-        """Make one mask per frame, in order, at colour resolution."""
+        """Make one mask per frame, in order, at color resolution."""
         for frame in frames:
             mask = self.working_mask(frame)
             labels = mask.labels
@@ -138,7 +138,7 @@ class Segmenter:
     ) -> tuple[UInt8[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
         """Return labels and sure pixels, by evidence and the learned appearance.
 
-        Colour change counts as far as it looks like the animal. Small masks need support, since noise makes
+        Color change counts as far as it looks like the animal. Small masks need support, since noise makes
         them too. If none is found, clearly moving pixels are sure: small views are all depth steps.
         """
         gloss = evidence.color_log_odds / (1 + np.exp(log_ratio))
@@ -160,7 +160,7 @@ class Segmenter:
 
 
 def learn_color_histogram(segmenter: Segmenter, pictures: int = 30) -> ColorHistogram:
-    """Learn the animal's colours from frames spread over the recording."""
+    """Learn the animal's colors from frames spread over the recording."""
     histogram = ColorHistogram()
     seen = [
         (frame, sphere) for frame, sphere in enumerate(segmenter.spheres) if sphere and not sphere.presumed

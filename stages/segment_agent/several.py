@@ -171,7 +171,7 @@ def identity_evidence(evidence_of: EvidenceOf, margin_of: AppearanceOf) -> Evide
 
 
 def resolve_overlaps(segmenters: list[Segmenter], scores: IdentityScores, own: int, frame: int) -> Mask:
-    """Make one animal's mask of a frame, at colour resolution, with the others' pixels unknown."""
+    """Make one animal's mask of a frame, at color resolution, with the others' pixels unknown."""
     found = [next(segmenter.masks([frame])) for segmenter in segmenters]
     own_mask, labels = found[own], found[own].labels.copy()
     own_margin = scores.against_others(own)(frame)

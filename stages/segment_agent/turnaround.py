@@ -104,7 +104,7 @@ def surroundings(
 
 
 def axes_focus(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "3"] | None:
-    """Return the point nearest to all optical axes (robust least squares), metres.
+    """Return the point nearest to all optical axes (robust least squares), meters.
 
     None if they are parallel, or meet behind most cameras because the phone turns on the spot.
     """

@@ -12,7 +12,7 @@ from pipeline.geometry.flying_pixels import supported
 from stages.segment_agent.free_space import clean_depth
 
 STEP_M = 0.05
-"""difference of neighbouring depths above which they form a step"""
+"""difference of neighboring depths above which they form a step"""
 NEAREST_M = 0.2
 """least distance for the projected size of a sphere"""
 RIM_PX = 8
@@ -21,7 +21,7 @@ RIM_PX = 8
 
 @dataclass(frozen=True)
 class Sphere:
-    """Bounding sphere of the animal at one time, in the recording's world, metres."""
+    """Bounding sphere of the animal at one time, in the recording's world, meters."""
 
     centre_world: Float[np.ndarray, "3"]
     radius_m: float
@@ -50,7 +50,7 @@ def working_size(clip: Clip, height_px: int) -> tuple[int, int]:
 
 
 def working_picture(clip: Clip, frame: int, height_px: int) -> UInt8[np.ndarray, "height width 3"]:
-    """Read a frame's colours at working resolution."""
+    """Read a frame's colors at working resolution."""
     color, size = clip.color(frame), working_size(clip, height_px)
     return color if size == clip.color_size else cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA)
 
@@ -103,7 +103,7 @@ def crop_window(
 
 
 def supported_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
-    """Read depth with sharp steps, including thin things that neighbours support (0 = unknown)."""
+    """Read depth with sharp steps, including thin things that neighbors support (0 = unknown)."""
     depth = snap_depth_steps(clip.depth(frame))
     return np.where(supported(depth), depth, 0)
 
@@ -111,7 +111,7 @@ def supported_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]
 def snap_depth_steps(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
     """Snap depth between two surfaces to the closer of them, since sensors blur depth steps.
 
-    Toggle mapping (Kramer and Bruckner 1975) where neighbours differ by more than a step.
+    Toggle mapping (Kramer and Bruckner 1975) where neighbors differ by more than a step.
     """
     around = np.ones((3, 3), np.uint8)
     low = cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), around)

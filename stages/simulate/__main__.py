@@ -1,4 +1,4 @@
-"""Run the behaviour model without a page, or let the animal travel through sub-goals; write the take.
+"""Run the behavior model without a page, or let the animal travel through sub-goals; write the take.
 
 With `--behavior`: beside a scripted observer; writes `take.npz` and `take.csv`. In Python:
 `Simulator.reset(seed)` and `Simulator.step(observer)` of `pipeline.behavior.simulator`. With `--animals`: all

@@ -1,4 +1,4 @@
-"""Sub-goals for minutes of motion from the behaviour model: each is sampled where the last plan ended."""
+"""Sub-goals for minutes of motion from the behavior model: each is sampled where the last plan ended."""
 
 import numpy as np
 

@@ -16,7 +16,7 @@ class Config:
     """What is simulated, for how long, and how plans are drawn."""
 
     seconds: float = 30.0
-    """Length of a take of the behaviour model."""
+    """Length of a take of the behavior model."""
     observer: ObserverScript = "approach"
     """What the observer does."""
     observer_speed_m_s: float = 1.0
@@ -28,12 +28,12 @@ class Config:
     sequence_steps: int = 0
     """Denoising steps of paths and bodies; 0: as the model is best sampled."""
     places: SubgoalSource = "none"
-    """Sub-goals that no file gives: sampled from where the animal has been, or the behaviour model's goals
-    one after the other; none: a take of the behaviour model."""
+    """Sub-goals that no file gives: sampled from where the animal has been, or the behavior model's goals
+    one after the other; none: a take of the behavior model."""
     place_count: int = 20
     """How many of them."""
     optimise: bool = True
-    """Make the motion physically plausible; a take of the behaviour model only where `--longterm` and
+    """Make the motion physically plausible; a take of the behavior model only where `--longterm` and
     `--reconstruction` are given."""
     pictures_per_s: float = 10.0
     """Pictures per second of long-term motion; 0: none."""

@@ -11,7 +11,7 @@ class Inputs:
     behavior_data: Path | None = None
     """Trajectories and scenes."""
     behavior: Path | None = None
-    """The behaviour model."""
+    """The behavior model."""
     simulator: Path | None = None
     """Meshes of the live view."""
     longterm: Path | None = None

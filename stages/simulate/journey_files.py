@@ -26,7 +26,7 @@ FOCAL = 0.9
 SMOOTHED_FRAMES, TURNED_FRAMES = 12.0, 20.0
 """Standard deviations of the Gaussians that smooth the camera's target and its direction, frames."""
 ASIDE_M, ABOVE_M, OFF_CENTER_M = 1.3, [0.0, 1.4, 0.05], 0.3
-"""Camera offset from the animal; nearer to the room's centre than the last, the horizontal offset shrinks."""
+"""Camera offset from the animal; nearer to the room's center than the last, the horizontal offset shrinks."""
 AMBIENT, DIFFUSE = 0.45, 0.55
 """Ambient and diffuse shading of the animal."""
 FITTED_POSES = 60
@@ -60,7 +60,7 @@ def write_journey(folder: Path, journey: Journey, body: SkinnedBody) -> None:
 
 
 def write_metrics(folder: Path, before: Plausibility, after: Plausibility, **about: object) -> None:
-    """Write `take.json`: a description of the take, and its plausibility before and after optimisation."""
+    """Write `take.json`: a description of the take, and its plausibility before and after optimization."""
     metrics = {
         when: {name: finite(value) for name, value in vars(each).items()}
         for when, each in (("before", before), ("after", after))
@@ -94,7 +94,7 @@ def write_frames(
 def follow_camera(
     roots_world: Float[np.ndarray, "frame 3"], centre: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Return poses of a smoothly moving camera above the animal, on the side of the room's centre."""
+    """Return poses of a smoothly moving camera above the animal, on the side of the room's center."""
     target = np.asarray(gaussian_filter1d(roots_world, SMOOTHED_FRAMES, axis=0, mode="nearest"))
     away = (centre - target) * [1.0, 0.0, 1.0]
     away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), OFF_CENTER_M)

@@ -25,7 +25,7 @@ from pipeline.geometry.meshes import Mesh
 from stages.simulate.rollout import Take, take_of
 
 PERSON, GOAL, FUR = (47, 111, 159), (200, 114, 43), (150, 120, 90)
-"""Colours; the last of an animal that has none."""
+"""Colors; the last of an animal that has none."""
 PERSON_M, GOAL_M = 0.12, 0.06
 """Radii of the balls that show the person and the goal."""
 SLIDER_STEP = 0.05

@@ -10,7 +10,7 @@ from pipeline.behavior.trajectories import RATE_HZ
 from stages.simulate.config import ObserverScript
 
 Observer = Callable[[float, Float[np.ndarray, "3"]], Float[np.ndarray, "3"]]
-"""From time in seconds and the animal's position to the observer's position, world metres"""
+"""From time in seconds and the animal's position to the observer's position, world meters"""
 ROUND_S, TOWARDS_S = 8.0, 4.0
 """Duration of approach and return, and of the approach alone."""
 UNKNOWN_OBSERVER_M = 100.0
@@ -31,7 +31,7 @@ def scripted(script: ObserverScript, *, center: Float[np.ndarray, "3"], speed_m_
 
 
 class ApproachingObserver:
-    """Walks up to the animal for 4 s, goes back to the centre for 4 s."""
+    """Walks up to the animal for 4 s, goes back to the center for 4 s."""
 
     def __init__(self, center: Float[np.ndarray, "3"], speed_m_s: float):
         self.center = np.asarray(center, float)

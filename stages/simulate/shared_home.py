@@ -20,7 +20,7 @@ from stages.simulate.observers import Observer
 from stages.simulate.rollout import Take, take_of, write_take
 
 Companions = Float[np.ndarray, "companion past_frame 4"] | None
-"""Past world positions (metres) and kinds of the other animals; None if there are none"""
+"""Past world positions (meters) and kinds of the other animals; None if there are none"""
 PERSON_RGB = (47, 111, 159)
 COLORS = [(200, 114, 43), (76, 128, 103), (140, 86, 160), (190, 60, 70), (90, 90, 90)] * 3
 """Of animals in order."""
@@ -50,7 +50,7 @@ class HomeAnimal(Protocol):
 
     @property
     def past_world(self) -> Float[np.ndarray, "past_frame 3"]:
-        """Return where it has been, now last; metres."""
+        """Return where it has been, now last; meters."""
         ...
 
 
@@ -82,7 +82,7 @@ class ReplayedAnimal:
 
     @property
     def past_world(self) -> Float[np.ndarray, "past_frame 3"]:
-        """Return where it has been, now last; metres."""
+        """Return where it has been, now last; meters."""
         past = np.arange(self.now - self.data.past + 1, self.now + 1) % len(self.frames)
         return self.track.world_from_agent[self.frames[past], :3, 3]
 
@@ -119,7 +119,7 @@ class SharedHome:
         }
 
     def step(self, observer: Float[np.ndarray, "3"]) -> dict[str, SimulatorState]:
-        """Let 0.1 s pass for all with the person at this position (metres, world)."""
+        """Let 0.1 s pass for all with the person at this position (meters, world)."""
         past = {name: animal.past_world for name, animal in self.animals.items()}
         return {name: each.step(observer, _companions_of(name, past)) for name, each in self.animals.items()}
 
@@ -146,7 +146,7 @@ def _nearest_window(
     placed: Float[np.ndarray, "animal 3"],
 ) -> Int[np.ndarray, "1"]:
     """Return the training window nearest in time to another animal's, preferably of the same recording, in
-    which the animal does not overlap those ``placed`` (metres, world).
+    which the animal does not overlap those ``placed`` (meters, world).
     """
     (track, start), known = recorded_at(leading, window), data.indices(TRAIN)
     same, time_s = leading.videos[int(leading.video[window[0]])], track.timestamp_s[start]
@@ -179,7 +179,7 @@ def rollout_of_all(home: SharedHome, observer: Observer, *, seconds: float, seed
 
 
 def write_takes(folder: Path, takes: Mapping[str, Take], scene: Mesh) -> None:
-    """Write each animal's take into a folder of its name, and `from_above.jpg`: the room with the labelled
+    """Write each animal's take into a folder of its name, and `from_above.jpg`: the room with the labeled
     tracks of all animals and of the person (blue).
     """
     first = next(iter(takes.values()))

@@ -1,7 +1,7 @@
 """Sub-goals as a user writes them: a TOML file of `[[subgoal]]` tables.
 
 [[subgoal]]
-position = [1.2, 0.8]       # x, z on the floor, or x, y, z of the body's centre (on furniture); metres, world
+position = [1.2, 0.8]       # x, z on the floor, or x, y, z of the body's center (on furniture); meters, world
 heading_deg = 90             # optional: about +y, 0 looks along +z, 90 along +x
 time_s = 12.0                # optional: when to be there; not before the animal can be
 
@@ -27,7 +27,7 @@ class SubgoalEntry:
     """One `[[subgoal]]`."""
 
     position: tuple[float, ...]
-    """x and z on the floor, or x, y, z of the body's centre; metres, world."""
+    """x and z on the floor, or x, y, z of the body's center; meters, world."""
     heading_deg: float | None = None
     """Where the head points: about +y, 0 along +z, 90 along +x; None: as it comes."""
     time_s: float | None = None
@@ -46,7 +46,7 @@ def read(path: Path) -> list[Subgoal]:
     for number, each in enumerate(written, 1):
         where = f"{path}: subgoal {number}"
         if len(each.position) not in (2, 3) or not np.isfinite(each.position).all():
-            remedy = "give [x, z] or [x, y, z] in metres"
+            remedy = "give [x, z] or [x, y, z] in meters"
             raise InputError("SIM-002", f"{each.position} is no position", where, remedy)
         if not np.isfinite(each.heading_deg or 0.0) or not (each.time_s or 0.0) <= LONGEST_S:
             what = f"heading_deg or time_s is no number up to {LONGEST_S:g} s"

@@ -55,7 +55,7 @@ class FinishedTake:
 
 
 def of_behavior(inputs: Inputs, c: Config, device: str) -> FinishedTake:
-    """Simulate the animal with a scripted observer; optimise the take if configured and possible."""
+    """Simulate the animal with a scripted observer; optimize the take if configured and possible."""
     data = BehaviorData.load(_required(inputs, "behavior_data"))
     if inputs.home is not None:
         return _elsewhere(inputs, inputs.home, data, c, device)
@@ -213,7 +213,7 @@ def _simulator(
 
 
 def _observer(simulator: Simulator, c: Config) -> Observer:
-    """Return the scripted observer, centred where the recording's observer was, else beside the animal."""
+    """Return the scripted observer, centered where the recording's observer was, else beside the animal."""
     begin = simulator.reset(c.seed).world_from_agent[:3, 3]
     return _recorded_person(simulator.recording, begin, c)
 

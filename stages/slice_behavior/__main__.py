@@ -1,4 +1,4 @@
-"""Turn reconstructed motion into trajectories on an even grid and windows for the behaviour model.
+"""Turn reconstructed motion into trajectories on an even grid and windows for the behavior model.
 
 A window is past (0.8 s) and future (5.6 s), all of it valid; the split is by recording. Motion comes from
 the reconstruction or from tables. Writes also the scenes' feature volumes, with the voxels in which the

@@ -1,4 +1,4 @@
-"""What the quality page of the behaviour data shows: visits, speeds and distances, windows per recording."""
+"""What the quality page of the behavior data shows: visits, speeds and distances, windows per recording."""
 
 from collections.abc import Collection
 

@@ -1,7 +1,7 @@
 """A species as data: bones at rest, flesh around them, a coat and a gait.
 
 `skeleton` mirrors the limbs of the left side. The 25 bones have the same names and order in all species:
-fore limbs are wings where `Gait.wings` says so. Frame: `agent`, metres.
+fore limbs are wings where `Gait.wings` says so. Frame: `agent`, meters.
 """
 
 from collections.abc import Callable, Iterable
@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 Point = tuple[float, float, float]
 BoneRow = tuple[str, str, Point, Point, tuple[float, float]]
-"""name, parent, head, tail and the radii at both, metres"""
+"""name, parent, head, tail and the radii at both, meters"""
 Coat = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 """Linear RGB albedo and strength of the fine pattern ``[vertex 4]`` of vertices ``[vertex 3]``."""
 SHADED = ("pelvis", "spine", "loin", "chest", "head", "left hand", "right hand", "left toes", "right toes")
@@ -39,7 +39,7 @@ class Flesh:
     tail: Point
     radius: tuple[float, float]
     softness: float
-    """Width of the smooth union with other parts, metres."""
+    """Width of the smooth union with other parts, meters."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Gait:
     """
 
     stand_m: float = 0.235
-    """Height of the body's centre above the ground when it stands at rest; likewise sitting and lying."""
+    """Height of the body's center above the ground when it stands at rest; likewise sitting and lying."""
     sit_m: float = 0.172
     lie_m: float = 0.105
     sit_pitch: float = -0.56
@@ -132,7 +132,7 @@ def skeleton(trunk: Iterable[BoneRow], left: Iterable[BoneRow]) -> tuple[Bone, .
 
 
 def tail_rows(start: Point, step: Point, droop: float, radius: Point) -> list[BoneRow]:
-    """Return five bones of a tail: each ``step`` long, turning down by ``droop`` metres more than the last.
+    """Return five bones of a tail: each ``step`` long, turning down by ``droop`` meters more than the last.
 
     ``radius`` is that at the root, at the end of the first bone, and how much it falls per bone.
     """

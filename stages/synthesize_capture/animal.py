@@ -1,8 +1,8 @@
 """The animals: smooth watertight skinned surfaces with 25 bones and patterned fur, of each species.
 
 `grow` blends rounded cones along the bones into a signed distance, extracts one surface by marching cubes,
-and gives each vertex up to four bones. Frame: `agent`, origin at the body's centre, +y up, +z towards the
-head, +x to its left, metres. At rest every bone's axes are the agent's; only its origin differs.
+and gives each vertex up to four bones. Frame: `agent`, origin at the body's center, +y up, +z towards the
+head, +x to its left, meters. At rest every bone's axes are the agent's; only its origin differs.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ BONES, HEADS = CAT.bones, CAT.heads
 INDEX = {bone.name: index for index, bone in enumerate(BONES)}
 """Index of a bone by name, the same in every species."""
 SOFTNESS = [0.03] * 6 + [0.012] * 5 + [0.024, 0.012, 0.008, 0.03, 0.014, 0.008, 0.008] * 2
-"""Width of each bone's smooth union with those before it, metres."""
+"""Width of each bone's smooth union with those before it, meters."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ TRUNK: list[BoneRow] = [
     *tail_rows((0.0, 0.022, -0.20), (0.0, 0.0, -0.056), 0.006, (0.021, 0.0195, 0.0016)),
 ]
 F, H = 0.045, 0.045 * 1.1
-"""Lateral offset of fore and hind limbs, metres."""
+"""Lateral offset of fore and hind limbs, meters."""
 LEFT: list[BoneRow] = [
     ("upper arm", "chest", (F, -0.005, 0.115), (F * 1.15, -0.103, 0.075), (0.042, 0.027)),
     ("forearm", "upper arm", (F * 1.15, -0.103, 0.075), (F, -0.203, 0.112), (0.025, 0.018)),

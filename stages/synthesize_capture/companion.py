@@ -26,7 +26,7 @@ LASTING_S: dict[Mode, tuple[float, float]] = {
 }
 PACE_M_S: dict[Mode, float] = {"own": 0.7, "follow": 0.9, "play": 1.5, "avoid": 1.2}
 REACH_M: dict[Mode, float] = {"follow": 0.95, "play": 0.75}
-"""Distance to which it approaches the other, centre to centre."""
+"""Distance to which it approaches the other, center to center."""
 PLANNED_S = 0.4
 """Interval of replanning."""
 APART_M, PUSH_M_S = 0.62, 1.2

@@ -11,7 +11,7 @@ class Config:
     """What to film."""
 
     seed: int = 0
-    """Decides everything: room, coat, light, behaviour, noise."""
+    """Decides everything: room, coat, light, behavior, noise."""
     session_count: int = 6
     """Recordings of the animal's life; the last is the test video."""
     session_s: float = 60.0

@@ -1,7 +1,7 @@
 """Other homes than the one that is filmed: the same kinds of furniture along other walls, in another order.
 
-`furnish_otherwise` draws a home until everything stands free and the animal can reach all of its favourite
-places. Only `lives` needs them: behaviour must be learned in some homes and judged in one that it has never
+`furnish_otherwise` draws a home until everything stands free and the animal can reach all of its favorite
+places. Only `lives` needs them: behavior must be learned in some homes and judged in one that it has never
 seen.
 """
 
@@ -146,7 +146,7 @@ def _places(standing: tuple[Standing, ...]) -> tuple[Place, ...]:
 
 
 def _livable(room: Room) -> bool:
-    """Return whether the free floor is connected for animal and person and reaches all favourite places."""
+    """Return whether the free floor is connected for animal and person and reaches all favorite places."""
     for size_m in (ANIMAL_M, PERSON_M):
         floor = floor_for(room.obstacles(), size_m)
         parts, count = cast("tuple[np.ndarray, int]", label(floor.free))

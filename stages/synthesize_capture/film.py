@@ -61,7 +61,7 @@ class Stage:
         return found
 
     def mesh(self, bodies: Sequence[Body]) -> tuple[Float[np.ndarray, "joined 3"], Int[np.ndarray, "face 3"]]:
-        """Return vertices (world, metres) and faces of the room, then of the animals."""
+        """Return vertices (world, meters) and faces of the room, then of the animals."""
         vertices = np.concatenate([self.room.vertices, *(body.vertices_world for body in bodies)])
         return vertices, np.concatenate([self.room.faces, *_faces(bodies, start=len(self.room.vertices))])
 
@@ -131,7 +131,7 @@ def _faces(bodies: Sequence[Body], start: int) -> Iterator[Int[np.ndarray, "face
 def true_flow(
     stage: Stage, first: int, second: int, *, stride: int = 4
 ) -> Float[np.ndarray, "rows columns 2"]:
-    """Return flow between two frames of the upright picture, pixels, at the centres of ``stride``-wide cells.
+    """Return flow between two frames of the upright picture, pixels, at the centers of ``stride``-wide cells.
 
     NaN where the surface is hidden or out of view in frame ``second``.
     """

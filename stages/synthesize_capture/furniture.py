@@ -1,4 +1,4 @@
-"""Pieces of furniture and loose things, each about its own origin: floor at y = 0, back to -z, metres."""
+"""Pieces of furniture and loose things, each about its own origin: floor at y = 0, back to -z, meters."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -2,7 +2,7 @@
 
 `footfalls` plants each foot for the part of the stride that it carries weight: while planted it does not
 move in the world. `poses` then places the body, reaches the feet with the legs, and turns head and tail.
-Everything is a closed function of time, vectorised over the queried times.
+Everything is a closed function of time, vectorized over the queried times.
 """
 
 from dataclasses import dataclass, replace
@@ -144,7 +144,7 @@ def footfalls(
 
 
 def _rhythm(course: AnimalCourse, gait: Gait) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return stride phase, duty factor, phase offset per foot, and lift of the feet (metres)."""
+    """Return stride phase, duty factor, phase offset per foot, and lift of the feet (meters)."""
     step = float(course.timestamp_s[1] - course.timestamp_s[0])
     speed = gaussian_filter1d(np.where(course.airborne > 0.5, 0.0, course.speed()), 0.08 / step)
     turn = gaussian_filter1d(np.abs(np.gradient(course.yaw, step)), 0.08 / step)

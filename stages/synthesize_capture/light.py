@@ -24,7 +24,7 @@ Hour = Literal["day", "evening"]
 
 @dataclass(frozen=True)
 class Light:
-    """One session's light; colours are linear RGB."""
+    """One session's light; colors are linear RGB."""
 
     window: Rgb
     lamp: Rgb

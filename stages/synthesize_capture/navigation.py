@@ -34,11 +34,11 @@ class Floor:
         return bool(self.free[self.cell(point)])
 
     def centers(self) -> Float[np.ndarray, "cell 2"]:
-        """Return the centres of all free cells."""
+        """Return the centers of all free cells."""
         return (np.argwhere(self.free) + 0.5) * CELL_M - [WIDTH_M / 2, DEPTH_M / 2]
 
     def nearest(self, point: Ground) -> Ground:
-        """Return the point itself if free, else the centre of the nearest free cell."""
+        """Return the point itself if free, else the center of the nearest free cell."""
         if self.is_free(point):
             return np.asarray(point, float)
         centers = self.centers()

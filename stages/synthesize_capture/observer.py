@@ -1,8 +1,8 @@
 """The person with the phone: follows the animal, walks up to it, stands, steps back, strolls.
 
 A small random state machine. Who films comes up every 8 to 10 s so that what the animal does about people can
-be learnt from minutes of video, mostly from where the animal came to; who lives there leaves it alone for
-longer, goes off again, and comes up from across the room. Positions (x, z) on the floor in metres, yaw about
+be learned from minutes of video, mostly from where the animal came to; who lives there leaves it alone for
+longer, goes off again, and comes up from across the room. Positions (x, z) on the floor in meters, yaw about
 +y.
 """
 

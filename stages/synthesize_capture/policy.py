@@ -1,8 +1,8 @@
 """What the animal decides: a goal-driven cat that reacts to the person with the phone.
 
 It runs away when someone walks up to it, comes near when someone stands still or leaves, and
-otherwise visits its favourite places, sits, lies and looks. Someone far away changes nothing.
-Positions in metres, world axes; heights are those of what it stands on.
+otherwise visits its favorite places, sits, lies and looks. Someone far away changes nothing.
+Positions in meters, world axes; heights are those of what it stands on.
 """
 
 from dataclasses import dataclass
@@ -122,7 +122,7 @@ class Policy:
             self._visit()
 
     def _flee(self, seen: SeenWalker) -> None:
-        """Run to a free spot straight away from the person, about two metres off, not past it."""
+        """Run to a free spot straight away from the person, about two meters off, not past it."""
         centers = self.walker.floor.centers()
         off = centers - self.walker.position
         length = np.linalg.norm(off, axis=-1)
@@ -153,7 +153,7 @@ class Policy:
         return None
 
     def _approach(self, seen: SeenWalker) -> None:
-        """Walk up to about a metre from the person, a little to one side."""
+        """Walk up to about a meter from the person, a little to one side."""
         from_person = self.walker.position - seen.position
         angle = np.arctan2(from_person[0], from_person[1]) + self.rng.normal(0, 0.15)
         goal = seen.position + self.rng.uniform(0.9, 1.05) * np.array([np.sin(angle), np.cos(angle)])
@@ -164,7 +164,7 @@ class Policy:
         self.rest_s = self.rng.uniform(4.0, 7.0)
 
     def _visit(self) -> None:
-        """Go to a favourite place, or to a random one."""
+        """Go to a favorite place, or to a random one."""
         away = np.array([np.linalg.norm(self.walker.position - place.entry) for place in self.places])
         weight = np.array([0.5 if place is self.perch else 1.0 for place in self.places]) * np.exp(
             -0.25 * away

@@ -23,7 +23,7 @@ from stages.synthesize_capture.truth import TruthWriter, write_flow
 
 FLOW_PAIRS = 40
 THUMBNAILS, OUTLINE = 6, (255, 0, 255)
-"""Frames of a recording on the quality page, and the colour around its animals."""
+"""Frames of a recording on the quality page, and the color around its animals."""
 
 
 @dataclass(frozen=True)

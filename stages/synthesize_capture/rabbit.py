@@ -31,7 +31,7 @@ BELLY = Flesh((0, -0.03, -0.08), (0, -0.03, 0.05), (0.06, 0.05), 0.03)
 def _harlequin(
     vertices: Float[np.ndarray, "vertex 3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "vertex 4"]:
-    """Draw a fawn coat with grey-brown patches, a white collar, blaze, belly and feet, and dark ears."""
+    """Draw a fawn coat with gray-brown patches, a white collar, blaze, belly and feet, and dark ears."""
     x, y, z = vertices.T
     phase = rng.uniform(0, 2 * np.pi, 4)
     fawn, grey, white = np.array([[0.42, 0.26, 0.13], [0.09, 0.075, 0.065], [0.76, 0.73, 0.69]])

@@ -31,7 +31,7 @@ def rasterize(
     height: int,
     width: int,
 ) -> RasterView:
-    """Find the nearest face at each pixel centre, without back-face culling."""
+    """Find the nearest face at each pixel center, without back-face culling."""
     face = np.full((height, width), -1, np.int32)
     inverse_depth = np.zeros((height, width), np.float32)
     inverse_corners = np.zeros((len(faces), 3, 3), np.float64)
@@ -99,7 +99,7 @@ def _invert(a, b, c, out):
 
 @njit(cache=True, error_model="numpy")
 def depth_through(face_of, inverse_depth, inverse_corners, focal_center, height, width):
-    """Return exact z-depth ``[height width]`` (0 = nothing) at the view's pixel centres in another size."""
+    """Return exact z-depth ``[height width]`` (0 = nothing) at the view's pixel centers in another size."""
     depth = np.zeros((height, width), np.float32)
     fx, fy, cx, cy = focal_center
     rows, columns = face_of.shape

@@ -58,7 +58,7 @@ class Writer:
         depth: Float[np.ndarray, "rows columns"],
         confidence: UInt8[np.ndarray, "rows columns"],
     ) -> None:
-        """Append one frame: RGB, depth in metres (float32), confidence 0 to 2."""
+        """Append one frame: RGB, depth in meters (float32), confidence 0 to 2."""
         bgr, quality = cv2.cvtColor(color, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 92]
         done, jpeg = cv2.imencode(".jpg", bgr, quality)
         assert done, "JPEG encoding failed"

@@ -1,8 +1,8 @@
-"""The home: one furnished living room as sheets, footprints, favourite places and lights.
+"""The home: one furnished living room as sheets, footprints, favorite places and lights.
 
 `furnish` builds it from a generator: walls with faint plaster, a repeating plank floor, and strong features
 only where homes have them. `Room.arranged` puts the movable things somewhere else for another session. Frame:
-the world of the truth, +y up, floor at y = 0, metres; x along the long side, z along the short one. The
+the world of the truth, +y up, floor at y = 0, meters; x along the long side, z along the short one. The
 pieces of `furniture.py` stand about their own origins with their backs to -z; `furnish` puts them up.
 """
 
@@ -49,7 +49,7 @@ class Standing:
     def axis_distance(
         self, x: Float[np.ndarray, "*batch"], z: Float[np.ndarray, "*batch"]
     ) -> Float[np.ndarray, "*batch 2"]:
-        """Return how far floor points are from its origin along its own axes, metres."""
+        """Return how far floor points are from its origin along its own axes, meters."""
         cosine, sine, x, z = np.cos(self.yaw), np.sin(self.yaw), x - self.x, z - self.z
         return np.abs(np.stack([cosine * x - sine * z, sine * x + cosine * z], axis=-1))
 
@@ -115,7 +115,7 @@ def placed(
 
 
 def furnish(rng: np.random.Generator) -> Room:
-    """Build the room with its usual arrangement; the generator gives colours, prints and small offsets."""
+    """Build the room with its usual arrangement; the generator gives colors, prints and small offsets."""
     stands = {
         "sofa": (-0.75, -Z + 0.5, 0.0),
         "shelf": (-X + 0.18, 0.65, np.pi / 2),
@@ -149,7 +149,7 @@ HOMES = (
 
 
 def _places(stands: dict[str, tuple[float, float, float]]) -> tuple[Place, ...]:
-    """Return the animal's favourite places, from where the furniture stands."""
+    """Return the animal's favorite places, from where the furniture stands."""
     sofa, tree, bowls, shelf = (stands[name] for name in ("sofa", "cat tree", "bowls", "shelf"))
     return (
         Place("sofa", (sofa[0] + 0.35, 0.44, sofa[1] + 0.12), 0.0, (sofa[0] + 0.55, sofa[1] + 0.86)),

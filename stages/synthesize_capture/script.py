@@ -24,7 +24,7 @@ from stages.synthesize_capture.visitor import PERSON
 
 @dataclass(frozen=True)
 class PhoneFormat:
-    """What the phone stores; a LiDAR phone's depth, and its colour small enough to render on two cores."""
+    """What the phone stores; a LiDAR phone's depth, and its color small enough to render on two cores."""
 
     fps: float = 15.0
     """Frames per second."""
@@ -51,7 +51,7 @@ class Script:
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     """Stored canvas, OpenCV axes."""
     intrinsics: Float[np.ndarray, "frame 4"]
-    """fx, fy, cx, cy in stored colour pixels."""
+    """fx, fy, cx, cy in stored color pixels."""
     odometry_from_camera: Float[np.ndarray, "frame 4 4"]
     gain: Float[np.ndarray, "frame"]
     motions: tuple[AnimalMotion | None, AnimalMotion | None, AnimalMotion | None]

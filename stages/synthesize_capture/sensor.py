@@ -53,7 +53,7 @@ def timestamps(rng: np.random.Generator, duration_s: float, fps: float) -> Float
 def lens(
     rng: np.random.Generator, timestamp_s: Float[np.ndarray, "frame"], width: int, height: int
 ) -> Float[np.ndarray, "frame 4"]:
-    """Return fx, fy, cx, cy per frame: about 54 by 68 degrees, with a stabiliser and a focus that wander."""
+    """Return fx, fy, cx, cy per frame: about 54 by 68 degrees, with a stabilizer and a focus that wander."""
     focal = 235.0 / 240.0 * width * rng.uniform(0.985, 1.015)
     center = np.array([width, height]) / 2 + rng.normal(0, 0.004 * width, 2)
     wander = [_slow(rng, timestamp_s, 1.2) for _ in range(3)]
@@ -69,7 +69,7 @@ def odometry(
 ) -> Float[np.ndarray, "frame 4 4"]:
     """Return the phone's own poses: gravity-aligned, a new origin and heading, drifting.
 
-    Steps between frames are chained with a slowly wrong heading (about a degree a minute), half a per cent
+    Steps between frames are chained with a slowly wrong heading (about a degree a minute), half a percent
     of scale and a small tilt.
     """
     count = len(timestamp_s)
@@ -110,9 +110,9 @@ def picture(
 def lidar(
     depth: Float[np.ndarray, "height width"], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "height width"], UInt8[np.ndarray, "height width"]]:
-    """Return LiDAR-like depth (metres, float32; 0 or NaN unknown) and confidence 0 low, 1 medium, 2 high.
+    """Return LiDAR-like depth (meters, float32; 0 or NaN unknown) and confidence 0 low, 1 medium, 2 high.
 
-    Range noise of half a per cent plus 4 mm with a spatial grain, outlines that wander by a pixel and smear
+    Range noise of half a percent plus 4 mm with a spatial grain, outlines that wander by a pixel and smear
     into mixed pixels, holes along some edges, nothing past 5 m.
     """
     height, width = depth.shape
@@ -145,7 +145,7 @@ def motion_blur_px(
     focal_px: float,
     shutter_s: float,
 ) -> Float[np.ndarray, "frame 2"]:
-    """Return how far (x, y) the turning camera moves the picture's centre while the shutter is open."""
+    """Return how far (x, y) the turning camera moves the picture's center while the shutter is open."""
     turn = rigid.vector_from_rotation(
         np.swapaxes(world_from_camera[:-1, :3, :3], -1, -2) @ world_from_camera[1:, :3, :3]
     )

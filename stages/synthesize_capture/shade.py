@@ -65,7 +65,7 @@ class Coat(NamedTuple):
     pattern: Float[np.ndarray, "vertex 4"]
     """Base albedo (linear RGB) and how strongly the fine fur pattern shows."""
     shadow: Float[np.ndarray, "ball 4"]
-    """Camera-frame centre and radius."""
+    """Camera-frame center and radius."""
 
 
 def shade(
@@ -163,7 +163,7 @@ def _sample(face, a, b, c, x, y, z, fx, sheet, room, pixel):
 
 @njit(cache=True, error_model="numpy")
 def _fur(corner, a, b, c, coat, footprint, pixel):
-    """Blend base colour and light, and add the fine fur that the footprint (metres a pixel) can resolve."""
+    """Blend base color and light, and add the fine fur that the footprint (meters a pixel) can resolve."""
     rest, light, pattern = coat.rest, coat.light, coat.pattern
     a, b, c = max(a, 0.0), max(b, 0.0), max(c, 0.0)
     total = a + b + c

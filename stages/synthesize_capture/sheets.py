@@ -2,7 +2,7 @@
 
 A sheet's grid runs like its picture: columns along u (right), rows along v (down), seen from its front.
 Walls, box sides, cylinders, cushions, curtains and leaves are all sheets, so one baker and one
-renderer serve everything. Frames: object or world axes, +y up, metres.
+renderer serve everything. Frames: object or world axes, +y up, meters.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,7 +14,7 @@ from jaxtyping import Float, Int, UInt8
 from pipeline.geometry import rigid
 
 Paint = Callable[[float, float], UInt8[np.ndarray, "height width 3"]]
-"""Draws the picture of a sheet of the given width and height in metres (sRGB albedo)."""
+"""Draws the picture of a sheet of the given width and height in meters (sRGB albedo)."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def box(center, size, paint: Paint | dict[str, Paint], *, skip: str = "") -> lis
 
 
 def cushion(center, size, paint: Paint, *, bulge: float, skip: str = "-y") -> list[Sheet]:
-    """Make a box whose faces bulge softly outwards by ``bulge`` metres."""
+    """Make a box whose faces bulge softly outwards by ``bulge`` meters."""
     soft = []
     for sheet in box(center, size, paint, skip=skip):
         corner = sheet.points[0, 0]
@@ -101,7 +101,7 @@ def cylinder(
 
 
 def curtain(corner, right, height: float, paint: Paint, *, depth: float, folds: int) -> Sheet:
-    """Make a hanging cloth from its top left corner along ``right``, in waves of ``depth`` metres."""
+    """Make a hanging cloth from its top left corner along ``right``, in waves of ``depth`` meters."""
     corner, right = np.asarray(corner, float), np.asarray(right, float)
     u = np.linspace(0, 1, folds * 4 + 1)
     out = np.cross(right, [0, 1.0, 0]) / np.linalg.norm(right)
@@ -129,7 +129,7 @@ def triangles(
 ]:
     """Join sheets to one mesh.
 
-    Returns vertices (metres), faces (counter-clockwise from the front), picture coordinates in [0, 1], and
+    Returns vertices (meters), faces (counter-clockwise from the front), picture coordinates in [0, 1], and
     each face's sheet.
     """
     vertices, faces, coordinates, owner, start = [], [], [], [], 0

@@ -1,6 +1,6 @@
 """Paints: procedural pictures for the sheets of a home.
 
-Every maker takes a generator and colours and returns a `Paint`, which draws a picture for a sheet of a
+Every maker takes a generator and colors and returns a `Paint`, which draws a picture for a sheet of a
 given size at `TEXEL_M` (fine prints at `PRINT_TEXEL_M`). Plain surfaces carry only faint structure,
 floors and fabrics repeat, and strong features stand where homes have them: posters, books, rugs, labels.
 """
@@ -45,7 +45,7 @@ def _maker(texel_m: float):
 def plain(
     size: Size, rng: np.random.Generator, color: Color, *, grain: float = 1.5, clouds: float = 2.5
 ) -> Picture:
-    """Paint plaster or lacquer: one colour with faint grain and broad clouds, deviations of 255 levels."""
+    """Paint plaster or lacquer: one color with faint grain and broad clouds, deviations of 255 levels."""
     field = (
         grain * _noise(rng, size, 0.0)
         + 0.8 * grain * _noise(rng, size, 0.02 / TEXEL_M)

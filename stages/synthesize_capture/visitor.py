@@ -35,7 +35,7 @@ APART_M = 1.0
 def _dressed(
     vertices: Float[np.ndarray, "vertex 3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "vertex 4"]:
-    """Draw trousers, a striped shirt, shoes, skin and hair in random colours."""
+    """Draw trousers, a striped shirt, shoes, skin and hair in random colors."""
     _, y, z = vertices.T
     trousers, shirt, stripe = (0.02 + 0.5 * rng.random(3) ** 2 for _ in range(3))
     skin, hair = np.array([0.5, 0.28, 0.19]) * rng.uniform(0.4, 1.2), np.array([0.09, 0.05, 0.03])

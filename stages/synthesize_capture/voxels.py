@@ -53,7 +53,7 @@ def _taken(
 ) -> np.ndarray:
     """Return a thing's voxels: surfaces above its clearance, and in its block all below the topmost one."""
     block = (thing.axis_distance(centres[..., 0], centres[..., 2]) < np.array(thing.piece.size) / 2).all(-1)
-    if thing.name == "rug":  # colours the floor
+    if thing.name == "rug":  # colors the floor
         return block & (np.abs(centres[..., 1] + VOXEL_M / 2) < VOXEL_M / 2)
     if thing.name == "window":  # radiator and curtains hang on the wall
         return block & (centres[..., 1] > 0) & (centres[..., 1] < thing.piece.top)

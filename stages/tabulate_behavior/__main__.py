@@ -1,4 +1,4 @@
-"""Make the tables of the behaviour methods: every method with several seeds, judged on the same windows.
+"""Make the tables of the behavior methods: every method with several seeds, judged on the same windows.
 
 Writes flat figures (`tables.json`), the tables as text, and the exact windows. Intervals of 95 % are drawn
 over training seeds and over episodes of the test recordings.

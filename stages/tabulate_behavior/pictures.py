@@ -13,7 +13,7 @@ PLATEAU_SLOPE = 0.05
 
 
 def pictures(curves: Mapping[str, Mapping[str, Float[np.ndarray, "seed step"]]]) -> list[Picture]:
-    """Draw the losses of all trials: one panel per network, one colour per method, one line per seed."""
+    """Draw the losses of all trials: one panel per network, one color per method, one line per seed."""
     caption = (
         "Losses of all trials, smoothed over a fiftieth; the Gaussian's are likelihoods and lie elsewhere."
     )

@@ -10,7 +10,7 @@ from stages.tabulate_behavior.reading import MethodScores
 SAMPLES = 16
 """Samples per window (K), as many as `score_behavior` draws."""
 FIT_STRIDE = 4
-"""Every how many training windows the baselines are fitted to; neighbours are alike."""
+"""Every how many training windows the baselines are fitted to; neighbors are alike."""
 WINDOWS_AT_ONCE = 64
 """Bounds the memory of sampled bones."""
 

@@ -1,8 +1,8 @@
 """Make the tables of long-term motion (Tables 1, 2 and 4 of the paper), every variant with and without
-optimisation.
+optimization.
 
 On held-out sessions and an unseen home of the built-in world, where the truth is known, and on the
-reconstructed test recording; then minutes through many sub-goals, and samples of the behaviour model before
+reconstructed test recording; then minutes through many sub-goals, and samples of the behavior model before
 and after.
 """
 

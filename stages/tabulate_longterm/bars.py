@@ -9,25 +9,25 @@ from stages.tabulate_longterm.methods import WITHOUT_SCENE
 BASELINES = ("base", "route_cvae", "nearest")
 OPTIMIZED, SAMPLES, MINUTES = "longterm/ours_opt", "longterm_samples", "longterm_minutes"
 BARS: tuple[tuple[str, str | tuple[str, str], str, float, Literal["lower", "higher"]], ...] = (
-    ("non-collision, optimised", f"{OPTIMIZED}/non_collision", "share", 0.995, "higher"),
-    ("contact, optimised", f"{OPTIMIZED}/contact", "share", 0.97, "higher"),
-    ("foot slide, optimised", f"{OPTIMIZED}/slide_m_s", "m/s", 0.01, "lower"),
+    ("non-collision, optimized", f"{OPTIMIZED}/non_collision", "share", 0.995, "higher"),
+    ("contact, optimized", f"{OPTIMIZED}/contact", "share", 0.97, "higher"),
+    ("foot slide, optimized", f"{OPTIMIZED}/slide_m_s", "m/s", 0.01, "lower"),
     (
-        "MPVPE, optimised against not",
+        "MPVPE, optimized against not",
         (f"{OPTIMIZED}/mpvpe_mm", "longterm/ours_same/mpvpe_mm"),
         "",
         1.2,
         "lower",
     ),
     (
-        "distance of the ends from the given bodies, optimised",
+        "distance of the ends from the given bodies, optimized",
         f"{OPTIMIZED}/end_v2v_share",
         "of body length",
         0.006,
         "lower",
     ),
     (
-        "neighbour v2v where two motions join, beyond their own, optimised",
+        "neighbor v2v where two motions join, beyond their own, optimized",
         f"{OPTIMIZED}/seam_share",
         "of body length",
         0.006,

@@ -56,7 +56,7 @@ def figures(prefix: str, source: MotionSource, config: Config) -> dict[str, floa
         true = [known[index] for index in some]
         done[f"{name}_opt"] = scores.scores(made[name][some], clips[some], true, model, config.optimization)
         done[f"{name}_same"] = plain[name][some]
-        progress.log(f"{prefix}: {name}, optimised")
+        progress.log(f"{prefix}: {name}, optimized")
     episode = episodes(cuts.start, cuts.stretch, EPISODE_FRAMES)
     unseen = np.array([source.split.kinds[stretch] == "unseen" for stretch in cuts.stretch])
     found, every = {}, np.ones(len(clips), bool)
@@ -71,7 +71,7 @@ def figures(prefix: str, source: MotionSource, config: Config) -> dict[str, floa
 def _figures_of_lengths(
     prefix: str, source: MotionSource, cuts: ClipSelection, optimized: tuple[str, ...], config: Config
 ) -> dict[str, float | None]:
-    """Return the metrics of optimised motions of several lengths, each as a whole, from the same starts."""
+    """Return the metrics of optimized motions of several lengths, each as a whole, from the same starts."""
     dataset, model = source.split.held_out, source.models.ours
     assert dataset is not None
     run = max(LENGTHS_S) * RATE_HZ // STEPS
@@ -91,7 +91,7 @@ def _figures_of_lengths(
         for name, motions in made.items():
             rows[f"{name}_opt"] = scores.score_runs(motions, known, model, run, parts, config.optimization)
         found |= tables.figures(rows, episode, f"{prefix}_{seconds}s", seed=config.seed)
-        progress.log(f"{prefix}: {len(episode)} motions of {seconds} s, optimised")
+        progress.log(f"{prefix}: {len(episode)} motions of {seconds} s, optimized")
     return found
 
 

@@ -14,16 +14,16 @@ class Config:
     m.
     """
     optimized_clips: int = 24
-    """How many of them are also optimised: of reconstructed motion ours alone, of the built-in world all
+    """How many of them are also optimized: of reconstructed motion ours alone, of the built-in world all
     methods.
     """
     optimization: MotionOptimizationConfig = field(default_factory=MotionOptimizationConfig)
-    """Length of the optimisation."""
+    """Length of the optimization."""
     minutes_s: float = 300.0
     """Length of the long motion, seconds; 0 = none."""
     subgoals: int = 20
     """Sub-goals of the long motion."""
     samples: int = 60
-    """Samples of the behaviour model that are made physical; 0 = none."""
+    """Samples of the behavior model that are made physical; 0 = none."""
     seed: int = 0
     """Seed of the choice of clips, the CVAE's codes, samples and resampling."""

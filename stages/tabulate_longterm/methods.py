@@ -17,7 +17,7 @@ from pipeline.longterm.networks import ROOT_CHANNELS
 Method = Callable[[Clips], Float[Tensor, "clip frame channel"]]
 """Predicts all frames of clips from their first and last frames and the scene alone."""
 OPTIMIZED = ("ours", "base", "route_cvae", "nearest")
-"""Methods that are also evaluated after optimisation."""
+"""Methods that are also evaluated after optimization."""
 WITHOUT_SCENE = {"ours": "ours_no_scene", "route_t_pose": "route_t_pose_no_scene", "base": "base_no_scene"}
 """Methods that see the scene, and their ablations without it; `route_tr_pose` has the routes of ours."""
 COMPARED_WITH = {"base": "ours", "route_cvae": "ours", "nearest": "ours"} | {

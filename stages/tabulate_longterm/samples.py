@@ -1,4 +1,4 @@
-"""Samples of the behaviour model before and after optimisation: penetration, foot skate, errors."""
+"""Samples of the behavior model before and after optimization: penetration, foot skate, errors."""
 
 from pathlib import Path
 
@@ -28,13 +28,13 @@ UNITS = ("m", "m_s", "m", "m")
 def figures(
     source: MotionSource, model: Path, behavior_data: Path, config: Config, device: str
 ) -> dict[str, float | None]:
-    """Sample one plan per window, optimise it, and compare penetration, foot skate and errors.
+    """Sample one plan per window, optimize it, and compare penetration, foot skate and errors.
 
     Returns `<name>_before_<unit>`, `<name>_<unit>` and their difference `<name>_more_<unit>`, with intervals
     over episodes.
     """
     data = source.data
-    assert data is not None, "only recorded motion has samples of the behaviour model"
+    assert data is not None, "only recorded motion has samples of the behavior model"
     windows = np.flatnonzero(data.split != TRAIN)
     windows = windows if len(windows) else np.flatnonzero(data.split == TRAIN)
     count = min(config.samples, len(windows))
@@ -64,7 +64,7 @@ def rows(
     config: Config,
     device: str,
 ) -> Float[np.ndarray, "window 2 4"]:
-    """Return `NAMES` of each window's plan before and after optimisation."""
+    """Return `NAMES` of each window's plan before and after optimization."""
     architecture, nets, scaling, schedule, _ = behavior.load(model)
     sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
     context, future = data.windows(windows)

@@ -24,8 +24,8 @@ METRICS = (
     "non_collision", "contact", "penetration_mm", "slide_m_s", "planted", "min_slide_m_s",
 )  # fmt: skip
 """translation, orientation, pose: L1 x 100 of root position (m), 6D root rotation, and the bones' channels
-(rad, m). MPJPE: origins of the bones. MPVPE: all vertices. The paper's neighbour v2v in three readings. End
-v2v, as the text defines it: distance of the first and last mesh from the given ones. Neighbour v2v, as its
+(rad, m). MPJPE: origins of the bones. MPVPE: all vertices. The paper's neighbor v2v in three readings. End
+v2v, as the text defines it: distance of the first and last mesh from the given ones. Neighbor v2v, as its
 values suggest, since they are not zero for true motion: distance of the given ends from the meshes one frame
 further in. Seam: how much longer the vertices' steps are at the frame where two clips join than beside it,
 mean and maximum. Share: relative to body length. Slide: median speed of feet in stance; planted: share of
@@ -96,7 +96,7 @@ def scores(
 ) -> Float[np.ndarray, "clip metric"]:
     """Return the metrics of one method on clips in consecutive pairs, with the seam within each pair.
 
-    With ``settings`` each pair is optimised as one motion, except the given bodies at its ends and middle.
+    With ``settings`` each pair is optimized as one motion, except the given bodies at its ends and middle.
     """
     return score_pairs(decode_clips(channels, clips, references, model), references, model, settings)
 
@@ -157,7 +157,7 @@ def _joined(
     model: LongTerm,
     settings: MotionOptimizationConfig | None,
 ) -> BodyMotion:
-    """Concatenate motions; with ``settings`` optimise them as one, except the bodies at their ends."""
+    """Concatenate motions; with ``settings`` optimize them as one, except the bodies at their ends."""
     joined = concatenate_motions(motions)
     if settings is None:
         return joined

@@ -41,7 +41,7 @@ def run(
     (out / "tables.txt").write_text(text + "\n")
     qa.write(
         out,
-        good="ours ahead of every baseline, and physical after the optimisation at little more error",
+        good="ours ahead of every baseline, and physical after the optimization at little more error",
         bad="a baseline ahead, feet that slide, bodies inside furniture",
         checks=bars.checks(figures),
     )

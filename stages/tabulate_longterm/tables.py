@@ -59,7 +59,7 @@ def text(found: Mapping[str, float | None]) -> str:
     others = [name for name in found if name.split("/")[0] in ("longterm_minutes", "longterm_samples")]
     if others:
         rows = [(name, formatted_interval(found, name)) for name in others]
-        parts.append(aligned("Minutes of motion, and samples of the behaviour model", rows))
+        parts.append(aligned("Minutes of motion, and samples of the behavior model", rows))
     return "\n\n".join(parts)
 
 

@@ -1,4 +1,4 @@
-"""Train the behaviour model from trajectories: perception, goal, path and body.
+"""Train the behavior model from trajectories: perception, goal, path and body.
 
 `batches` draws augmented windows in the ego frame, `objective` computes denoising losses (`baseline_losses`
 those of the baselines of Table 4), `training` runs the loop, `reactions` measures reactions to the observer,

@@ -1,4 +1,4 @@
-"""Train the behaviour model: what the animal perceives, where it goes next, along which path, with which
+"""Train the behavior model: what the animal perceives, where it goes next, along which path, with which
 body.
 
 Goal, path and body are three diffusion models under one perception code; conditions are dropped at random for

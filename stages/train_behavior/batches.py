@@ -38,7 +38,7 @@ APPROACH_DISTANCE_M, APPROACH_SPEED_M_S = 2.4, 0.4
 BIN_M, MAX_REPEATS = 0.2, 8
 """width of the distance bins that approaches are balanced over, and maximum repetitions of a window"""
 MIN_PATH_STD_M, MIN_WAY_STD = 0.02, 0.05
-"""minimum scales of positions of paths (metres), and of goals, strides and past positions"""
+"""minimum scales of positions of paths (meters), and of goals, strides and past positions"""
 MIN_ROTATION_STD, MIN_BONE_STD = 0.1, (0.05, 0.05, 0.05, 0.01, 0.01, 0.01)
 """minimum scales of the root's rotation and of the six channels of a bone, for animals that only rest"""
 MAX_STATISTICS_WINDOWS = 8192

@@ -1,4 +1,4 @@
-"""Settings of the behaviour model and its training."""
+"""Settings of the behavior model and its training."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -94,7 +94,7 @@ class BehaviorTrainingConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """Settings of the behaviour model and its training."""
+    """Settings of the behavior model and its training."""
 
     ego: Ego = "yaw"
     """Ego frame: the root's heading, its full rotation as in the paper, or, as an ablation, the world's axes
@@ -121,7 +121,7 @@ class Config:
     ablated_input: AblatedInput = "nothing"
     """Ablation: an input that the model never perceives."""
     observer_radius_m: float = 4.0
-    """Horizontal distance in metres beyond which others are not perceived; at least 8 with companions."""
+    """Horizontal distance in meters beyond which others are not perceived; at least 8 with companions."""
     unet_width: int = 16
     """Channels of the UNets' finest level; the next two have 2 and 4 times as many."""
     map_lookup: MapLookup = "attention"

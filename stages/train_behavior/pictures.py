@@ -1,4 +1,4 @@
-"""What the quality page of the behaviour model shows: goal fans, the effect of guidance, losses."""
+"""What the quality page of the behavior model shows: goal fans, the effect of guidance, losses."""
 
 from dataclasses import replace
 

@@ -26,7 +26,7 @@ SIDES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0
 
 @dataclass(frozen=True)
 class Reactions:
-    """Mean shifts of sampled goals in metres, over windows and sides."""
+    """Mean shifts of sampled goals in meters, over windows and sides."""
 
     away_m: float
     """along the direction away from an approaching observer, against no observer"""

@@ -15,7 +15,7 @@ class SceneSampler:
     """Samples the ego grid at the resolution of the scene encoder, fast enough for every step.
 
     The encoder averages blocks of cells. Here the volume is smoothed once by the same kernel, and sampled at
-    the centres of the blocks.
+    the centers of the blocks.
     """
 
     def __init__(self, scenes: Scenes, stride: int, device: str):

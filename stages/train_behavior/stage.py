@@ -1,4 +1,4 @@
-"""The stage: trajectories and scenes -> a trained behaviour model, as files."""
+"""The stage: trajectories and scenes -> a trained behavior model, as files."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

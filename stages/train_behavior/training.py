@@ -105,7 +105,7 @@ def train(
         resume=resume,
         save_every=max(optimization.steps // CHECKPOINTS, 1),
         schedule=lambda progress: two_cosines(progress, goal_steps / optimization.steps),
-        label="behaviour",
+        label="behavior",
         clip_norm=CLIP_NORM,
         after_step=lambda step: _average(average, nets, step, goal_steps, optimization.average),
         shared=True,
@@ -147,7 +147,7 @@ def rounded(nets: BehaviorNets) -> BehaviorNets:
 def initial_nets(
     architecture: Architecture, schedule: Schedule, statistics: WindowStatistics, seed: int
 ) -> BehaviorNets:
-    """Return initialised networks with the statistics of the data in their buffers."""
+    """Return initialized networks with the statistics of the data in their buffers."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         nets = BehaviorNets(architecture, schedule)

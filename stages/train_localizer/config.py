@@ -29,7 +29,7 @@ class AgentConfig:
     held_out: int = 60
     """Further views that measure the error and calibrate the uncertainty."""
     distance_m: tuple[float, float] = (0.7, 3.5)
-    """Distance range of rendered cameras, metres."""
+    """Distance range of rendered cameras, meters."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Config:
     target: Literal["scene", "agent"] = "scene"
     """Target of localization: the room or the animal."""
     kind: Literal["bank", "regression"] = "bank"
-    """bank: nearest neighbours among patches of rendered views; regression: a network regresses the pose, as
+    """bank: nearest neighbors among patches of rendered views; regression: a network regresses the pose, as
     in the paper."""
     scene: SceneConfig = field(default_factory=SceneConfig)
     """Views of the room."""

@@ -23,7 +23,7 @@ from pipeline.metrics.pose_errors import pose_errors
 from stages.train_localizer.views import RenderedView
 
 POSE_TOLERANCE: dict[Target, tuple[float, float]] = {"scene": (2.0, 0.05), "agent": (15.0, 0.08)}
-"""Largest rotation error (degrees) and translation error (metres) of a correct pose."""
+"""Largest rotation error (degrees) and translation error (meters) of a correct pose."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class DescribedViews:
 
     @property
     def points_map(self) -> Float[np.ndarray, "patch 3"]:
-        """The true map point of each patch, metres."""
+        """The true map point of each patch, meters."""
         posed = zip(self.map_from_camera[self.view], self.patches, strict=True)
         return np.concatenate([rigid.apply(pose, patches.points_camera) for pose, patches in posed]).astype(
             np.float32

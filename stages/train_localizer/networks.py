@@ -49,7 +49,7 @@ class PoseSamples:
 
 
 def _sample(descriptors, patches, map_from_camera, target) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a view's grid, rotation and regressed map position: camera centre or agent centre."""
+    """Return a view's grid, rotation and regressed map position: camera center or agent center."""
     rotation, position = map_from_camera[:3, :3], map_from_camera[:3, 3]
     if target == "agent":
         position = rotation @ np.median(patches.points_camera, axis=0) + position

@@ -29,7 +29,7 @@ PCA_AXES = 64
 SCENE_SAMPLING = PatchSampling("scene", 120.0, 0, 8, (6, 18))
 """Resized to a focal length of 120 px, a patch every 8 px (4 degrees), radii of 6 and 18 px."""
 AGENT_SAMPLING = PatchSampling("agent", 110.0, 104, 4, (6, 14))
-"""110 px per metre, crops of 0.95 m, a patch every 4 px (4 cm), radii of 6 and 14 px."""
+"""110 px per meter, crops of 0.95 m, a patch every 4 px (4 cm), radii of 6 and 14 px."""
 SOLVERS: dict[Target, localizers.RansacSolver] = {
     "scene": localizers.RansacSolver(threshold_m=0.1, min_side_m=0.25, iterations=600, sectors=1),
     "agent": localizers.RansacSolver(threshold_m=0.04, min_side_m=0.06, iterations=600, sectors=6),
@@ -38,7 +38,7 @@ SOLVERS: dict[Target, localizers.RansacSolver] = {
 RENDER_SCALE = 2
 """Resolution of rendered agent views relative to that of the crop."""
 VIEW_MARGIN, MIN_DISTANCE_M, VIEW_PX = 2.4, 0.3, (64, 240)
-"""Agent views: side over the animal's radius, least distance to its surface (metres), bounds of the side."""
+"""Agent views: side over the animal's radius, least distance to its surface (meters), bounds of the side."""
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,13 @@ from pipeline.mapping.depth_scans import depth_noise
 
 UP = np.array([0.0, 1.0, 0.0])
 NEAR_SHARE, NEAR_M, NEAR_YAW_RAD, NEAR_PITCH_RAD = 0.5, 0.35, 0.6, 0.2
-"""Share of scene cameras near the walk-through's, standard deviations of their offset, metres and radians."""
+"""Share of scene cameras near the walk-through's, standard deviations of their offset, meters and radians."""
 ROOM_MARGIN_M, HEIGHT_M = 0.8, (0.5, 1.9)
-"""The other cameras: margin around the walk-through's path, and heights above the floor, metres."""
+"""The other cameras: margin around the walk-through's path, and heights above the floor, meters."""
 ROLL_DEG = 12.0
 """Standard deviation of roll, degrees."""
 ELEVATION_DEG, TARGET_SIGMA_M = (-10.0, 70.0), 0.03
-"""Agent cameras: elevation range (degrees), and standard deviation of the look-at point (metres)."""
+"""Agent cameras: elevation range (degrees), and standard deviation of the look-at point (meters)."""
 GAIN, WHITE_BALANCE, GAMMA = 0.3, 0.04, 0.25
 """Largest change of exposure, standard deviation of white balance, largest change of gamma."""
 BLUR_PX, MIN_BLUR_PX, PIXEL_NOISE = 1.0, 0.3, 0.015
@@ -34,7 +34,7 @@ OCCLUDED_SHARE, OCCLUDER_DEPTH = 0.4, 0.8
 OCCLUDER_AXES, OCCLUDER_TURN_DEG = ((12, 4), (14, 7)), 30
 """Range of an occluder's semi-axes, as divisors of the picture's width, and largest rotation."""
 MIN_SEEN_SHARE, MIN_DEPTH_M, DEPTH_QUANTILE, MIN_FRONT_SHARE = 0.6, 0.35, 0.05, 0.95
-"""A plausible view: least share of pixels with surface, least depth (metres) at a quantile, and least share
+"""A plausible view: least share of pixels with surface, least depth (meters) at a quantile, and least share
 of front-facing surface."""
 FRONT_RAYS = 16
 """Rays along the picture's height that test for front faces."""
@@ -42,7 +42,7 @@ FRONT_RAYS = 16
 
 @dataclass(frozen=True)
 class RenderedView:
-    """One augmented rendered view; depth in metres, 0 = no surface; intrinsics in pixels."""
+    """One augmented rendered view; depth in meters, 0 = no surface; intrinsics in pixels."""
 
     map_from_camera: Float[np.ndarray, "4 4"]
     intrinsics: Float[np.ndarray, "3 3"]
@@ -95,10 +95,10 @@ def render(
     size: tuple[int, int],
     rng: np.random.Generator,
 ) -> RenderedView:
-    """Render a view (size = height, width in pixels) with augmented colour and exact depth."""
+    """Render a view (size = height, width in pixels) with augmented color and exact depth."""
     depth, hits = render_view(caster, map_from_camera, intrinsics, *size)
     seen = depth > 0
-    assert caster.mesh.color is not None, "templates have colours"
+    assert caster.mesh.color is not None, "templates have colors"
     color = hits.interpolate(caster.mesh, caster.mesh.color).reshape(*size, 3)
     color[~seen] = color[seen].mean(0) if seen.any() else 128
     return RenderedView(map_from_camera, intrinsics, augment(color, rng), depth, seen)
@@ -107,7 +107,7 @@ def render(
 def augment(
     color: Float[np.ndarray, "height width 3"], rng: np.random.Generator
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Change exposure, white balance and gamma, blur a little and add noise; colours 0..255."""
+    """Change exposure, white balance and gamma, blur a little and add noise; colors 0..255."""
     sigma = max(MIN_BLUR_PX, rng.uniform(0, BLUR_PX))
     kernel = round(8 * sigma + 1) | 1  # four standard deviations on either side
     gain = 1 + rng.uniform(-GAIN, GAIN) + rng.normal(0, WHITE_BALANCE, 3)

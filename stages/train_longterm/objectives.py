@@ -17,7 +17,7 @@ TOUCHING_M = 0.02
 def route_error(
     made: Float[Tensor, "*batch channel"], truth: Float[Tensor, "*batch known"]
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """Return the mean L1 distance of t (metres) and of r (6D rotations, no unit), the first nine channels."""
+    """Return the mean L1 distance of t (meters) and of r (6D rotations, no unit), the first nine channels."""
     parts = (slice(0, 3), slice(3, ROOT_CHANNELS))
     shift, turn = ((made[..., part] - truth[..., part]).abs().mean() for part in parts)
     return shift, turn
@@ -28,12 +28,12 @@ def pose_error(
     truth: Float[Tensor, "*batch pose"],
     basis_m: Float[Tensor, "pose channel"],
 ) -> Float[Tensor, ""]:
-    """Return the mean L1 distance of the bones' channels decoded from p, metres (radians times 0.1 m)."""
+    """Return the mean L1 distance of the bones' channels decoded from p, meters (radians times 0.1 m)."""
     return ((made - truth) @ basis_m).abs().mean()
 
 
 def metric_basis(poses: PoseSpace) -> Float[Tensor, "pose channel"]:
-    """Return the pose space's basis with all channels in metres."""
+    """Return the pose space's basis with all channels in meters."""
     return poses.basis * torch.tensor([LEVER_M] * 3 + [1.0] * 3).repeat(len(poses.rest))
 
 
@@ -61,7 +61,7 @@ def scene_errors(
     scenes: list[SignedDistance],
     count: int,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """Return mean collision error (metres) and contact error of bodies; ``scene`` is the scene index of each.
+    """Return mean collision error (meters) and contact error of bodies; ``scene`` is the scene index of each.
 
     Vertices are in the world; those from ``count`` on are the contact vertices.
     """

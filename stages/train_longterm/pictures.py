@@ -32,7 +32,7 @@ ARROW_M, ARROW_FRAMES = 0.15, 15
 """Length of the heading lines, and frames between them."""
 CAPTIONS = {
     "losses": "Loss of each network over its training, smoothed.",
-    "routes": f"Held-out routes in panels of {2 * SHOWN_M:g} m: true blue, generated orange, scene grey.",
+    "routes": f"Held-out routes in panels of {2 * SHOWN_M:g} m: true blue, generated orange, scene gray.",
 }
 
 
@@ -70,7 +70,7 @@ def evaluate_held_out(learned: TrainedLongTerm, dataset: DatasetSplit, seed: int
 
 
 def _stills(learned: TrainedLongTerm, where: MotionDataset, rng: np.random.Generator) -> tuple[float, float]:
-    """Return the median gap and the median penetration depth of bodies sampled at held-out places, metres."""
+    """Return the median gap and the median penetration depth of bodies sampled at held-out places, meters."""
     stretch, scene = where.stretches[0], where.scenes[where.scene_of[0]]
     places = stretch.world_from_agent[np.linspace(0, len(stretch) - 1, STILLS).astype(int)]
     made = learned.model.bodies(places, where.body, scene, rng, candidates=CANDIDATES)

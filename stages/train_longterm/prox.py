@@ -47,7 +47,7 @@ _ALLOWED = {
 
 @dataclass(frozen=True)
 class PersonRecording:
-    """Stretches of one recording's motion in the world of its scene (+y up, metres)."""
+    """Stretches of one recording's motion in the world of its scene (+y up, meters)."""
 
     scene: str
     motions: tuple[BodyMotion, ...]

@@ -19,7 +19,7 @@ STUDY_REACH_M = 1.5
 
 
 def recorded(reconstruction: Path, behavior_data: Path) -> DatasetSplit:
-    """Read reconstructed sessions; behaviour test videos are held out. Raises LTM-001 without motion."""
+    """Read reconstructed sessions; behavior test videos are held out. Raises LTM-001 without motion."""
     split = reconstructed_split(reconstruction, BehaviorData.load(behavior_data))
     if not split.train.stretches:
         remedy = "record longer sessions in which the animal stays in view"
@@ -31,7 +31,7 @@ def people(model: Path, folder: Path) -> DatasetSplit:
     """Read recorded SMPL-X motion: `scene.ply` and `*.npz` of one person; the last file by name is held out.
 
     Each file holds `timestamp_s`, `transl`, `global_orient`, `body_pose` (rotation vectors, world +y up,
-    metres) and `betas`, optionally `left_hand_pose` and `right_hand_pose` (45 values or PCA coefficients). A
+    meters) and `betas`, optionally `left_hand_pose` and `right_hand_pose` (45 values or PCA coefficients). A
     folder in PROX's layout is read by `prox`. Raises InputError LTM-001 without motion, LTM-003 and LTM-004
     without SMPL-X, LTM-005 for damaged PROX data.
     """

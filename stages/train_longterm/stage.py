@@ -17,7 +17,7 @@ SECONDS_PER_MINUTE = 60
 
 @dataclass(frozen=True)
 class Inputs:
-    """Training artifacts: simulated motion, or a reconstruction with its behaviour data."""
+    """Training artifacts: simulated motion, or a reconstruction with its behavior data."""
 
     reconstruction: Path | None = None
     behavior_data: Path | None = None

@@ -41,17 +41,17 @@ class LongTermLossWeights:
     """Weights of the loss terms."""
 
     translation: float = 1.0
-    """lambda_t, per metre"""
+    """lambda_t, per meter"""
     rotation: float = 1.0
     """lambda_r"""
     pose: float = 10.0
-    """lambda_p, per metre of the bones"""
+    """lambda_p, per meter of the bones"""
     divergence: float = 0.003
     """KL term of the CVAE"""
     vertices: float = 5.0
-    """distance of the CVAE's mesh from the true one, per metre"""
+    """distance of the CVAE's mesh from the true one, per meter"""
     collision: float = 5.0
-    """CVAE: penetration depth, per metre"""
+    """CVAE: penetration depth, per meter"""
     contact: float = 0.02
     """CVAE: robust distance of contact vertices from the scene"""
 

@@ -1,4 +1,4 @@
-"""A real kitchen from colour alone: camera path, intrinsics and depth compared with a depth camera."""
+"""A real kitchen from color alone: camera path, intrinsics and depth compared with a depth camera."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ from tests.pipeline.recordings import made_formats
 from tests.real.seven_scenes import SCENE, Half, halves
 
 COLOR_FOCAL_PX = (515.0, 565.0)
-"""of the colour camera, by the README of the sample closer to 525-555 than to the 585 of the depth camera"""
+"""of the color camera, by the README of the sample closer to 525-555 than to the 585 of the depth camera"""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Walk:
     truth: Half
     kept: np.ndarray
     scale: float
-    """metres per unit, from the camera centres"""
+    """meters per unit, from the camera centers"""
     gap_m: np.ndarray
     """distance of each camera from the truth after the similarity"""
 

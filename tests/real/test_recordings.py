@@ -45,7 +45,7 @@ def test_seven_scenes_pass_the_pose_check():
     assert plan.pose_check.verdict == "documented"
     assert (
         plan.pose_check.residual_m < 2 * LIMIT_M
-    )  # a Kinect v1, whose poses are accurate to some centimetres
+    )  # a Kinect v1, whose poses are accurate to some centimeters
     assert not plan.gravity_known
 
 

@@ -21,7 +21,7 @@ from tests.real.seven_scenes import Half, halves
 
 FRAMES = range(25)
 NEAR = (7.0, 0.15)
-"""degrees and metres of the recall by which methods are compared"""
+"""degrees and meters of the recall by which methods are compared"""
 
 
 @dataclass(frozen=True)

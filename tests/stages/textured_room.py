@@ -16,7 +16,7 @@ UP = np.array([0.0, 1.0, 0.0])
 
 
 def textured_room(seed: int = 0, edge_m: float = 0.04) -> Mesh:
-    """Room of 3 x 2.2 x 2.6 m, floor at 0, with three boxes; vertex colours are smooth noise at several
+    """Room of 3 x 2.2 x 2.6 m, floor at 0, with three boxes; vertex colors are smooth noise at several
     scales.
     """
     walls = trimesh.creation.box((3.0, 2.2, 2.6), rigid.make(np.eye(3), np.array([0, 1.1, 0.0])))
@@ -33,7 +33,7 @@ def textured_room(seed: int = 0, edge_m: float = 0.04) -> Mesh:
 
 
 def noise_color(points: np.ndarray, seed: int) -> np.ndarray:
-    """Return colours of a sum of smooth random fields."""
+    """Return colors of a sum of smooth random fields."""
     rng = np.random.default_rng(seed)
     color = np.full((len(points), 3), 128.0)
     for cell_m, strength in ((0.5, 60.0), (0.22, 55.0), (0.1, 45.0)):
@@ -143,7 +143,7 @@ def drifting(truth: np.ndarray, seed: int, *, deg: float = 0.1, m: float = 0.004
 
 
 def aligned_errors(poses: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rotation errors in degrees and position errors in metres after rigid alignment of all poses."""
+    """Return rotation errors in degrees and position errors in meters after rigid alignment of all poses."""
     rotation = rigid.mean_rotation(truth[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], 1, 2))
     moved = rigid.make(rotation, (truth[:, :3, 3] - poses[:, :3, 3] @ rotation.T).mean(0)) @ poses
     angle = np.rad2deg(rigid.rotation_angle(moved[:, :3, :3], truth[:, :3, :3]))

@@ -1,4 +1,4 @@
-"""RAFT as an estimator: pictures in colour at the working size, flow from a guess where there is one."""
+"""RAFT as an estimator: pictures in color at the working size, flow from a guess where there is one."""
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ little"""
 
 
 class RaftEstimator(Estimator):
-    """Flow by the network in place of the search; pictures are read in colour."""
+    """Flow by the network in place of the search; pictures are read in color."""
 
     def __init__(self, network: raft.Raft, color_size: tuple[int, int], working_side_px: int) -> None:
         """Prepare for pictures of (height, width), reduced as by `Estimator`."""

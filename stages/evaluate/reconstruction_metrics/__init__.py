@@ -1,1 +1,1 @@
-"""What precedes behaviour, against truth: masks, flow, registration, localizer, reconstruction."""
+"""What precedes behavior, against truth: masks, flow, registration, localizer, reconstruction."""

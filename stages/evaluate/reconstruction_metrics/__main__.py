@@ -2,7 +2,7 @@
 
 Truth is read where it is given (the built-in capture). Elsewhere clicked correspondences (`make annotate`)
 stand for it, and a held-out phone is placed by them or by registration; metrics that need more are left out
-with the reason. `evaluate` adds behaviour to them; its table of the recipe configures both.
+with the reason. `evaluate` adds behavior to them; its table of the recipe configures both.
 """
 
 from pipeline.workflow import cli

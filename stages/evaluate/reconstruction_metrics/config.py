@@ -1,4 +1,4 @@
-"""Settings of these metrics, in one table with those of behaviour."""
+"""Settings of these metrics, in one table with those of behavior."""
 
 from stages.evaluate.config import Config
 

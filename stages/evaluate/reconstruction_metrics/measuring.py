@@ -1,4 +1,4 @@
-"""Ask every subject but behaviour for its metrics, one after the other."""
+"""Ask every subject but behavior for its metrics, one after the other."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""The stage: all that precedes behaviour, and what is known of the truth -> metrics, the quality page."""
+"""The stage: all that precedes behavior, and what is known of the truth -> metrics, the quality page."""
 
 from pathlib import Path
 
@@ -28,13 +28,13 @@ def run(
     device: devices.Device = "cpu",
     videos: tuple[Video, ...] = (),
 ) -> Metrics:
-    """Measure what precedes behaviour into `out`, and return the metrics."""
+    """Measure what precedes behavior into `out`, and return the metrics."""
     measure = measuring.against_clicks if inputs.truth is None else measuring.against_truth
     metrics = measure(inputs, videos, config, device)
     metrics.write(out, "metrics.json")
     qa.write(
         out,
-        good="errors of a few centimetres and of less than a degree, and masks that follow the animal",
+        good="errors of a few centimeters and of less than a degree, and masks that follow the animal",
         bad="an error far above its limit: what is made after it is no better",
         checks=metrics.judged(LIMITS),
         pictures=[

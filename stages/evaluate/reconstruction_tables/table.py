@@ -59,7 +59,7 @@ FLOOR_QUANTILE = 0.02
 ROOM_PX = 320
 """Width of a room in the comparison."""
 EPISODE_FRAMES = 3
-"""Rendered frames that are resampled together: neighbours look alike."""
+"""Rendered frames that are resampled together: neighbors look alike."""
 
 
 def metrics(
@@ -123,7 +123,7 @@ def metrics(
 def _compare(
     found: Metrics, variant: str, lacking: Float[np.ndarray, "view part"], rng: np.random.Generator
 ) -> None:
-    """Put the mean difference of pictures to the reference; neighbouring pictures are resampled together."""
+    """Put the mean difference of pictures to the reference; neighboring pictures are resampled together."""
     for column, part in enumerate(PARTS):
         seen = np.flatnonzero(np.isfinite(lacking[:, column]))
         if not len(seen):

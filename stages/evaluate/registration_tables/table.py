@@ -24,7 +24,7 @@ PAPER = {
     "no_feature_metric": (22.47, 1.30),
     "totalrecon": (59.19, 0.68),
 }
-"""Rotation (degrees) and translation (metres) on the paper's own cat videos (Table 1)"""
+"""Rotation (degrees) and translation (meters) on the paper's own cat videos (Table 1)"""
 NAMES = {
     "ours": "ours",
     "no_localizer": "without localizer",
@@ -39,7 +39,7 @@ TITLE = (
 )
 FOOTNOTE = "paper: on its own cat videos; '-': more than half (a twentieth) of the frames has no pose."
 EPISODE_S = 5.0
-"""Intervals resample stretches of this length together: poses of neighbouring frames err alike."""
+"""Intervals resample stretches of this length together: poses of neighboring frames err alike."""
 MAX_DEG, MAX_M = 180.0, 10.0
 """A frame without a pose counts as this wrong where errors are averaged"""
 UNITS = {"rotation_deg": "degrees", "translation_m": "meters"}

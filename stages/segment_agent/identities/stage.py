@@ -61,11 +61,11 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: Sequence[Video] = 
     ]
     qa.write(
         out,
-        good="each animal in one colour, whole",
-        bad="animals of two colours: they look alike, or one turnaround shows both",
+        good="each animal in one color, whole",
+        bad="animals of two colors: they look alike, or one turnaround shows both",
         checks=checks,
         pictures=qa.captioned(
-            {"portraits": "Held-out portraits, every pixel in the colour of its predicted identity."},
+            {"portraits": "Held-out portraits, every pixel in the color of its predicted identity."},
             portraits=sheet(network, tested),
         ),
     )
@@ -88,7 +88,7 @@ def portraits(
 def sheet(
     network: Identities, tested: Sequence[Portrait], columns: int = 6
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw portraits with each of the animal's pixels in the colour of its predicted identity."""
+    """Draw portraits with each of the animal's pixels in the color of its predicted identity."""
     tiles = []
     for each in tested[:: max(1, len(tested) // (2 * columns))]:
         taken = network.predict(each.color)[1:].argmax(0)

@@ -1,4 +1,4 @@
-"""Simulate the built-in animal's life in several homes, without pictures: what behaviour models are measured
+"""Simulate the built-in animal's life in several homes, without pictures: what behavior models are measured
 on.
 
 Writes one table of motion per session, each with its home as a feature volume, in the form that

@@ -1,6 +1,6 @@
 """Scripted approaches: a person stands, then walks up to the animal; in its twin the person goes on standing.
 
-What the animal's true policy does in either case is what a behaviour model should do when it is shown the
+What the animal's true policy does in either case is what a behavior model should do when it is shown the
 same 0.8 s.
 """
 

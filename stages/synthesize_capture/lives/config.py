@@ -8,7 +8,7 @@ class Config:
     """How many lives, where, and how long."""
 
     seed: int = 0
-    """Decides everything: homes, behaviour, the person's walks."""
+    """Decides everything: homes, behavior, the person's walks."""
     homes: int = 24
     """Homes to learn from, differently furnished."""
     sessions_per_home: int = 1

@@ -85,7 +85,7 @@ def test_goals_follow_the_map():
 
     clean, perceived = draw(16)
     found = goals(trained(net, draw, 300), perceived, 8)
-    assert (found - clean[:, None]).norm(dim=-1).median() < 0.4  # neighbouring cells are some 1.2 apart
+    assert (found - clean[:, None]).norm(dim=-1).median() < 0.4  # neighboring cells are some 1.2 apart
 
 
 def test_local_heads_read_the_map_at_candidate_goals():

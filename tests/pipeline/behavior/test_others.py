@@ -30,7 +30,7 @@ def encoder():
 
 
 def companions_nearby(count, seed=0):
-    """Companions within two metres of the agent, alternately animals and people."""
+    """Companions within two meters of the agent, alternately animals and people."""
     drawn = torch.randn(2, count, 8, 10, generator=torch.Generator().manual_seed(seed)) * 0.5
     drawn[..., 9] = torch.arange(count)[:, None] % 2
     return drawn
@@ -209,7 +209,7 @@ def test_external_companions_are_perceived_and_avoided(sampler):
         animals.begin(context, np.random.default_rng(0), companions=beside)
         plans[name] = animals.plan.root.copy()
     np.testing.assert_allclose(plans["alone"], plans["far"], atol=1e-4)
-    assert np.abs(plans["alone"] - plans["near"]).max() > 5e-3, "metres"
+    assert np.abs(plans["alone"] - plans["near"]).max() > 5e-3, "meters"
     obstacle = here + np.array([[0.5, 0.0, 0.0]])
     animals.begin(context, np.random.default_rng(0), companions=standing(obstacle))
     lives = np.stack([animals.step(far, standing(obstacle)).root[0, 0, :3, 3] for _ in range(60)])

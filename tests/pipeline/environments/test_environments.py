@@ -155,7 +155,7 @@ def test_persons_stay_out_of_unobserved_space():
     world = small_world()
     world.floors[0] = floor
     world.begin(40, np.random.default_rng(0))
-    assert (np.abs(world.persons.position) < 1.1).all(), "metres: inside"
+    assert (np.abs(world.persons.position) < 1.1).all(), "meters: inside"
     for _ in range(30):
         world.step(np.tile([1.0, 0.0, 0.1], (40, 1)))
         assert (np.abs(world.persons.position) < 1.1).all()

@@ -29,7 +29,7 @@ RED, BLUE = (200, 30, 30), (30, 30, 200)
 
 
 def box(extents, color, place=(0.0, 0.0, 0.0), inward=False):
-    """A box of one colour with a given centre."""
+    """A box of one color with a given center."""
     made = trimesh.creation.box(extents, rigid.make(np.eye(3), np.array(place)))
     faces = np.asarray(made.faces)[:, ::-1] if inward else np.asarray(made.faces)
     vertices = np.asarray(made.vertices, np.float32)
@@ -122,9 +122,9 @@ def test_gymnasium_accepts_image_observations(builds, observations):
     assert set(seen) == {"rgb", "depth", *observations} - {"rgbd"}
     rgb, depth = seen["rgb"].astype(int), seen["depth"]
     animal = (rgb == RED).all(-1)
-    assert 5 < animal.sum() < 1000, "it begins in view, a metre or so away"
+    assert 5 < animal.sum() < 1000, "it begins in view, a meter or so away"
     assert ((rgb == BLUE).all(-1) | animal).all() and depth[animal].mean() < depth[~animal].max()
-    assert 0.3 < depth[animal].mean() < 2.5, "metres"
+    assert 0.3 < depth[animal].mean() < 2.5, "meters"
 
 
 def test_rendered_depth_is_relative_to_the_camera():
@@ -151,7 +151,7 @@ def test_rendered_depth_is_relative_to_the_camera():
         )
         np.testing.assert_allclose(
             ahead * 0.95, [0, height], atol=0.06
-        )  # metres, at the near side of the body
+        )  # meters, at the near side of the body
 
 
 def test_rendering_without_surfaces_is_refused(builds, tmp_path):

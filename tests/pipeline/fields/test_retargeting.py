@@ -25,7 +25,7 @@ def posed(shape: SkinnedShape, bones: np.ndarray) -> np.ndarray:
 def test_retargeting_to_the_same_body_is_the_identity() -> None:
     same = retargeting.retarget(body(), body(), TRACK.world_from_agent, MOTION)
     away = np.linalg.norm(posed(body(), same.agent_from_bone) - posed(body(), MOTION), axis=-1)
-    assert away.max() < 1e-3 and same.residual_m.max() < 1e-3, "metres"
+    assert away.max() < 1e-3 and same.residual_m.max() < 1e-3, "meters"
     np.testing.assert_allclose(same.world_from_agent, TRACK.world_from_agent)
     assert retargeting.shape_distance_m(body(), body()) < 1e-6
 
@@ -37,7 +37,7 @@ def test_motion_scales_with_the_body() -> None:
     big = SkinnedShape(2 * small.vertices, small.weights, rest)
     moved = retargeting.retarget(small, big, TRACK.world_from_agent, MOTION)
     away = np.linalg.norm(posed(big, moved.agent_from_bone) - 2 * posed(small, MOTION), axis=-1)
-    assert away.max() < 2e-3, "metres"
+    assert away.max() < 2e-3, "meters"
     steps, own = (
         np.linalg.norm(np.diff(root[:, [0, 2], 3], axis=0), axis=1)
         for root in (TRACK.world_from_agent, moved.world_from_agent)
@@ -47,7 +47,7 @@ def test_motion_scales_with_the_body() -> None:
         root[:, 1, 3] + retargeting.extent(shape)[0, 1]
         for root, shape in ((TRACK.world_from_agent, small), (moved.world_from_agent, big))
     )
-    np.testing.assert_allclose(own_feet, feet, atol=1e-9)  # metres: on the same floor
+    np.testing.assert_allclose(own_feet, feet, atol=1e-9)  # meters: on the same floor
 
 
 def test_other_bones_follow_the_same_surface() -> None:

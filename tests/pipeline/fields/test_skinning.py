@@ -47,7 +47,7 @@ def test_backward_inverts_forward_where_bones_agree():
     forward = skinning.move(skinning.blend(skinning.skinning_weights(cloud, rest, scale), posed, rest), cloud)
     weights = skinning.skinning_weights(forward, posed, scale)
     inverse = skinning.move(skinning.blend(weights, posed, rest), forward, inverse=True)
-    assert (inverse - cloud).norm(dim=-1).median() < 0.003, "metres; joints bend by about a degree"
+    assert (inverse - cloud).norm(dim=-1).median() < 0.003, "meters; joints bend by about a degree"
 
 
 def test_gradients_are_finite_at_rest():

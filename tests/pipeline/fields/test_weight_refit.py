@@ -45,7 +45,7 @@ def test_rigid_points_are_exact() -> None:
     body = SkinnedShape(points, alone, rest)
     poses = weight_refit.Poses.of(body, posed_bones)
     fitted = weight_refit.refit_weights(body, poses)
-    assert weight_refit.residual_m(points, fitted, poses).max() < 1e-4, "metres: float32 blending"
+    assert weight_refit.residual_m(points, fitted, poses).max() < 1e-4, "meters: float32 blending"
 
 
 def test_selected_poses_contain_the_extremes() -> None:

@@ -24,8 +24,8 @@ def test_room_is_fused_where_it_was_observed():
     mesh = volume.surface(0.0)
     extent = np.array([1.5, 1.0, 1.5])
     off_wall = np.abs(np.abs(mesh.vertices) - extent).min(1)
-    assert np.median(off_wall) < 0.01, "metres; a voxel is 0.05"
-    assert np.quantile(off_wall, 0.95) < 0.05, "metres"
+    assert np.median(off_wall) < 0.01, "meters; a voxel is 0.05"
+    assert np.quantile(off_wall, 0.95) < 0.05, "meters"
     assert mesh.vertices[:, 2].min() > -1.3, "the wall behind was never seen"
     assert (np.abs(mesh.color.astype(int) - (10, 200, 90)).max(1) <= 1).mean() > 0.99
     centre = mesh.vertices[mesh.faces].mean(1)

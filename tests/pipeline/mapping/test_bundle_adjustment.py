@@ -68,7 +68,7 @@ def test_outliers_of_matches_and_depth_are_rejected():
     tracked.pixel[wrong] += rng.uniform(20, 40, (int(wrong.sum()), 2))
     tracked.depth_m[rng.random(len(wrong)) < 0.1] += 0.8
     found = optimized(displaced(truth, rng), tracked)
-    assert np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.01, "metres"
+    assert np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.01, "meters"
 
 
 def test_depth_determines_only_the_scale():
@@ -92,7 +92,7 @@ def test_standard_deviations_are_estimated():
 
 
 def test_lens_distortion_is_recovered():
-    """Pixels are closer to the centre than with a pinhole."""
+    """Pixels are closer to the center than with a pinhole."""
     rng, radial = np.random.default_rng(5), 0.05
     truth, tracked = observed(rng)
     straight = (tracked.pixel - tracked.center_px) / FOCAL_PX
@@ -103,7 +103,7 @@ def test_lens_distortion_is_recovered():
     term = PointTerm(tracked, truth)
     found = optimized(displaced(truth, rng), tracked, term)
     assert term.radial == pytest.approx(radial, abs=0.005)
-    assert np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.005, "metres"
+    assert np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.005, "meters"
 
 
 def test_points_with_two_observations_in_a_picture_are_dropped():

@@ -59,7 +59,7 @@ def test_correspondences_align_a_camera_to_the_wall():
         reach_m=(0.2,) * 8,
     )
     seen = rigid.apply(found.world_from_camera[0], scan.points_camera)
-    assert np.abs(seen[:, 2] - 2.0).max() < 1e-3, "metres"
+    assert np.abs(seen[:, 2] - 2.0).max() < 1e-3, "meters"
 
 
 def test_distance_is_signed_and_back_faces_are_no_correspondences():

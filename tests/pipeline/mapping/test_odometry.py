@@ -39,7 +39,7 @@ def room() -> RayCaster:
 
 @pytest.fixture(scope="module")
 def circle(room):
-    """True poses on a circle around the centre, and noisy depth views."""
+    """True poses on a circle around the center, and noisy depth views."""
     rng = np.random.default_rng(0)
     angles = np.linspace(0, 2 * np.pi * 1.05, 60)
     eyes = np.stack([1.1 * np.cos(angles), 1.0 + 0.1 * np.sin(3 * angles), 1.0 * np.sin(angles)], axis=1)
@@ -106,7 +106,7 @@ def test_drift_is_corrected(circle):
     before = np.linalg.norm(odometry[:, :3, 3] - poses[:, :3, 3], axis=1)
     after = np.linalg.norm(found.world_from_camera[:, :3, 3] - poses[:, :3, 3], axis=1)
     assert np.median(after) < 0.6 * np.median(before)
-    assert np.median(after) < 0.015, "metres; the depth noise is 4 mm, the odometry drifts by several cm"
+    assert np.median(after) < 0.015, "meters; the depth noise is 4 mm, the odometry drifts by several cm"
     assert found.edges >= 12
 
 
@@ -116,7 +116,7 @@ def test_tracking_jump_is_repaired(circle):
     odometry[35:] = rigid.exp(np.array([0, 0.1, 0, 0.5, 0, 0.3])) @ odometry[35:]
     found = correct_drift(views.__getitem__, 0.1 * np.arange(len(poses)), odometry)
     assert np.linalg.norm(found.world_from_camera[:, :3, 3] - poses[:, :3, 3], axis=1).max() < 0.05, (
-        "metres; the jump is 0.6 m"
+        "meters; the jump is 0.6 m"
     )
 
 
@@ -129,7 +129,7 @@ def test_chained_alignment_needs_no_odometry(circle):
     truth = rigid.inverse(poses[0]) @ poses[:12]
     error = np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max()
     assert error < 0.75 * np.linalg.norm(guessed[:, :3, 3] - truth[:, :3, 3], axis=1).max()
-    assert error < 0.12, "metres over a walk of 1.2 m along plain walls"
+    assert error < 0.12, "meters over a walk of 1.2 m along plain walls"
 
 
 def test_gravity_is_estimated(circle):

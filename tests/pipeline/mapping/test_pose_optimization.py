@@ -116,7 +116,7 @@ def test_marginal_covariance_is_correct_and_grows_away_from_correspondences():
     dense = np.stack([whole[6 * frame : 6 * frame + 6, 6 * frame : 6 * frame + 6] for frame in range(FRAMES)])
     assert np.abs(found - dense).max() < 1e-6 * np.abs(dense).max()
     size = np.sqrt(found[:, range(3, 6), range(3, 6)].sum(1))
-    assert (np.diff(size[2:]) > 0).all(), "metres: what odometry alone carries drifts"
+    assert (np.diff(size[2:]) > 0).all(), "meters: what odometry alone carries drifts"
 
 
 def test_inconsistencies_are_in_standard_deviations():

@@ -23,8 +23,8 @@ def test_jump_is_detected_and_repaired():
     odometry = jumping(jumping(drifting(truth, 4, deg=0.03, m=0.001), 20), 41, 0.9)
     jumps = find_jumps(TIME_S, odometry)
     assert np.flatnonzero(jumps).tolist() == [20, 41]
-    assert aligned_errors(odometry, truth)[1].max() > 0.3, "metres"
-    assert aligned_errors(repair(TIME_S, odometry, jumps), truth)[1].max() < 0.03, "metres, drift included"
+    assert aligned_errors(odometry, truth)[1].max() > 0.3, "meters"
+    assert aligned_errors(repair(TIME_S, odometry, jumps), truth)[1].max() < 0.03, "meters, drift included"
 
 
 def test_single_displaced_frame_gives_two_jumps():

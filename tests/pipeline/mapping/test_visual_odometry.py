@@ -21,7 +21,7 @@ def test_motion_is_chained_and_a_textureless_frame_is_a_jump():
     assert np.flatnonzero(found.jumps).tolist() == [4, 5]
     errors = pose_errors(found.relative_poses.first_from_second, rigid.inverse(truth[:-1]) @ truth[1:])
     assert errors.degrees[~found.jumps[1:]].max() < 0.5, "degrees, steps of 3 degrees"
-    assert errors.meters[~found.jumps[1:]].max() < 0.02, "metres, steps of 5 cm"
+    assert errors.meters[~found.jumps[1:]].max() < 0.02, "meters, steps of 5 cm"
     assert found.relative_poses.sigma_m[3] > 10 * found.relative_poses.sigma_m[0]
 
 
@@ -37,4 +37,4 @@ def test_fast_rotation_is_tracked():
     assert not found.jumps.any()
     errors = pose_errors(found.relative_poses.first_from_second, rigid.inverse(truth[:-1]) @ truth[1:])
     assert errors.degrees.max() < 1.0, "degrees, one step of 120"
-    assert errors.meters.max() < 0.03, "metres"
+    assert errors.meters.max() < 0.03, "meters"

@@ -127,7 +127,7 @@ def polycam_mesh(folder: Path, mesh: trimesh.Trimesh, aligned_from_world: np.nda
 
 
 def nerfcapture(folder: Path, made: Made, reach_m: float = 8.0) -> Path:
-    """The streamed folder: depth upsampled to the picture, with a scale in metres for 16 bits."""
+    """The streamed folder: depth upsampled to the picture, with a scale in meters for 16 bits."""
     members, frames, scale = {}, [], reach_m / 65535
     fl_x, fl_y, cx, cy = coefficients(made)
     for i, camera in enumerate(cameras.opencv_from_opengl(stored_cameras(made))):
@@ -153,13 +153,13 @@ def nerfcapture_zip(path: Path, made: Made) -> Path:
 
 
 def tum(folder: Path, made: Made, poses: bool = True, per_meter: float = 5000) -> Path:
-    """Depth and poses have timestamps some milliseconds after colour, as from separate sensors."""
+    """Depth and poses have timestamps some milliseconds after color, as from separate sensors."""
     times = START_S + made.timestamp_s
     members: dict[str, bytes | str] = {"intrinsics.txt": " ".join(map(str, coefficients(made)))}
     for i, time in enumerate(times):
         members[f"rgb/{time:.6f}.png"] = png(made.color(i)[..., ::-1])
         members[f"depth/{time + 0.004:.6f}.png"] = png(millimeters(made.depth(i), per_meter))
-    members["rgb.txt"] = "# colour\n" + "\n".join(f"{time:.6f} rgb/{time:.6f}.png" for time in times)
+    members["rgb.txt"] = "# color\n" + "\n".join(f"{time:.6f} rgb/{time:.6f}.png" for time in times)
     members["depth.txt"] = "# depth\n" + "\n".join(
         f"{time + 0.004:.6f} depth/{time + 0.004:.6f}.png" for time in times
     )

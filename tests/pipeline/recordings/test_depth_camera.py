@@ -1,4 +1,4 @@
-"""Reprojection of depth from a separate depth camera to the colour camera, with edges and occlusions."""
+"""Reprojection of depth from a separate depth camera to the color camera, with edges and occlusions."""
 
 import numpy as np
 import pytest
@@ -61,7 +61,7 @@ def test_sidecar_describes_the_depth_camera(tmp_path):
     (folder / "depth_from_color.txt").write_text("1 0 0 0.03\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
     recording = open_recording(folder)
     assert recording.depth_camera.baseline_m == pytest.approx(0.03)
-    assert any("30 mm from the colour camera" in remark for remark in recording.remarks)
+    assert any("30 mm from the color camera" in remark for remark in recording.remarks)
     plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, max_side_px=640)
     frame = next(iter(extraction.frames(recording, plan, max_depth_m=6.0, jpeg_quality=90)))
     lens = plan.depth_intrinsics[0]

@@ -178,7 +178,7 @@ def test_hidden_macos_files_are_ignored(tmp_path):
 
 
 def test_depth_that_is_numbered_from_1_is_refused(tmp_path):
-    """ffmpeg numbers pictures from 1; every frame would get the depth of its neighbour."""
+    """ffmpeg numbers pictures from 1; every frame would get the depth of its neighbor."""
     path = made_formats.video_and_depth(tmp_path / "a", walk(6))
     for number in range(5, -1, -1):
         (path / f"depth/{number:06d}.png").rename(path / f"depth/{number + 1:06d}.png")
@@ -284,7 +284,7 @@ def test_poses_distinguish_millimetres_from_dataset_units(tmp_path, per_meter):
     made = walk(18, rate_hz=RATE_HZ)
     recording = open_recording(made_formats.tum(tmp_path / "a", made, per_meter=per_meter))
     np.testing.assert_allclose(recording.read_depth(3), made.depth(3), atol=1e-3)
-    assert any(f"{per_meter} units per metre" in remark for remark in recording.remarks)
+    assert any(f"{per_meter} units per meter" in remark for remark in recording.remarks)
 
 
 @pytest.mark.parametrize(("per_meter", "named"), [(100, "times 10 "), (1000, ""), (200, "times 5 ")])
@@ -302,11 +302,11 @@ def test_poses_name_the_unit_in_which_depth_would_agree(tmp_path, per_meter, nam
 def test_depth_scale_file_gives_the_depth_unit(tmp_path):
     made = walk(6)
     path = made_formats.tum(tmp_path / "a", made, poses=False, per_meter=256)
-    (path / "depth_scale.txt").write_text("# units per metre\n256\n")
+    (path / "depth_scale.txt").write_text("# units per meter\n256\n")
     recording = open_recording(path)
     np.testing.assert_allclose(recording.read_depth(3), made.depth(3), atol=3e-3)
     assert not recording.remarks
-    for impossible in ("0", "inf", "1000 1000", "millimetres"):
+    for impossible in ("0", "inf", "1000 1000", "millimeters"):
         (path / "depth_scale.txt").write_text(impossible)
         with pytest.raises(InputError, match="CAP-004"):
             open_recording(path)
@@ -374,7 +374,7 @@ def _hdr(srgb, curve):
     return np.where(light < 1 / 12, dark, 0.17883277 * bright + 0.55991073)
 
 
-@pytest.mark.slow  # colour look-up tables, once per video
+@pytest.mark.slow  # color look-up tables, once per video
 @pytest.mark.parametrize("curve", ["arib-std-b67", "smpte2084"])
 def test_hdr_is_converted_to_standard_colours(tmp_path, curve):
     """iPhones write HLG, Samsung phones PQ, which look washed out without conversion. Tolerance: 8 levels,

@@ -1,4 +1,4 @@
-"""Recordings in odd but real forms: cut off, wide colours, missing files, varying times."""
+"""Recordings in odd but real forms: cut off, wide colors, missing files, varying times."""
 
 from fractions import Fraction
 
@@ -68,7 +68,7 @@ def _stripes(color):
     return np.repeat(np.repeat(color[None].astype(np.uint8), 32, axis=0), 32, axis=1)
 
 
-@pytest.mark.slow  # tables of colours
+@pytest.mark.slow  # tables of colors
 @pytest.mark.parametrize("curve", [ColorTrc.BT709, ColorTrc.IEC61966_2_1])
 def test_display_p3_becomes_srgb(tmp_path, curve):
     """Its red is redder: a red animal would fade, and differ from the one of another phone."""

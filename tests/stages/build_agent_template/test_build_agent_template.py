@@ -71,7 +71,7 @@ def test_surface_is_closed_and_accurate(template, turnaround):
     ours = rigid.apply(true_from_ours(template, turnaround), mesh.sample(4000, seed=0))
     true = scenery.animal().sample(20000, seed=0)
     assert cKDTree(true).query(ours)[0].mean() < 0.012, (
-        "metres; cells of 8 mm, depth noise of 5 mm, pixels of 11 mm"
+        "meters; cells of 8 mm, depth noise of 5 mm, pixels of 11 mm"
     )
 
 
@@ -93,7 +93,7 @@ def test_template_heading_can_be_rotated(turnaround, template, turn_deg, head):
 def test_cameras_are_accurate(template, turnaround):
     placed = true_from_ours(template, turnaround) @ template.agent_from_camera
     error = np.linalg.norm(placed[:, :3, 3] - turnaround[3][:, :3, 3], axis=1)
-    assert np.median(error) < 0.015, "metres; odometry drifts by some centimetres on the circle"
+    assert np.median(error) < 0.015, "meters; odometry drifts by some centimeters on the circle"
     assert template.coverage_deg > 340
 
 
@@ -130,7 +130,7 @@ def test_each_limb_has_its_own_bone():
     )
     nearest = np.linalg.norm(bones.agent_from_bone_rest[None, :, :3, 3] - tips[:, None], axis=-1)
     assert len(set(nearest.argmin(1))) == len(tips)
-    assert nearest.min(1).max() < 0.07, "metres from a tip to its bone's centre"
+    assert nearest.min(1).max() < 0.07, "meters from a tip to its bone's center"
     assert (bones.bone_scale_m > 0.01).all()
 
 

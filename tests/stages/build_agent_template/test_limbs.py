@@ -26,7 +26,7 @@ def test_frames_with_the_same_tail_pose_are_selected():
     limb = find_limb(*measured(angles), CELLS)
     assert limb is not None and 12 <= len(limb.frames) < 50
     assert np.ptp(angles[limb.frames]) * 0.3 < 0.09, (
-        "metres at the tip: alike within 3 cm to either side of where points are dense"
+        "meters at the tip: alike within 3 cm to either side of where points are dense"
     )
     volume = Volume(np.array([-0.4, -0.1, -0.1]), (81, 21, 46), 0.01, 0.03)
     there = limb_region(limb, volume)

@@ -1,4 +1,4 @@
-"""A mesh supplied by the recording is used if depth confirms it: metric, upright, coloured, with holes where
+"""A mesh supplied by the recording is used if depth confirms it: metric, upright, colored, with holes where
 unobserved.
 """
 
@@ -23,7 +23,7 @@ def clip() -> MemoryClip:
 
 
 def _own(clip: MemoryClip, scale: float = 1.0) -> Mesh:
-    """The room in the odometry frame without colours, and a block outside that was never observed."""
+    """The room in the odometry frame without colors, and a block outside that was never observed."""
     room = clip.caster.mesh
     block = textured_room(edge_m=0.5)
     vertices = np.concatenate([room.vertices, block.vertices + np.array([9.0, 0, 0], np.float32)]).astype(
@@ -45,13 +45,13 @@ def test_own_mesh_is_metric_upright_and_cropped_to_observed_space(clip):
     assert made.own_mesh
     rotation, distance = aligned_errors(made.world_from_camera, clip.truth)
     assert np.median(rotation) < 0.5, "degrees"
-    assert np.median(distance) < 0.02, "metres"
+    assert np.median(distance) < 0.02, "meters"
     up = made.world_from_camera[:, :3, :3] @ np.swapaxes(clip.truth[:, :3, :3], 1, 2) @ np.array([0, 1.0, 0])
     assert np.rad2deg(np.arccos(np.clip(up[:, 1], -1, 1))).max() < 1.5, "degrees between +y and gravity"
     assert np.ptp(made.mesh.vertices, axis=0).max() < 5, "the block that nobody saw is gone"
     camera_height = made.world_from_camera[:, 1, 3].mean() - made.floor_m
     assert abs(camera_height - clip.truth[:, 1, 3].mean()) < 0.06
-    assert made.mesh.color.astype(float).std(0).min() > 10, "frames lend it their colours"
+    assert made.mesh.color.astype(float).std(0).min() > 10, "frames lend it their colors"
     assert len(made.mesh.faces) < len(_own(clip).faces)
 
 

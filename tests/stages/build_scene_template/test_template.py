@@ -38,7 +38,7 @@ def test_template_is_metric_upright_and_accurate(clip, tmp_path):
     made, sparse = template.build(clip, features, config, tmp_path)
     rotation, distance = aligned_errors(made.world_from_camera, clip.truth)
     assert np.median(rotation) < 0.5, "degrees"
-    assert np.median(distance) < 0.015, "metres, without any scale"
+    assert np.median(distance) < 0.015, "meters, without any scale"
     assert made.start.source == "colmap"
     assert len(sparse.frame) >= 10
     up_error = (
@@ -46,7 +46,7 @@ def test_template_is_metric_upright_and_accurate(clip, tmp_path):
     )
     assert np.rad2deg(np.arccos(up_error[:, 1])).max() < 1.5, "degrees between the world's +y and gravity"
     camera_height = made.world_from_camera[:, 1, 3].mean() - made.floor_m
-    assert abs(camera_height - clip.truth[:, 1, 3].mean()) < 0.06, "metres above the floor"
+    assert abs(camera_height - clip.truth[:, 1, 3].mean()) < 0.06, "meters above the floor"
     assert (np.linalg.norm(made.features, axis=1) > 0.9).mean() > 0.5
     template.write_model(sparse, made.world_from_camera, tmp_path / "colmap")
     assert (tmp_path / "colmap" / "images.txt").exists()
@@ -64,7 +64,7 @@ def test_points_per_frame_are_limited_by_memory(clip, monkeypatch):
     monkeypatch.setattr(fuse, "ALIGN_POINTS", 48 * 60)
     _, gap = fuse.align_frames(clip, clip.caster.mesh, start, FusionConfig())
     assert max(taken) <= 48 * 60
-    assert np.nanmedian(gap) < 0.006, "metres; the depth noise is 4 mm, the cameras began 1.6 cm off"
+    assert np.nanmedian(gap) < 0.006, "meters; the depth noise is 4 mm, the cameras began 1.6 cm off"
 
 
 def test_wrong_structure_is_rejected_by_depth(clip):
@@ -91,7 +91,7 @@ def test_keyframes_are_refined_by_depth_and_odometry_alone(clip):
     found = refine.refine_keyframes(clip, frames, keyframes, start, NO_POINTS, RefinementConfig())
     before, after = aligned_errors(start, clip.truth[frames])[1], aligned_errors(found, clip.truth[frames])[1]
     assert np.median(after) < 0.013, (
-        "metres; points at rims, which hold a small room's furniture, do not count"
+        "meters; points at rims, which hold a small room's furniture, do not count"
     )
     assert np.median(after) < 0.7 * np.median(before)
 
@@ -136,7 +136,7 @@ def test_tracked_points_lie_on_the_room(clip, matched):
     pairs = np.stack([tracked.camera, tracked.point])
     assert len(np.unique(pairs, axis=1).T) == len(tracked.camera), "no point twice in a keyframe"
     gap = clip.caster.mesh.vertices[:, None, 1].min() - tracked.unproject(clip.truth[frames])[:, 1]
-    assert np.quantile(gap, 0.95) < 0.05, "metres below the floor"
+    assert np.quantile(gap, 0.95) < 0.05, "meters below the floor"
 
 
 def test_both_sides_of_a_thin_wall_are_kept_apart():

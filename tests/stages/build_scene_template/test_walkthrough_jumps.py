@@ -18,8 +18,8 @@ def test_jump_is_repaired():
     odometry = odometry.copy()
     odometry[25:] = rigid.exp(np.array([0, 0.3, 0, 0.3, 0, 0.1])) @ odometry[25:]
     repaired = template.without_jumps(replace(clip, odometry_from_camera=odometry))
-    assert aligned_errors(odometry, truth)[1].max() > 0.1, "metres"
-    assert aligned_errors(repaired.odometry_from_camera, truth)[1].max() < 0.04, "metres"
+    assert aligned_errors(odometry, truth)[1].max() > 0.1, "meters"
+    assert aligned_errors(repaired.odometry_from_camera, truth)[1].max() < 0.04, "meters"
 
 
 def test_recording_without_odometry_is_unchanged():

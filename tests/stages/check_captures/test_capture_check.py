@@ -152,7 +152,7 @@ def test_damaged_pictures_and_missing_depth_are_reported(tmp_path):
 def _shots(
     seed: int, count: int, offset: np.ndarray | None = None, balls=lambda frame: ()
 ) -> list[SampledFrame]:
-    """Rendered views of a room with the given colours, with balls of (centre, radius) per frame."""
+    """Rendered views of a room with the given colors, with balls of (center, radius) per frame."""
     mesh = textured_room.textured_room(seed, edge_m=0.08)
     caster, size, intrinsics = (
         RayCaster(mesh),

@@ -19,7 +19,7 @@ ANIMAL_COLOR = np.array([235, 120, 30])
 
 
 def render(room: Mesh, camera: np.ndarray, world_from_agent: np.ndarray | None, rng: np.random.Generator):
-    """Return colour, z-depth and the mask of the animal."""
+    """Return color, z-depth and the mask of the animal."""
     meshes, faces = [trimesh.Trimesh(room.vertices, room.faces, process=False)], len(room.faces)
     if world_from_agent is not None:
         meshes.append(animal().apply_transform(world_from_agent))

@@ -28,7 +28,7 @@ def texture(height, width, seed=0):
 
 
 def moved(image, matrix):
-    """Warp so that the point p (pixel centres at +0.5) moves to matrix @ (p, 1)."""
+    """Warp so that the point p (pixel centers at +0.5) moves to matrix @ (p, 1)."""
     shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
     indexed = np.linalg.inv(shift) @ np.vstack([matrix, [0, 0, 1]]) @ shift
     return cv2.warpAffine(

@@ -43,7 +43,7 @@ def test_body_below_the_floor_penetrates(tmp_path: Path) -> None:
     assert set(values) == set(physical.NAMES) and values["behavior/physical_windows"] == 2
     assert (
         values["behavior/recorded/penetration_m"] < 0.003 < 0.01 < values["behavior/ats/penetration_m"] < 0.1
-    ), "metres"
+    ), "meters"
     assert (
         values["behavior/ats/non_collision_share"]
         < 0.7

@@ -12,7 +12,7 @@ from stages.evaluate.reconstruction_tables import table
 
 
 def view(wrong: int) -> HeldoutView:
-    """Return a picture of 100 pixels, 20 of them of the agent, with some scene pixels half a metre too far or
+    """Return a picture of 100 pixels, 20 of them of the agent, with some scene pixels half a meter too far or
     missing.
     """
     color, agent = np.zeros((10, 10, 3), np.uint8), np.zeros((10, 10), bool)

@@ -24,13 +24,13 @@ RNG = np.random.default_rng(0)
 
 
 def plane(height_m: float) -> TriangleSurface:
-    """Return a floor of 120 square metres as two triangles."""
+    """Return a floor of 120 square meters as two triangles."""
     corner = np.array([[0, height_m, 0], [12, height_m, 0], [12, height_m, 10], [0, height_m, 10.0]])
     return TriangleSurface(corner[[[0, 1, 2], [0, 2, 3]]])
 
 
 def soup(count: int) -> np.ndarray:
-    """Return triangles between a centimetre and a metre, some of them degenerate."""
+    """Return triangles between a centimeter and a meter, some of them degenerate."""
     corner = RNG.normal(0, 1, (count, 1, 3)) + RNG.normal(0, 1, (count, 3, 3)) * 10 ** RNG.uniform(
         -2, 0, (count, 1, 1)
     )
@@ -72,7 +72,7 @@ def test_distance_of_parallel_planes(apart_m: float):
 
 def test_distance_of_a_surface_to_itself_is_zero():
     ball = TriangleSurface(BALL.triangles)
-    assert chamfer(ball, ball, 2000, RNG) < 1e-12, "metres"
+    assert chamfer(ball, ball, 2000, RNG) < 1e-12, "meters"
     assert chamfer(ball, TriangleSurface(1.05 * BALL.triangles), 2000, RNG) == pytest.approx(0.01, abs=3e-4)
 
 
@@ -106,7 +106,7 @@ def test_fraction_of_compared_frames_is_reported(tmp_path: Path):
     config, frames = Config(surface_frames=FRAMES), SimpleNamespace(world_from_true_world=np.eye(4))
     values = reconstruction._agent_chamfer(folders, sessions, motions, frames, config, RNG).values
     assert values["reconstruction/agent_chamfer_share"] == pytest.approx(3 / 12)
-    assert values["reconstruction/agent_chamfer_m"] < 1e-6, "metres"
+    assert values["reconstruction/agent_chamfer_m"] < 1e-6, "meters"
     nobody = reconstruction._agent_chamfer(
         folders, sessions, dict.fromkeys(motions), frames, config, RNG
     ).values

@@ -13,7 +13,7 @@ SECONDS = 1.2
 
 
 def model() -> tuple[bytes, Float[np.ndarray, "corner 3"]]:
-    """Return the file with the action `walk`, and its vertices in the world at `SECONDS`, metres."""
+    """Return the file with the action `walk`, and its vertices in the world at `SECONDS`, meters."""
     mesh, weights = small_world.tube()
     joints = np.argsort(-weights, 1)[:, :4]
     kept = np.take_along_axis(weights, joints, 1)

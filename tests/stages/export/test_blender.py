@@ -39,4 +39,4 @@ def test_blender_animates_the_animal_like_python(tmp_path) -> None:
     )
     assert any(name.startswith("walk") for name in found["names"])
     x, y, z = np.array(found["places"]).T  # +z is up in Blender
-    np.testing.assert_allclose(np.stack([x, z, -y], 1), places, atol=2e-5)  # metres
+    np.testing.assert_allclose(np.stack([x, z, -y], 1), places, atol=2e-5)  # meters

@@ -49,4 +49,4 @@ def test_three_animates_the_animal_like_python() -> None:
             [base64.b64encode(model).decode(), moving_tube.SECONDS],
         )
     assert loaded["names"] == ["walk"]
-    np.testing.assert_allclose(loaded["places"], places, atol=2e-5)  # metres
+    np.testing.assert_allclose(loaded["places"], places, atol=2e-5)  # meters

@@ -9,7 +9,7 @@ FAR_M = 9.0
 
 
 def goals(page: Page, places: np.ndarray, **more: object) -> np.ndarray:
-    """Sample goals on the floor, metres, for an observer that walked over `places` [place 2] in steps of 0.1
+    """Sample goals on the floor, meters, for an observer that walked over `places` [place 2] in steps of 0.1
     s.
     """
     question = {"observer": np.atleast_2d(places).tolist(), "seed": 7, "K": 16, **more}
@@ -22,7 +22,7 @@ def approach(here: np.ndarray, side: np.ndarray, near_m: float, speed_m_s: float
 
 
 def away_m(page: Page, near_m: float = 0.6, speed_m_s: float = 0.8, directions: int = 8) -> np.ndarray:
-    """Return, per direction of approach, the shift of goals away from the observer, metres, relative to a
+    """Return, per direction of approach, the shift of goals away from the observer, meters, relative to a
     distant one.
     """
     here = np.array(page.evaluate("ats.state()")["animal"])[[0, 2]]

@@ -281,7 +281,7 @@ def allowed(shape: tuple[int, int, int]) -> np.ndarray:
 
 
 def furnish(build: Path) -> None:
-    """Add a box of `BOX_M` at the centre of the floor, and floor and walls to the volume."""
+    """Add a box of `BOX_M` at the center of the floor, and floor and walls to the volume."""
     scene, half = ply.read_ply(build / "reconstruction/scene.ply"), np.array(BOX_M) / 2
     box = trimesh.creation.box(BOX_M, rigid.make(np.eye(3), [0, half[1], 0])).subdivide().subdivide()
     vertices = np.concatenate([scene.vertices, box.vertices]).astype(np.float32)

@@ -19,11 +19,11 @@ CLEARANCE_M = clearance_of(REST)
 
 
 def test_clearance_scales_with_the_animal():
-    assert clearance_of(REST) == pytest.approx(0.4), "metres, of a cat"
+    assert clearance_of(REST) == pytest.approx(0.4), "meters, of a cat"
     dog = REST * np.array([1.0, 1.0, 1.0, 1.3])
     assert clearance_of(dog) == pytest.approx(PERSON_M + 1.3 * 0.28)
     assert clearance_of(REST[1:2]) == pytest.approx(0.4), (
-        "metres, of an animal of which only the root is known"
+        "meters, of an animal of which only the root is known"
     )
 
 
@@ -49,17 +49,17 @@ def nearest_m(paths: np.ndarray) -> np.ndarray:
 def test_paths_do_not_intersect_the_person(paths):
     led = around_person(paths[:, 1:], paths[:, 0], np.zeros((len(paths), 3)), CLEARANCE_M)
     whole = np.concatenate([paths[:, :1], led], axis=1)
-    assert nearest_m(paths).min() < 0.05 and nearest_m(whole).min() > CLEARANCE_M - 0.01, "metres"
+    assert nearest_m(paths).min() < 0.05 and nearest_m(whole).min() > CLEARANCE_M - 0.01, "meters"
     steps = np.linalg.norm(np.diff(whole[..., [0, 2]], axis=1), axis=-1)
-    assert steps.max() < 0.09, "metres in 0.1 s: a walk, no jump"
+    assert steps.max() < 0.09, "meters in 0.1 s: a walk, no jump"
     past = np.linalg.norm((led[:, -1] - paths[:, -1])[:, [0, 2]], axis=1)
-    assert np.median(past) < 0.02, "metres: those that can arrive arrive"
+    assert np.median(past) < 0.02, "meters: those that can arrive arrive"
 
 
 def test_animal_within_the_clearance_does_not_come_closer(paths):
     start = 0.2 * paths[:, 0] / np.linalg.norm(paths[:, 0][:, [0, 2]], axis=1, keepdims=True)
     led = around_person(paths[:, 1:], start, np.zeros((len(paths), 3)), CLEARANCE_M)
-    assert np.linalg.norm(led[..., [0, 2]], axis=-1).min() > 0.19, "metres"
+    assert np.linalg.norm(led[..., [0, 2]], axis=-1).min() > 0.19, "meters"
 
 
 def test_distant_persons_do_not_change_paths(paths):

@@ -183,9 +183,9 @@ def test_paths_avoid_moved_furniture() -> None:
     whole = np.concatenate([paths[:, :1], led], axis=1)
     assert not entered(whole, moved).any()
     steps = np.linalg.norm(np.diff(whole, axis=1), axis=-1)
-    assert steps.max() < 1.21 * 1.9 / 56, "metres in 0.1 s: a walk, no jump"
+    assert steps.max() < 1.21 * 1.9 / 56, "meters in 0.1 s: a walk, no jump"
     short = np.linalg.norm(whole[:, -1] - paths[:, -1], axis=-1)
-    assert np.median(short) < 0.05 and short.max() < 0.4, "metres: what is left is for the next plan"
+    assert np.median(short) < 0.05 and short.max() < 0.4, "meters: what is left is for the next plan"
 
 
 def mask_of_box(da: int, dc: int) -> np.ndarray:
@@ -196,7 +196,7 @@ def mask_of_box(da: int, dc: int) -> np.ndarray:
 
 
 def entered(paths: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return which paths, sampled every half centimetre, enter one of the columns."""
+    """Return which paths, sampled every half centimeter, enter one of the columns."""
     share = np.linspace(0, 1, 10, endpoint=False)[:, None, None, None]
     dense = paths[:, :-1] * (1 - share) + paths[:, 1:] * share
     at = np.floor((dense[..., [0, 2]] + 2.0) / VOXEL_M + 1e-6).astype(int)

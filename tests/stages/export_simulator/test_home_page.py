@@ -95,7 +95,7 @@ def _check_goals(page: Page, home: Path, cat: Path) -> None:
     companions = np.stack([as_companions(each[None]) for each in place])
     context = Context(met.context.world_from_agent, met.context.agent_from_bone, eyes, companions=companions)
     expected = ats.goals(context, 1, twins.PageNoise(met.seed)).goal[:, 0][:, [0, 2]]
-    assert np.median(np.abs(found["near"] - expected)) < 1e-3, "metres"
+    assert np.median(np.abs(found["near"] - expected)) < 1e-3, "meters"
     away_m = -((found["near"] - found["alone"]) * met.side).sum(-1)
     assert (away_m > 0.1).mean() > 0.4, "it flees from whom it perceives"
 
@@ -108,11 +108,11 @@ def test_animals_are_selected_removed_and_replayed(home: Path, animals: Path, ch
             cat, dog = (np.array(each["place"])[[0, 2]] for each in page.evaluate("ats.state().animals"))
             gaps.append(np.linalg.norm(cat - dog))
             page.wait_for_timeout(100)
-        assert min(gaps) > 0.3, "metres: bodies' 0.4, less what two plans that fade into each other cut"
+        assert min(gaps) > 0.3, "meters: bodies' 0.4, less what two plans that fade into each other cut"
         page.keyboard.press("n")
         assert page.get_by_role("radio", name="dog").is_checked()
         page.mouse.click(*page.evaluate("ats.screen([0.5, 0, -0.4])"))
-        assert np.allclose(page.evaluate("ats.state().aim"), [0.5, -0.4], atol=0.05), "metres: the dog's"
+        assert np.allclose(page.evaluate("ats.state().aim"), [0.5, -0.4], atol=0.05), "meters: the dog's"
         page.get_by_role("radio", name="cat").check()
         assert page.evaluate("ats.state().aim") is None
         assert page.get_by_role("radiogroup", name="The animal that clicks").count() == 1
@@ -145,7 +145,7 @@ def _check_it_replays(page: Page, animals: Path) -> None:
     recorded = (
         BehaviorData.load(animals / "cat/behavior_data").trajectories["v002"].world_from_agent[:, :3, 3]
     )
-    assert np.linalg.norm(recorded - place, axis=1).min() < 0.04, "metres: half a step of the recording"
+    assert np.linalg.norm(recorded - place, axis=1).min() < 0.04, "meters: half a step of the recording"
     plans = page.evaluate("ats.state().animals[0].plans")
     assert plans == before["animals"][0]["plans"], "none was asked for"
     page.evaluate("ats.play()")

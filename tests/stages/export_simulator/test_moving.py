@@ -127,14 +127,14 @@ def test_animal_and_person_walk_around_moved_furniture(furnished: Path, chromium
         for seed in range(6):
             path = _planned(page, here, aim, seed)
             assert not _entered(path, stands), seed
-            assert np.linalg.norm(path[-1] - goal) < 0.5 * np.linalg.norm(here - goal), "metres: it gets past"
+            assert np.linalg.norm(path[-1] - goal) < 0.5 * np.linalg.norm(here - goal), "meters: it gets past"
         _check_it_walks_around(page, stands, goal)
         _check_the_person_does(page, by)
         assert wrong == []
 
 
 def _towards_the_free_side(here: np.ndarray) -> np.ndarray:
-    """Return a step of 1.1 m along the wall, for an animal that walks 1.2 m from the centre."""
+    """Return a step of 1.1 m along the wall, for an animal that walks 1.2 m from the center."""
     aside = np.array([-here[1], here[0]]) - 0.55 * here
     return 1.1 * aside / np.linalg.norm(aside)
 
@@ -186,7 +186,7 @@ def _check_the_person_does(page: Page, by: list[int]) -> None:
         place = np.array(page.evaluate("ats.state().observer"))
         assert not _entered(np.stack([place, place]), _columns(by))
     page.mouse.up()
-    assert np.linalg.norm(place - from_here) > 0.2, "metres: it came as far as the box"
+    assert np.linalg.norm(place - from_here) > 0.2, "meters: it came as far as the box"
 
 
 def test_furniture_is_dragged_by_touch(furnished: Path, chromium: Browser) -> None:

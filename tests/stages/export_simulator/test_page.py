@@ -76,7 +76,7 @@ def test_page_runs_and_animal_reacts_to_the_observer(simulator: Path, chromium: 
         page.wait_for_function(f"ats.state().tick > {before['tick'] + 5}", timeout=120_000)
         after = page.evaluate("ats.state()")
         assert np.linalg.norm(np.subtract(after["animal"], before["animal"])[:3]) > 0.01, (
-            "metres within half a second"
+            "meters within half a second"
         )
         assert wrong == []
 
@@ -112,7 +112,7 @@ def test_animal_walks_around_a_standing_person(simulator: Path, chromium: Browse
                 gaps.append(np.hypot(state["animal"][0] - person[0], state["animal"][2] - person[1]))
             assert state["aim"] is None, f"half a minute, and it stands at {state['animal'][:3]}"
         min_m = clearance_of(small_world.rest()) - 0.04
-        assert min(gaps[4:]) > min_m, "metres: two plans that fade into each other cut corners"
+        assert min(gaps[4:]) > min_m, "meters: two plans that fade into each other cut corners"
         assert wrong == []
 
 
@@ -130,7 +130,7 @@ def _check_reaction(page: Page) -> None:
     far = reaction.goals(page, here + 9 * side)
     assert np.abs(reaction.goals(page, here - 9 * side) - far).max() < 1e-5, "a far observer does not matter"
     assert (reaction.away_m(page, directions=4) > 0.3).all(), (
-        "metres: away from who comes near, whichever way"
+        "meters: away from who comes near, whichever way"
     )
     page.click("#panel-toggle")
     page.locator("#interactivity").press("Home")
@@ -141,7 +141,7 @@ def _check_reaction(page: Page) -> None:
     assert "observer=0" in page.evaluate("location.hash")
     assert np.abs(reaction.goals(page, near) - far).max() < 1e-5, "nor one it is not aware of"
     page.locator("[data-sense=observer]").locator("xpath=..").click()
-    assert np.abs(reaction.goals(page, near) - far).max() > 0.3, "metres: aware again"
+    assert np.abs(reaction.goals(page, near) - far).max() > 0.3, "meters: aware again"
     page.click("#panel-toggle")
 
 
@@ -158,7 +158,7 @@ def _check_it_reacts_as_python_does(page: Page, build: Path) -> None:
     assert 0.2 < there.rate(met.side, 0.4) < 0.8, "not all of them far"
     for further_m in (0.1, 0.3, 0.4, 0.5):
         assert abs(here.rate(met.side, further_m) - there.rate(met.side, further_m)) < 0.03
-    assert np.median(np.abs(here.near - there.near)) < 1e-3, "metres"
+    assert np.median(np.abs(here.near - there.near)) < 1e-3, "meters"
     for answers in (here, there):
         assert np.abs(answers.opposite - answers.far[:5]).max() < 1e-5, "a far observer does not matter"
         assert np.abs(answers.ignored - answers.far[:5]).max() < 1e-5, (
@@ -187,7 +187,7 @@ def _check_a_clicked_goal(page: Page) -> None:
     """The animal reaches the clicked position and is then free again."""
     goal = np.array([-0.6, -0.5])
     page.mouse.click(*page.evaluate("ats.screen([-0.6, 0, -0.5])"))
-    assert np.allclose(page.evaluate("ats.state().aim"), goal, atol=0.05), "metres"
+    assert np.allclose(page.evaluate("ats.state().aim"), goal, atol=0.05), "meters"
     assert "aim=" in page.evaluate("location.hash")
     page.wait_for_function(
         "Math.hypot(ats.state().animal[0] + 0.6, ats.state().animal[2] + 0.5) < 0.3", timeout=120_000
@@ -205,7 +205,7 @@ def _check_goals_in_turn(page: Page, folder: Path) -> None:
     page.keyboard.down("Shift")
     page.mouse.click(*page.evaluate("p => ats.screen(p)", [goals[2, 0], 0, goals[2, 1]]))
     page.keyboard.up("Shift")
-    np.testing.assert_allclose(page.evaluate("ats.state().stops"), goals, atol=0.05)  # metres
+    np.testing.assert_allclose(page.evaluate("ats.state().stops"), goals, atol=0.05)  # meters
     assert page.evaluate("new URLSearchParams(location.hash.slice(1)).get('aim').split(';').length") == 3
     begin = page.evaluate("ats.state().animal")
     with page.expect_download() as download:
@@ -214,15 +214,15 @@ def _check_goals_in_turn(page: Page, folder: Path) -> None:
     journey = read(folder / "goals.toml")
     assert (
         np.linalg.norm(journey[0].position_world - begin[:3]) < 0.5 and journey[0].heading_rad is not None
-    ), "metres: it begins where it was"
+    ), "meters: it begins where it was"
     np.testing.assert_allclose([stop.position_world[[0, 2]] for stop in journey[1:]], goals, atol=0.05)
     for left in (2, 1, 0):
         place = _place_when_stops_are(page, left)
-        assert np.linalg.norm(place - goals[2 - left]) < 0.6, "metres: it is at the stop that is next in turn"
+        assert np.linalg.norm(place - goals[2 - left]) < 0.6, "meters: it is at the stop that is next in turn"
 
 
 def _place_when_stops_are(page: Page, left: int) -> np.ndarray:
-    """Return [x, z] in metres at the moment with a given number of remaining stops, in a single call of the
+    """Return [x, z] in meters at the moment with a given number of remaining stops, in a single call of the
     page.
     """
     state = page.wait_for_function(
@@ -237,7 +237,7 @@ def _check_a_goal_in_a_cupboard(page: Page) -> None:
     """For an unreachable goal the animal stops as near as possible and continues with the next one."""
     page.evaluate("ats.visit([[1.8, -1.8], [0.3, -0.2]])")
     place = _place_when_stops_are(page, 1)
-    assert np.linalg.norm(place - [1.8, -1.8]) < 1.0, "metres: beside the cupboard, which is 0.7 m wide"
+    assert np.linalg.norm(place - [1.8, -1.8]) < 1.0, "meters: beside the cupboard, which is 0.7 m wide"
     page.wait_for_function("ats.state().aim === null", timeout=120_000)
 
 
@@ -254,7 +254,7 @@ def _check_a_drawn_path(page: Page) -> None:
     assert "route=" in page.evaluate("location.hash")
     route = np.array(page.evaluate("ats.state().route.points"))
     assert np.linalg.norm(route[-1] - stroke[-1, [0, 2]]) < 0.1, (
-        "metres: the route ends where the stroke does"
+        "meters: the route ends where the stroke does"
     )
     drawn_at = page.evaluate("ats.state().tick")
     page.wait_for_function(
@@ -269,7 +269,7 @@ def _check_a_drawn_path(page: Page) -> None:
             ticks.add(state["tick"])
         page.wait_for_timeout(20)
         assert len(aside) < 300, "half a minute"
-    assert np.median(aside) < 0.1 and min(ends) < 0.2, "metres"
+    assert np.median(aside) < 0.1 and min(ends) < 0.2, "meters"
 
 
 def _check_downloads(page: Page, folder: Path) -> None:
@@ -298,8 +298,8 @@ def _check_a_clip_beside(page: Page) -> None:
     page.wait_for_function("ats.state().replay && ats.state().tick > 4", timeout=20_000)
     state = page.evaluate("ats.state()")
     truth = small_world.trajectory(120, 0).world_from_agent[state["replay"]["tick"], :3, 3]
-    np.testing.assert_allclose(state["replay"]["place"], truth, atol=5e-4)  # metres: clips are half precision
-    assert np.linalg.norm(np.array(state["animal"])[[0, 2]] - truth[[0, 2]]) < 1.5, "metres: it began there"
+    np.testing.assert_allclose(state["replay"]["place"], truth, atol=5e-4)  # meters: clips are half precision
+    assert np.linalg.norm(np.array(state["animal"])[[0, 2]] - truth[[0, 2]]) < 1.5, "meters: it began there"
 
 
 def _check_an_opened_take(page: Page, folder: Path) -> None:
@@ -329,7 +329,7 @@ def _check_an_opened_take(page: Page, folder: Path) -> None:
 def _check_it_plays(page: Page, name: str, place: np.ndarray) -> None:
     page.wait_for_function(f"ats.state().replay?.name === '{name}' && ats.state().tick > 2", timeout=20_000)
     replay = page.evaluate("ats.state().replay")
-    np.testing.assert_allclose(replay["place"], place[3 * (replay["tick"] % 61)], atol=1e-5)  # metres
+    np.testing.assert_allclose(replay["place"], place[3 * (replay["tick"] % 61)], atol=1e-5)  # meters
 
 
 def test_keys_work_while_the_panel_has_focus(simulator: Path, chromium: Browser) -> None:
@@ -383,7 +383,7 @@ def test_walking_speed_is_limited(simulator: Path, chromium: Browser, tmp_path: 
     address = (simulator / "index.html").as_uri() + "#speed=0.3&at=1.2,1.2"
     with browser.shown(chromium, address, script=WALKS_WHILE_THE_FIRST_PLAN_IS_AWAITED) as (page, wrong):
         assert np.linalg.norm(np.subtract(page.evaluate("ats.state().observer"), 1.2)) > 0.3, (
-            "metres, while the first plan is awaited"
+            "meters, while the first plan is awaited"
         )
         page.wait_for_function("ats.state().take_s > 0.5 && told.length > 1", timeout=120_000)
         page.keyboard.up("w")
@@ -394,7 +394,7 @@ def test_walking_speed_is_limited(simulator: Path, chromium: Browser, tmp_path: 
         told = np.array(page.evaluate("told.at(-1)"))
         for places in (np.stack([table["observer_x"], table["observer_z"]], -1), told[:, [0, 2]]):
             steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
-            assert 0.05 < steps.max() < 0.115, "metres"
+            assert 0.05 < steps.max() < 0.115, "meters"
         assert wrong == []
 
 
@@ -459,7 +459,7 @@ def test_hash_keeps_a_setting_on_a_phone(simulator: Path, chromium: Browser) -> 
         assert page.input_value("#interactivity") == "0.25"
         assert page.evaluate("document.documentElement.scrollWidth") <= 390, "pixels"
         page.touchscreen.tap(*page.evaluate("ats.screen([0.2, 0, -0.3])"))
-        assert np.allclose(page.evaluate("ats.state().aim"), [0.2, -0.3], atol=0.05), "metres"
+        assert np.allclose(page.evaluate("ats.state().aim"), [0.2, -0.3], atol=0.05), "meters"
         assert not page.is_visible("#help")
         page.click("#how")
         assert page.is_visible("#help") and "Tap the floor" in page.inner_text("#help")

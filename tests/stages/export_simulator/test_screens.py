@@ -83,12 +83,12 @@ def test_small_windows_have_a_closed_panel_and_touch_input(simulator: Path, chro
         start = np.array([page.evaluate("ats.state().eye"), page.evaluate("ats.target()")])
         _dragged(touch, [floor[0]], [90.0, 0.0])
         turned = _at_rest(page)
-        assert np.linalg.norm(turned[0] - start[0]) > 0.5, "metres: the eye went around"
-        assert np.allclose(turned[1], start[1], atol=0.02), "metres: what it looks at stayed"
+        assert np.linalg.norm(turned[0] - start[0]) > 0.5, "meters: the eye went around"
+        assert np.allclose(turned[1], start[1], atol=0.02), "meters: what it looks at stayed"
         _dragged(touch, floor, [60.0, 30.0])
         moved = _at_rest(page)
         shift = moved - turned
-        assert np.linalg.norm(shift[1]) > 0.2, "metres: what is looked at moved, and the eye with it"
+        assert np.linalg.norm(shift[1]) > 0.2, "meters: what is looked at moved, and the eye with it"
         assert page.evaluate("ats.state().aim") is None
         page.touchscreen.tap(195, 420)
         goal = page.evaluate(
@@ -113,7 +113,7 @@ def _dragged(touch: CDPSession, fingers: list[np.ndarray], way: list[float]) -> 
 
 
 def _at_rest(page: Page) -> np.ndarray:
-    """Return eye and target in metres once the view has settled."""
+    """Return eye and target in meters once the view has settled."""
     page.wait_for_function(
         """() => {
           const [now, before] = [ats.state().eye, window.eyeBefore];
@@ -134,7 +134,7 @@ def test_page_is_accessible_to_screen_readers(simulator: Path, chromium: Browser
         x, _, z = page.evaluate("ats.state().animal")[:3]
         distance = np.hypot(*np.subtract([x, z], page.evaluate("ats.state().observer")))
         said = page.inner_text("#spoken")
-        assert said.startswith("tube is ") and abs(float(said.split()[2]) - distance) < 0.3, "metres"
+        assert said.startswith("tube is ") and abs(float(said.split()[2]) - distance) < 0.3, "meters"
         page.evaluate("([x, z]) => ats.visit([[x + 0.3, z]])", [x, z])
         page.wait_for_function(
             "document.querySelector('#spoken').textContent.includes('arrived')", timeout=60_000
@@ -153,22 +153,22 @@ def test_headset_controls_the_person(simulator: Path, chromium: Browser) -> None
         _frames(page, 6)
         inside = page.evaluate("ats.state()")
         assert np.allclose(inside["observer"], before["observer"], atol=1e-3), (
-            "metres: it begins where one is"
+            "meters: it begins where one is"
         )
         floor_m = page.evaluate("ats.contract.scene.floor_m")
-        assert inside["eye"][1] == pytest.approx(floor_m + 1.2, abs=1e-3), "metres, as the head is tracked"
+        assert inside["eye"][1] == pytest.approx(floor_m + 1.2, abs=1e-3), "meters, as the head is tracked"
         page.evaluate("headset.place = [0.4, 0.9, 0.0]")
         _frames(page, 4)
         stepped = page.evaluate("ats.state()")
         way = np.linalg.norm(np.subtract(stepped["observer"], inside["observer"]))
-        assert way == pytest.approx(0.3, abs=0.02), "metres: as far as the head went"
+        assert way == pytest.approx(0.3, abs=0.02), "meters: as far as the head went"
         assert np.allclose(np.array(stepped["eye"])[[0, 2]], stepped["observer"], atol=0.05), (
-            "metres: the camera that holds both eyes stands a little behind them"
+            "meters: the camera that holds both eyes stands a little behind them"
         )
         page.evaluate("headset.session.pull()")
         aim = np.array(page.evaluate("ats.state().aim"))
         assert np.linalg.norm(aim - stepped["observer"]) == pytest.approx(0.7 / np.tan(0.8), abs=0.03), (
-            "metres: where the beam of a hand 0.7 m above the floor meets it"
+            "meters: where the beam of a hand 0.7 m above the floor meets it"
         )
         page.evaluate("headset.session.hand.gamepad.axes = [0, 0, 0, 1]")
         _frames(page, 6)
@@ -176,7 +176,7 @@ def test_headset_controls_the_person(simulator: Path, chromium: Browser) -> None
         page.evaluate("headset.session.end()")
         page.wait_for_function("!ats.state().headset")
         _frames(page, 2)
-        assert np.allclose(page.evaluate("ats.state().eye"), before["eye"], atol=1e-2), "metres"
+        assert np.allclose(page.evaluate("ats.state().eye"), before["eye"], atol=1e-2), "meters"
         assert wrong == []
 
 

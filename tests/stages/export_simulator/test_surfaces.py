@@ -33,7 +33,7 @@ def test_floor_is_found_under_furniture(height_m: float) -> None:
         np.concatenate([lifted.faces, top.faces + len(lifted.vertices)]),
     )
     found = surfaces.floor_height_m(both, np.array([[0.0, height_m + 0.8, 0.0]]))
-    assert abs(found - height_m) < 0.01, "metres"
+    assert abs(found - height_m) < 0.01, "meters"
 
 
 def test_walls_face_inwards() -> None:

@@ -45,7 +45,7 @@ class Approaches:
 
 @dataclass(frozen=True)
 class Answers:
-    """Goals of the same plans, metres on the floor, per position of the observer; and with interactivity 0."""
+    """Goals of the same plans, meters on the floor, per position of the observer; and with interactivity 0."""
 
     near: Float[np.ndarray, "plan 2"]
     far: Float[np.ndarray, "plan 2"]

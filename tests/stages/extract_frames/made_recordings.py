@@ -32,12 +32,12 @@ class Made:
 
     @property
     def intrinsics(self) -> np.ndarray:
-        """Intrinsics of the stored colour pictures."""
+        """Intrinsics of the stored color pictures."""
         upright = np.array([[50.0, 0, 25], [0, 52, 31], [0, 0, 1]])
         return cameras.turn_intrinsics(upright, COLOR_SIZE, self.quarter_turns)
 
     def depth(self, frame: int) -> np.ndarray:
-        """Stored z-depth, metres: distance to the nearest wall along each ray."""
+        """Stored z-depth, meters: distance to the nearest wall along each ray."""
         size, color_size = self._size(DEPTH_SIZE), self._size(COLOR_SIZE)
         rays = cameras.ray_directions(cameras.scale_intrinsics(self.intrinsics, color_size, size), *size)
         return self._wall_m(rays, self.stored_from_upright(self.world_from_camera[frame])).astype("<f4")
@@ -58,7 +58,7 @@ class Made:
         return cameras.turn_image(picture, self.quarter_turns)
 
     def poses(self) -> np.ndarray:
-        """[frame 7] as stored by the app: OpenGL axes, quaternion xyzw, metres."""
+        """[frame 7] as stored by the app: OpenGL axes, quaternion xyzw, meters."""
         stored = cameras.opencv_from_opengl(self.stored_from_upright(self.world_from_camera))
         wxyz = rigid.quaternion_from_rotation(stored[:, :3, :3])
         return np.concatenate([np.roll(wxyz, -1, axis=1), stored[:, :3, 3]], axis=1)

@@ -30,7 +30,7 @@ def room():
 
 
 def _seen(room, camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colour and z-depth from a camera."""
+    """Color and z-depth from a camera."""
     mesh, caster = room
     depth, hits = render_view(caster, camera, INTRINSICS, *SIZE)
     return hits.interpolate(mesh, mesh.color).reshape(*SIZE, 3).astype(np.uint8), depth
@@ -71,7 +71,7 @@ def test_walkthrough_is_mapped_and_scaled_by_a_session_with_depth(room, tmp_path
     moved = rigid.apply(
         align.kabsch(plan.odometry_from_camera[:, :3, 3], centres), plan.odometry_from_camera[:, :3, 3]
     )
-    assert np.linalg.norm(moved - centres, axis=1).max() < 0.08, "metres, without any scale"
+    assert np.linalg.norm(moved - centres, axis=1).max() < 0.08, "meters, without any scale"
     off, known = [], []
     for frame, row in zip(mapped.frames, plan.chosen, strict=True):
         true = _seen(room, truth[row])[1][::2, ::2]

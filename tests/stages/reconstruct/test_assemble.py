@@ -1,4 +1,4 @@
-"""Uncertain roots that jump away from certain neighbours are dropped and their masks down-weighted."""
+"""Uncertain roots that jump away from certain neighbors are dropped and their masks down-weighted."""
 
 import dataclasses
 

@@ -53,7 +53,7 @@ def test_fields_and_motion_of_the_earlier_reconstruction_are_kept(made):
         for field, its in ((found.agent, before.agent), (found.scene, before.scene)):
             video = code if field is found.scene else None
             now, then = (each(points, video) for each in (field, its))
-            assert (now.signed_distance - then.signed_distance).abs().mean() < 2e-3, "metres"
+            assert (now.signed_distance - then.signed_distance).abs().mean() < 2e-3, "meters"
         of_v002 = torch.nonzero(found.video == 0)[:, 0]
         assert set(of_v002.tolist()) < set(known.frame.tolist())
         assert not set(torch.nonzero(found.video == 1)[:, 0].tolist()) & set(known.frame.tolist())

@@ -49,7 +49,7 @@ def test_floor_is_shared_and_the_ball_belongs_to_one_video():
                 "units of 0.1 m; cells are 5 cm on a ball of 25 cm, slivers are left out"
             )
             assert at_ball[:, 1].quantile(0.02) > 0.7 and at_ball[:, 3].quantile(0.98) < 0.1, (
-                "the ball keeps its own colour"
+                "the ball keeps its own color"
             )
         else:
             assert at_ball[:, 0].min() > 0.3, "free, or nearly so, for those who saw through it"
@@ -75,5 +75,5 @@ def test_field_on_fused_geometry_survives_saving(tmp_path: pytest.TempPathFactor
     scene = fields.load(tmp_path).scene
     values = scene(BALL[None] + torch.tensor([[0.25, 0, 0]]), torch.tensor([2]))
     assert values.signed_distance.abs() < 0.02 and values.color[0, 0] > 0.7, (
-        "untrained heads leave fused colours as they are"
+        "untrained heads leave fused colors as they are"
     )

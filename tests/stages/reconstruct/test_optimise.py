@@ -149,7 +149,7 @@ def test_room_and_ball_are_reconstructed(solved):
     code = torch.full((2,), -1)
     with torch.no_grad():
         assert (found.scene(centre, code).signed_distance > 0.05).all(), "the middle of the room is free"
-        assert (found.scene(wall, code).signed_distance.abs() < 0.05).all(), "metres; cells are 0.2 m"
+        assert (found.scene(wall, code).signed_distance.abs() < 0.05).all(), "meters; cells are 0.2 m"
     ball = marching_cubes.extract_agent(found.agent, 0.04)
     assert np.abs(np.linalg.norm(ball.vertices, axis=-1) - RADIUS_M).mean() < 0.02
 
@@ -283,7 +283,7 @@ def test_surface_behind_a_depth_edge_may_be_occluded():
 
 
 def test_penetration_of_the_floor_is_penalized():
-    """The floor is 10 cm below the centre of the ball; the bottom of the ball is moved up."""
+    """The floor is 10 cm below the center of the ball; the bottom of the ball is moved up."""
     found, _ = problem()
     height = torch.linspace(-0.4, 0.4, 9).view(1, 9, 1, 1).expand(9, 9, 9, 1) + 0.1
     block = torch.cat([(height / 0.2).clamp(-1, 1), torch.zeros(9, 9, 9, 4)], dim=-1)
@@ -303,7 +303,7 @@ def test_penetration_of_the_floor_is_penalized():
 
 
 def test_deep_penetration_is_penalized():
-    """Fused distances end a little below a surface; a ball half a metre below the floor is moved up too."""
+    """Fused distances end a little below a surface; a ball half a meter below the floor is moved up too."""
     found, _ = problem()
     block = torch.cat([torch.ones(9, 9, 9, 1), torch.zeros(9, 9, 9, 4)], dim=-1)
     fused = FusedGeometry(

@@ -56,7 +56,7 @@ def test_rendered_depth_is_correct_without_surface_losses(with_annealing):
     )
     measured = views.depth[0].float().numpy()
     beside = (measured > 0) & (views.outside_px[0].float().numpy() > 4)
-    assert (np.abs(depth - measured) < 0.1)[beside].mean() > 0.9, "metres; the paper's DepthAcc"
+    assert (np.abs(depth - measured) < 0.1)[beside].mean() > 0.9, "meters; the paper's DepthAcc"
     assert not agent.any(), "its pose was not given"
 
 
@@ -97,4 +97,4 @@ def test_every_ray_hits_a_thin_fused_wall():
     both = torch.cat([depth, fine], dim=1).sort(dim=1).values
     weight = ray_weights(both, torch.ones(500), wall(both, 0.005))
     assert (weight.sum(1) > 0.99).all()
-    assert ((weight * both).sum(1) / weight.sum(1) - wall_m[:, 0]).abs().max() < 0.02, "metres"
+    assert ((weight * both).sum(1) / weight.sum(1) - wall_m[:, 0]).abs().max() < 0.02, "meters"

@@ -50,7 +50,7 @@ def test_long_free_space_is_transparent():
     clear, fog = (density(distance, beta_m, truncation_m) for truncation_m in (0.06, None))
     seen, veiled = (composite(depth, torch.ones(1), layer(each, (0, 0, 1))) for each in (clear, fog))
     torch.testing.assert_close(seen.depth, torch.tensor([4.0]), atol=0.02, rtol=0)
-    assert seen.opacity > 0.99 and veiled.depth < 2, "metres"
+    assert seen.opacity > 0.99 and veiled.depth < 2, "meters"
 
 
 def test_surfaces_are_found_where_no_depth_was_measured():

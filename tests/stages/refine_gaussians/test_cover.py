@@ -24,7 +24,7 @@ EVERYWHERE, SHARED = np.ones((3, 8000), bool), np.full(8000, -1)
 
 
 def paint(points: np.ndarray) -> np.ndarray:
-    """Grey for x < 0, elsewhere red and blue squares of 10 cm."""
+    """Gray for x < 0, elsewhere red and blue squares of 10 cm."""
     checked = (np.floor(points[:, 0] / 0.1) + np.floor(points[:, 1] / 0.1)) % 2
     squares = np.where(checked[:, None], [0.9, 0.2, 0.2], [0.2, 0.2, 0.9])
     return np.where(points[:, :1] < 0, 0.5, squares)
@@ -60,7 +60,7 @@ def film(video: int) -> DrawnVideo:
 
 @pytest.fixture(scope="module")
 def wall() -> gaussians.SurfaceSamples:
-    """The reconstructed wall: colours blurred to the mean of each side, and a back-facing second layer."""
+    """The reconstructed wall: colors blurred to the mean of each side, and a back-facing second layer."""
     vertices = np.array(
         [[x, y, WALL_M + z] for z in (0, 0.02) for x in (-1.4, 0, 1.4) for y in (-1, 1)], np.float32
     )
@@ -88,7 +88,7 @@ def test_colour_and_light_are_recovered(wall):
 
 
 def test_surfaces_in_observed_free_space_are_removed(wall):
-    """All pictures see through the second layer, half a metre in front of the wall."""
+    """All pictures see through the second layer, half a meter in front of the wall."""
     ghost = wall.points[:, 2] > WALL_M + 0.01
     points = wall.points - ghost[:, None] * np.array([0, 0, 0.5])
     seen = cover.observe(replace(wall, points=points), EVERYWHERE, [film(0), film(1)], FRAMES)

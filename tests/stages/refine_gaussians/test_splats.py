@@ -78,7 +78,7 @@ def test_optimization_converges_to_a_known_picture():
         optimizer.step()
         errors.append(error.item())
     assert errors[-1] < 0.4 * errors[0]
-    assert abs(truth.depth[15, 20] - 1.0) < 0.05, "metres: the front of a ball of 0.5 m at 1.5 m"
+    assert abs(truth.depth[15, 20] - 1.0) < 0.05, "meters: the front of a ball of 0.5 m at 1.5 m"
 
 
 def test_animal_occludes_the_room():

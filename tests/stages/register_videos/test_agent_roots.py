@@ -55,7 +55,7 @@ def test_root_is_found_from_all_initial_headings(yaw_deg):
     best = placed[agent_fit.cost(observation, model, placed).argmin()]
     turn = np.rad2deg(rigid.rotation_angle(best[:3, :3], truth[:3, :3]))
     assert turn < 8, "degrees"
-    assert np.linalg.norm(best[:3, 3] - truth[:3, 3]) < 0.03, "metres"
+    assert np.linalg.norm(best[:3, 3] - truth[:3, 3]) < 0.03, "meters"
     assert best[1, 1] > 1 - 1e-4, "upright"
 
 
@@ -96,7 +96,7 @@ def test_lying_animal_is_not_lifted_to_standing_height():
     observation = replace(observation_of(mesh, truth), standing_m=0.22 + 0.12)
     start = rigid.make(truth[:3, :3], truth[:3, 3] + [0.02, 0.1, 0.02])
     placed = agent_fit.fit_fine(observation, model, start[None], rounds=12, tilt=True)[0]
-    assert np.linalg.norm(placed[:3, 3] - truth[:3, 3]) < 0.03, "metres"
+    assert np.linalg.norm(placed[:3, 3] - truth[:3, 3]) < 0.03, "meters"
 
 
 def partly(

@@ -49,7 +49,7 @@ def test_alignment_recovers_the_pose(scene):
 def test_true_pose_is_a_fixed_point(scene):
     clip, features, truth = scene
     matches = feature_correspondences(clip, NoAgent(1), features, 0, truth)
-    assert np.abs(residuals(truth[None], matches)).max() < 1e-4, "metres"
+    assert np.abs(residuals(truth[None], matches)).max() < 1e-4, "meters"
 
 
 def test_constant_features_do_not_move_the_camera(scene):

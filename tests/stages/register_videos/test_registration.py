@@ -45,7 +45,7 @@ def test_recording_is_registered(maps, with_odometry):
     found = registration.register(clip, NoAgent(40), maps, config, np.random.default_rng(0))
     errors = pose_errors(found.aligned.world_from_camera, truth)
     assert np.median(errors.degrees) < (0.3 if with_odometry else 1.0), "degrees"
-    assert np.median(errors.meters) < (0.015 if with_odometry else 0.04), "metres"
+    assert np.median(errors.meters) < (0.015 if with_odometry else 0.04), "meters"
     assert found.confidence.mean() > 0.8, "all frames are right"
     assert not found.roots.visible.any()
     assert np.isnan(found.roots.world_from_agent).all()
@@ -61,7 +61,7 @@ def test_registration_is_robust_to_a_tracking_jump(maps):
     found = registration.register(clip, NoAgent(40), maps, config, np.random.default_rng(0))
     errors = pose_errors(found.aligned.world_from_camera, truth)
     assert errors.degrees.max() < 1.0, "degrees"
-    assert errors.meters.max() < 0.05, "metres; the jump is 0.6 m"
+    assert errors.meters.max() < 0.05, "meters; the jump is 0.6 m"
 
 
 @pytest.mark.slow
@@ -91,7 +91,7 @@ def test_other_room_is_rejected(maps):
 
 
 def test_symmetric_pose_has_low_confidence(maps):
-    """A rotation by 180 degrees about the centre of a rectangular room fits depth, but no picture."""
+    """A rotation by 180 degrees about the center of a rectangular room fits depth, but no picture."""
     truth = walk(40, seed=7)
     caster = RayCaster(maps.scene)
     middle = rigid.make(np.eye(3), (maps.scene.vertices.min(0) + maps.scene.vertices.max(0)) / 2)
@@ -150,10 +150,10 @@ def test_repainted_room_is_rejected(maps):
     assert "looks different" in registration.rejection_reason(fit, right["other"], doubtful, inliers, config)
     assert registration.rejection_reason(fit, right["dim"], doubtful, inliers, config) is None
     assert registration.rejection_reason(fit, right["other"], sure, inliers, config) is None, (
-        "recognised with certainty"
+        "recognized with certainty"
     )
     rare = replace(doubtful, queries=10 * len(votes.frame))
-    assert "were recognised and agree" in registration.rejection_reason(
+    assert "were recognized and agree" in registration.rejection_reason(
         fit, right["dim"], rare, inliers, config
     ), "chance, of so many"
 

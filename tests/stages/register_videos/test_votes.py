@@ -33,7 +33,7 @@ def test_one_motion_is_found_among_wrong_votes():
     assert np.rad2deg(rigid.rotation_angle(carried[:, :3, :3], truth[:, :3, :3])).max() < 3.0, (
         "degrees, drift included"
     )
-    assert np.linalg.norm(carried[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.12, "metres"
+    assert np.linalg.norm(carried[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.12, "meters"
     assert (agreement.inliers == ~wrong).mean() > 0.9
     assert agreement.world_from_odometry[1, 1] > 1 - 1e-9, "gravity stays"
 
@@ -45,7 +45,7 @@ def test_scattered_votes_are_rejected():
     agreement = voting.find_agreement(votes, drifting(truth, 4), True, options)
     assert "agree" in voting.rejection_reason(votes, agreement.inliers if agreement else None)
     few = voting.FrameVotes(frames[:1], votes.hypotheses[:1], 12, votes.nearest)
-    assert "recognised" in voting.rejection_reason(few, None)
+    assert "recognized" in voting.rejection_reason(few, None)
 
 
 def broken_odometry(truth, jump_at) -> Odometry:
@@ -69,5 +69,5 @@ def test_votes_without_odometry_use_visual_odometry_and_drop_outliers():
     assert (inliers == ~wrong).all()
     poses = odometry.propagate_votes(votes, inliers, time, motion)
     error = np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1)
-    assert np.median(error) < 0.04, "metres"
-    assert error.max() < 0.15, "metres, the jump included"
+    assert np.median(error) < 0.04, "meters"
+    assert error.max() < 0.15, "meters, the jump included"

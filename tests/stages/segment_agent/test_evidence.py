@@ -1,4 +1,4 @@
-"""Sharpening of depth edges, and colour evidence that tolerates misalignment."""
+"""Sharpening of depth edges, and color evidence that tolerates misalignment."""
 
 import numpy as np
 import pytest

@@ -48,7 +48,7 @@ def _footage(folder: Path, pictures: list[np.ndarray], steps: list[np.ndarray]) 
 
 
 def test_motion_separates_the_animal_from_background_in_its_box(tmp_path):
-    """Half of the box shows a wall whose colour is rare outside; only the animal moves."""
+    """Half of the box shows a wall whose color is rare outside; only the animal moves."""
     rng = np.random.default_rng(0)
     picture = np.full((*SIZE, 3), (40, 110, 40), np.uint8)
     picture[30:60, 40:120] = 190, 190, 180
@@ -65,7 +65,7 @@ def test_motion_separates_the_animal_from_background_in_its_box(tmp_path):
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory) -> tuple[Footage, list[np.ndarray]]:
-    """An animal walks to the right in front of a wall with an object of its colour."""
+    """An animal walks to the right in front of a wall with an object of its color."""
     rng = np.random.default_rng(0)
     wall = np.clip(rng.normal((40, 110, 40), 12, (*SIZE, 3)), 0, 255).astype(np.uint8)
     coat = np.clip(rng.normal((150, 90, 50), 12, (*SIZE, 3)), 0, 255).astype(np.uint8)

@@ -20,7 +20,7 @@ scenery = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(scenery)
 
 THING, RADIUS_M = np.array([0.4, 0.0, 0.2]), 0.25
-"""a part of the room that is mistaken for the animal, world, metres"""
+"""a part of the room that is mistaken for the animal, world, meters"""
 
 
 @pytest.fixture(scope="module")

@@ -62,7 +62,7 @@ def test_person_is_separated_from_the_animal(visited, tmp_path):
     true = rigid.apply(rigid.inverse(truth.world_from_camera), person[:, None, :3, 3])[:, 0]
     off = np.linalg.norm(stored["feet_camera"][:, 0] - true, axis=-1)
     assert np.isfinite(off[seen]).mean() > 0.7, "share of the frames that show the person"
-    assert np.nanmedian(off) < 0.1, "metres"
+    assert np.nanmedian(off) < 0.1, "meters"
 
 
 def test_no_people_are_found_without_people(tmp_path):

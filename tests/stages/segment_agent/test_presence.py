@@ -121,7 +121,7 @@ def test_appearance_decides_without_geometry():
 
 
 def test_specular_surfaces_are_labelled_by_appearance():
-    """A surface whose colour changes beside the animal is labelled animal only if it looks like one."""
+    """A surface whose color changes beside the animal is labeled animal only if it looks like one."""
     shape, no = (60, 80), np.zeros((60, 80), bool)
     animal, gloss = no.copy(), no.copy()
     animal[20:40, 10:40], gloss[20:40, 40:75] = True, True

@@ -75,7 +75,7 @@ def test_standing_animal_is_segmented_in_a_turnaround(tmp_path):
 
 
 def around(middle, radius_m, outward=False, count=12):
-    """Return level cameras on a circle that face its centre or away from it."""
+    """Return level cameras on a circle that face its center or away from it."""
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
     away = np.stack([np.cos(angles), np.zeros(count), np.sin(angles)], axis=1)
     eyes = np.array(middle) + radius_m * away
@@ -156,7 +156,7 @@ def test_prompt_applies_to_connected_tracks():
 
 
 def click(mask, frame):
-    """Return a click at the centre of a true mask."""
+    """Return a click at the center of a true mask."""
     row, column = np.argwhere(mask)[mask.sum() // 2]
     return prompts.Prompt(frame, (column + 0.5, row + 0.5) * 2)
 
@@ -178,7 +178,7 @@ def test_prompted_static_animal_is_segmented(tmp_path):
 
 @pytest.mark.slow
 def test_other_moving_object_does_not_replace_a_prompted_animal(tmp_path):
-    """The animal leaves for good after 1.6 s; an object of similar size and another colour moves all the
+    """The animal leaves for good after 1.6 s; an object of similar size and another color moves all the
     time.
     """
     poses, agent = scenery.session()
@@ -251,7 +251,7 @@ def test_click_is_placed_on_the_surface(tmp_path):
 
 @pytest.mark.slow
 def test_appearance_is_learned_despite_label_noise():
-    """A striped object in front of noise; every seventh frame is labelled as background."""
+    """A striped object in front of noise; every seventh frame is labeled as background."""
     rng, examples, truths = np.random.default_rng(1), [], []
     for frame in range(28):
         color = rng.integers(90, 130, (96, 96, 3)).astype(np.uint8)

@@ -63,9 +63,9 @@ def test_animals_perceive_and_avoid_each_other(animals, tmp_path):
     assert list(alone) == ["cat"]
     places = [take["world_from_agent"][:, :3, 3] for take in together.values()]
     np.testing.assert_array_equal(places[0][0], alone["cat"]["world_from_agent"][0, :3, 3])
-    assert np.abs(places[0] - alone["cat"]["world_from_agent"][:, :3, 3]).max() > 1e-3, "metres"
+    assert np.abs(places[0] - alone["cat"]["world_from_agent"][:, :3, 3]).max() > 1e-3, "meters"
     gap = np.linalg.norm((places[0] - places[1])[:, [0, 2]], axis=-1)
-    assert gap[0] >= 0.4 and gap.min() > 0.3, "metres: bodies' 0.4, less what both do at once"
+    assert gap[0] >= 0.4 and gap.min() > 0.3, "meters: bodies' 0.4, less what both do at once"
 
 
 def test_replayed_animal_is_perceived(animals, tmp_path):
@@ -83,7 +83,7 @@ def test_replayed_animal_is_perceived(animals, tmp_path):
     np.testing.assert_array_equal(found, recorded)
     np.testing.assert_array_equal(living["dog"]["world_from_agent"][0], found[0])
     cats = [take["cat"]["world_from_agent"][:, :3, 3] for take in (living, replayed)]
-    assert np.abs(cats[0] - cats[1]).max() > 1e-4, "metres: it reacts to the clip"
+    assert np.abs(cats[0] - cats[1]).max() > 1e-4, "meters: it reacts to the clip"
 
 
 @pytest.mark.parametrize(

@@ -185,7 +185,7 @@ def test_observer_is_in_the_home_of_the_take(tmp_path, seen):
     takes.of_behavior(homes(tmp_path, seen), settings, "cpu").write(tmp_path)
     take = npz.load(tmp_path / "take.npz")
     begin, person = take["world_from_agent"][0, :3, 3], take["observer_world"]
-    assert abs(begin[0] - 20) < 2, "metres: the second home"
+    assert abs(begin[0] - 20) < 2, "meters: the second home"
     np.testing.assert_allclose(
         person,
         np.tile(

@@ -34,7 +34,7 @@ def test_dog_follows_and_makes_way():
         assert each.companion is not None
         apart = np.linalg.norm((each.animal.position - each.companion.position)[:, [0, 2]], axis=-1)
         level = (each.animal.position[:, 1] < 0.05) & (each.animal.airborne == 0)
-        assert apart[level].min() > 0.4, "metres between centres"
+        assert apart[level].min() > 0.4, "meters between centers"
         assert (each.companion.position[:, 1] == 0).all(), "on the floor"
         assert each.companion.speed().max() < 4.0
     near = [
@@ -57,7 +57,7 @@ def test_its_feet_stand_on_the_floor():
         animal.surface(DOG, world_from_agent @ bones)[:, 1].min()
         for world_from_agent, bones in zip(motion.world_from_agent, motion.agent_from_bone, strict=True)
     ]
-    assert np.abs(lowest).max() < 0.035, "metres: soles sink in as those of the cat do, in proportion"
+    assert np.abs(lowest).max() < 0.035, "meters: soles sink in as those of the cat do, in proportion"
 
 
 def test_each_animal_has_its_own_ground_truth(tmp_path):

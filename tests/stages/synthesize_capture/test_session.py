@@ -65,4 +65,4 @@ def test_animal_flees_from_an_approaching_person():
         cat = Policy(floor, HOME.places, np.zeros(2), np.random.default_rng(2))
         for _ in range(45):
             cat.step(STEP_S, SeenWalker(-1.2 * toward, 1.1 * toward))
-        assert cat.walker.position @ toward > 0.5, "metres along the way from the person to it"
+        assert cat.walker.position @ toward > 0.5, "meters along the way from the person to it"

@@ -37,7 +37,7 @@ def test_bones_have_the_same_names(species):
 @pytest.mark.parametrize("posture", [(0, 0, 0), (1, 0, 0), (0, 1, 0)])
 def test_it_rests_on_the_ground(species, posture):
     lowest = [points[:, 1].min() for points, _ in _shown(species, _course(0.0, posture))]
-    assert np.abs(lowest).max() < 0.015, "metres"
+    assert np.abs(lowest).max() < 0.015, "meters"
 
 
 @pytest.mark.parametrize(("species", "feet"), [("cat", 4), ("rabbit", 4), ("hen", 2)])
@@ -46,7 +46,7 @@ def test_it_stands_on_its_feet(species, feet):
     lows = [points[bone == animal.INDEX[name], 1].min(initial=1.0) for name in SOLES]
     assert sum(low < 0.02 for low in lows) == feet, lows
     if feet == 2:
-        assert min(lows[2:]) > 0.1, "metres: wings are off the ground"
+        assert min(lows[2:]) > 0.1, "meters: wings are off the ground"
 
 
 @pytest.mark.parametrize("species", OTHERS)
@@ -54,14 +54,14 @@ def test_it_stands_on_its_feet(species, feet):
 def test_it_walks_on_the_ground(species, speed):
     shown = _shown(species, _course(speed))
     assert np.isfinite([points for points, _ in shown]).all()
-    assert np.abs([points[:, 1].min() for points, _ in shown]).max() < 0.03, "metres"
+    assert np.abs([points[:, 1].min() for points, _ in shown]).max() < 0.03, "meters"
 
 
 def test_rabbit_hops_with_both_hind_feet():
     motion = gait.poses(_course(1.0), np.linspace(1, 3, 200), animal.BODIES["rabbit"])
     left, right = (_heights(motion, name) for name in ("left toes", "right toes"))
     assert np.corrcoef(left, right)[0, 1] > 0.9
-    assert np.ptp(motion.world_from_agent[:, 1, 3]) > 0.03, "metres that the body rises and falls"
+    assert np.ptp(motion.world_from_agent[:, 1, 3]) > 0.03, "meters that the body rises and falls"
 
 
 def test_hen_moves_one_foot_at_a_time():

@@ -1,4 +1,4 @@
-"""Chained simulation: a breathing animal counts as resting, despite millimetres of difference to recorded
+"""Chained simulation: a breathing animal counts as resting, despite millimeters of difference to recorded
 motion.
 """
 

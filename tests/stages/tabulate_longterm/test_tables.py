@@ -106,7 +106,7 @@ def test_tables_hold_every_method_with_intervals(source):
     assert found["longterm/base_beyond_ours/mpjpe_mm"] == pytest.approx(apart)
     for method in ("ours", "ours_opt", "base_opt"):
         assert found[f"longterm/{method}/end_v2v_share"] < 1e-4, (
-            "given ends are kept, by the networks and by the optimisation"
+            "given ends are kept, by the networks and by the optimization"
         )
     assert found["longterm/ours_opt/seam_share"] < 0.05
     for seconds in (2, 4, 6):

@@ -465,7 +465,7 @@ def test_static_animal_is_exported(windows, tmp_path):
 
 
 class Timid:
-    """Networks of an animal that moves one metre away from an observer within 4 m, with a standard deviation
+    """Networks of an animal that moves one meter away from an observer within 4 m, with a standard deviation
     of 0.1 m.
     """
 

@@ -43,7 +43,7 @@ def described(views: int, seed: int) -> DescribedViews:
 
 
 def asked(net, seen: DescribedViews) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rotation errors (degrees), translation errors (metres) and scores of all views."""
+    """Return rotation errors (degrees), translation errors (meters) and scores of all views."""
     sampling, solver = PatchSampling("scene", 100.0, 0, 8, (6,)), model.RansacSolver(0.15, 0.3, 200, 1)
     localizer = model.Localizer(sampling, seen.basis, net, model.Calibration(0.0, 1.0), solver)
     answers = [localizer.localize_patches(patches)[0] for patches in seen.patches]
@@ -58,7 +58,7 @@ def test_poses_are_regressed():
     )
     rotation, distance, certainty = asked(net, described(40, 2))
     assert np.median(rotation) < 20, "degrees; guessing has 34"
-    assert np.median(distance) < 0.4, "metres; guessing has 0.7"
+    assert np.median(distance) < 0.4, "meters; guessing has 0.7"
     assert ((certainty > 0) & (certainty < 1)).all()
 
 
