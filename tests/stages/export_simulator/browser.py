@@ -28,6 +28,12 @@ FLAGS = [
     "--mute-audio",
 ]
 
+FEWER_FRAMES = """
+  const nextFrame = window.requestAnimationFrame.bind(window);
+  window.requestAnimationFrame = (draw) => setTimeout(() => nextFrame(draw), 60);
+"""
+"""At most 15 frames per second: drawing more of them in software takes half of the CPU time of these tests."""
+
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
@@ -56,7 +62,7 @@ def shown(
     home = address.rsplit("/", 1)[0]
     context = browser.new_context(viewport={"width": size[0], "height": size[1]}, **more)
     page = context.new_page()
-    page.add_init_script(script)
+    page.add_init_script(FEWER_FRAMES + script)
     wrong: list[str] = []
     page.on(
         "console",

@@ -176,14 +176,17 @@ def _check_the_person_does(page: Page, by: list[int]) -> None:
     from_here = middle - np.array([0.8, 0])
     page.keyboard.press("m")
     page.evaluate("place => ats.moveObserver(place)", from_here.tolist())
-    page.wait_for_timeout(300)
     page.evaluate("ats.play()")
+    page.wait_for_timeout(300)  # the figure is moved when a frame is drawn
     page.mouse.move(*page.evaluate("([x, z]) => ats.screen([x, 0.8, z])", from_here.tolist()))
     page.mouse.down()
     page.mouse.move(*page.evaluate("([x, z]) => ats.screen([x + 0.8, 0, z])", middle.tolist()), steps=3)
-    for _ in range(20):
+    state = page.evaluate("ats.state()")
+    begin = state["tick"]
+    while state["tick"] < begin + 10:
         page.wait_for_timeout(50)
-        place = np.array(page.evaluate("ats.state().observer"))
+        state = page.evaluate("ats.state()")
+        place = np.array(state["observer"])
         assert not _entered(np.stack([place, place]), _columns(by))
     page.mouse.up()
     assert np.linalg.norm(place - from_here) > 0.2, "meters: it came as far as the box"
