@@ -1,6 +1,7 @@
 """Kill the toy build twelve times while stages write, without ground truth on disk; the artifacts are byte-identical.
 
-Artifacts that are never killed are copied from the toy. `benchmarks.faults` kills builds hundreds of times.
+Artifacts that are never killed, and those of all recordings but one, are copied from the toy. `benchmarks.faults` kills
+whole builds hundreds of times.
 """
 
 import contextlib
@@ -27,6 +28,8 @@ KILLS = {
 }  # fmt: skip
 """Number of kills per artifact while it, or a checkpoint of its training, is written."""
 TRAININGS = ("reconstruction", "splats", "behavior")
+RECORDING = "v001"
+"""The recording whose own artifacts are written here, the turnaround."""
 BUILT = [node.artifact for node in dag.nodes_of("recordings") if not (node.on_demand or node.mapped)]
 """Artifacts of `make toy`."""
 FROM_TRUTH = ("reconstruction_metrics", "evaluation", "report")
@@ -47,9 +50,16 @@ def copy(toy, tmp_path_factory) -> Path:
     (folder / ".venv").symlink_to(ROOT / ".venv")
     shutil.copytree(toy / "synthetic_capture", folder / "build/toy/synthetic_capture")
     shutil.rmtree(folder / "build/toy/synthetic_capture/truth")
-    for name in set(BUILT) - {"synthetic_capture", *KILLS, *FROM_TRUTH}:
+    for name in set(BUILT) - {"synthetic_capture", *FROM_TRUTH}:
         shutil.copytree(toy / name, folder / "build/toy" / name)
+    for name in KILLS:
+        shutil.rmtree(written_here(folder, name))
     return folder
+
+
+def written_here(folder: Path, name: str) -> Path:
+    """Return the folder of artifact `name` that is written in the copy."""
+    return folder / "build/toy" / name / (RECORDING if dag.NODES[name].roles else "")
 
 
 def start_build(folder: Path) -> subprocess.Popen[bytes]:
@@ -99,7 +109,7 @@ def kill_while_writing(folder: Path, names: list[str], choice: random.Random) ->
         if not new:
             assert code == 0, (folder / "build.log").read_text()[-3000:]
             for name in names:
-                shutil.rmtree(folder / "build" / "toy" / name)
+                shutil.rmtree(written_here(folder, name))
         elif new[0][1].exists():
             return new[0][0], str(new[0][1].relative_to(folder))
     raise AssertionError(f"{names} were never killed while they were written")
