@@ -114,7 +114,7 @@ export function api(simulator) {
         .project(room.camera);
       return [((spot.x + 1) / 2) * innerWidth, ((1 - spot.y) / 2) * innerHeight];
     },
-    // What the view is turned about, world metres.
+    // What the view is turned about, world meters.
     target: () => room.orbit.target.toArray(),
     frames: () => simulator.frames ?? 0,
   };

@@ -1,4 +1,4 @@
-// The room as a still: drawn once per view, colours and depth, and laid beneath everything else in every
+// The room as a still: drawn once per view, colors and depth, and laid beneath everything else in every
 // frame. Where a processor draws, this is most of the work saved while the view rests.
 
 import * as THREE from 'three';

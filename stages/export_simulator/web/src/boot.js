@@ -13,7 +13,7 @@ function missing() {
     ];
   if (typeof WebAssembly !== 'object')
     return [
-      'The behaviour model runs in WebAssembly, which is switched off here.',
+      'The behavior model runs in WebAssembly, which is switched off here.',
       'Open the page in another browser, or leave lockdown mode for it.',
     ];
   if (typeof DecompressionStream !== 'function')

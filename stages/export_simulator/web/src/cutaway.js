@@ -4,7 +4,7 @@
 import * as THREE from 'three';
 import { SplatEdit, SplatEditRgbaBlendMode, SplatEditSdf, SplatEditSdfType } from '@sparkjsdev/spark';
 
-const RADIUS_M = 0.34; // shows an animal of half a metre whole
+const RADIUS_M = 0.34; // shows an animal of half a meter whole
 const SHORT_OF_M = 0.3; // the cut ends this far before the animal, so that what carries it stays
 const ABOVE_FLOOR_M = 0.06; // lower things stay: they hide nothing
 const FLAT_EDGE_M = 0.08; // splats fade out over this

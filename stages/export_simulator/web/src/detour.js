@@ -168,7 +168,7 @@ export class Detour {
   }
 }
 
-// Corners taken less sharply: each point in the middle of its neighbours, which keeps a voxel's distance.
+// Corners taken less sharply: each point in the middle of its neighbors, which keeps a voxel's distance.
 function rounded(points, from) {
   return points.map((point, i) => {
     const next = points[i + 1];

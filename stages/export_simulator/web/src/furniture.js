@@ -19,7 +19,7 @@ const BESIDE = [
   [0, -1, 0],
 ];
 
-// The voxels of a volume by number, by place in the grid [a, b, c] and by metres of the world.
+// The voxels of a volume by number, by place in the grid [a, b, c] and by meters of the world.
 export class Grid {
   constructor({ shape: [, vx, vy, vz], origin, voxel_m: voxel }) {
     Object.assign(this, { vx, vy, vz, origin, voxel, count: vx * vy * vz });
@@ -234,7 +234,7 @@ export class Furniture {
   }
 
   // Why a piece cannot be set down at a move from where it was recorded, or null. others: the moves of other
-  // pieces; bodies: [{name, place: [x, z]}] that are in the way within `apart`, metres.
+  // pieces; bodies: [{name, place: [x, z]}] that are in the way within `apart`, meters.
   refusal(piece, by, others, bodies, apart) {
     const { grid, level } = this;
     const { occupancy } = arranged(this, [...others, { cells: piece.all, by: null }]);

@@ -50,7 +50,7 @@ export function animated(model, name, times, frames) {
   return packed(json, parts, length);
 }
 
-// Quaternions xyzw, unit length, with neighbours on one side.
+// Quaternions xyzw, unit length, with neighbors on one side.
 function withoutFlips(rows) {
   let last = null;
   return rows.flatMap((row) => {

@@ -117,7 +117,7 @@ export class Headset {
     this.rig.position.z += z - from.z;
   }
 
-  // Where the head is, world metres; null until it is tracked.
+  // Where the head is, world meters; null until it is tracked.
   head() {
     const { xr } = this.room.renderer;
     const pose = xr.getFrame()?.getViewerPose(xr.getReferenceSpace());

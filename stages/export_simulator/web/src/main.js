@@ -16,7 +16,7 @@ import { Resident, TICK_S } from './resident.js';
 import { Room } from './room.js';
 import { Route } from './route.js';
 import { doingsText, readDoings, readMoves, readPlaces, readPoint, readState, writeState } from './state.js';
-import { Stops, metres, placesText } from './stops.js';
+import { Stops, meters, placesText } from './stops.js';
 import { Tags } from './tags.js';
 import { save } from './take.js';
 import { rootOf } from './timeline.js';
@@ -69,7 +69,7 @@ class Simulator {
     this.room.renderer.setAnimationLoop(() => this.frame());
     // the animal is seen while what it plans with is loaded
     this.planner = await Planner.open(this.residents, (share) =>
-      panel.status(`loading the behaviour model, ${Math.round(100 * share)} %`),
+      panel.status(`loading the behavior model, ${Math.round(100 * share)} %`),
     );
     this.mover.inform();
     await this.addSplats().catch((error) => {
@@ -201,7 +201,7 @@ class Simulator {
     const sides = ['ahead', 'ahead to the left', 'left', 'behind to the left', 'behind'];
     const eighth = Math.round(Math.atan2(Math.sin(turn), Math.cos(turn)) / (Math.PI / 4));
     const side = eighth < 0 ? sides[-eighth].replace('left', 'right') : sides[eighth];
-    return `${this.selected.name} is ${Math.hypot(dx, dz).toFixed(1)} metres away, ${side}`;
+    return `${this.selected.name} is ${Math.hypot(dx, dz).toFixed(1)} meters away, ${side}`;
   }
 
   play() {
@@ -471,7 +471,7 @@ class Simulator {
   }
 
   rememberPlace() {
-    this.state.at = this.observer.place.map(metres).join(',');
+    this.state.at = this.observer.place.map(meters).join(',');
     writeState(this.state, this.contract);
     this.moved = false;
   }

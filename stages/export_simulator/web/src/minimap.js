@@ -24,7 +24,7 @@ export class Minimap {
     this.back = backdrop(picture, this.size, picture.half / this.half, this.turn);
   }
 
-  // How far to the right and down on the map something is that lies x, z beside the centre.
+  // How far to the right and down on the map something is that lies x, z beside the center.
   turned(x, z) {
     const [fx, fz] = this.ahead;
     return [x * -fz + z * fx, -(x * fx + z * fz)];
@@ -36,7 +36,7 @@ export class Minimap {
     return this.turned(x - this.center[0], z - this.center[1]).map((value) => value * scale + this.size / 2);
   }
 
-  // How far the room goes on the turned map, metres from its middle.
+  // How far the room goes on the turned map, meters from its middle.
   reach({ pixels, half }) {
     const side = Math.sqrt(pixels.length / 4);
     let furthest = 0;

@@ -15,7 +15,7 @@ const PROBES = [
   [-0.4, -0.4],
 ]; // of a voxel's edge
 const SEEN_M = 0.08; // the mesh within this of the floor's height is floor
-const AROUND_M = 0.5; // from there the floor's colour is taken
+const AROUND_M = 0.5; // from there the floor's color is taken
 const [FITS, REFUSED] = [0x3f7f5f, 0xb03a2e];
 
 export class Movables {
@@ -93,7 +93,7 @@ export class Movables {
     this.room.redraw();
   }
 
-  // A plane of the floor's colour where furniture stood and no floor was seen, dotted as other such floor.
+  // A plane of the floor's color where furniture stood and no floor was seen, dotted as other such floor.
   fillFloor(moves) {
     const { grid, floor } = this.furniture;
     for (const child of [...this.patch.children]) {
@@ -125,7 +125,7 @@ export class Movables {
     return ray.intersectObject(this.room.mesh, false).length > 0;
   }
 
-  // The mean colour of the floor around some places.
+  // The mean color of the floor around some places.
   floorColor(places) {
     const { position, color } = this.room.mesh.geometry.attributes;
     const { floor } = this.furniture;

@@ -5,7 +5,7 @@ import { Detour } from './detour.js';
 import { Furniture, Grid, arranged, sameCells } from './furniture.js';
 import { Movables } from './movables.js';
 import * as panel from './panel.js';
-import { metres } from './stops.js';
+import { meters } from './stops.js';
 import { Support } from './support.js';
 
 const APART_M = 0.25; // from the middle of whoever is there
@@ -204,7 +204,7 @@ export class Mover {
     this.held = null;
     const reason = this.pick({ place: [tx, tz], up: ty - floor });
     this.say(
-      reason ?? `Furniture ${away(piece).toFixed(1)} metres away: arrows move it, Enter sets it down.`,
+      reason ?? `Furniture ${away(piece).toFixed(1)} meters away: arrows move it, Enter sets it down.`,
     );
   }
 
@@ -268,12 +268,12 @@ export class Mover {
     return moment(seed);
   }
 
-  // What has been moved, as the address keeps it: a voxel of each piece and its move, metres.
+  // What has been moved, as the address keeps it: a voxel of each piece and its move, meters.
   get text() {
     const { grid } = this.furniture;
     return [...this.by]
       .map(([piece, by]) => [...grid.center(piece.seed), ...by.map((value) => value * grid.voxel)])
-      .map((numbers) => numbers.map(metres).join(','))
+      .map((numbers) => numbers.map(meters).join(','))
       .join(';');
   }
 

@@ -6,7 +6,7 @@ const MAX_GOALS = 16;
 const LIFT_M = 0.025;
 
 export class Overlays {
-  // floor: its height; crouch: height of the root above what it stands on, at least. Metres.
+  // floor: its height; crouch: height of the root above what it stands on, at least. Meters.
   constructor(scene, floor, crouch) {
     this.floor = floor;
     this.group = new THREE.Group();
@@ -41,7 +41,7 @@ export class Overlays {
     this.layers = { goals: true, path: true };
   }
 
-  // goals: points in the world; chosen: index; path: points; all metres.
+  // goals: points in the world; chosen: index; path: points; all meters.
   show(plan) {
     this.plan = plan;
     const count = Math.min(MAX_GOALS, plan.goals.length);

@@ -216,9 +216,9 @@ export function howTo() {
 export async function copyLink() {
   try {
     await navigator.clipboard.writeText(location.href);
-    help('The address of this behaviour is copied.', 4);
+    help('The address of this behavior is copied.', 4);
   } catch {
-    help("The address of this behaviour stands in the browser's address line.", 6);
+    help("The address of this behavior stands in the browser's address line.", 6);
   }
 }
 

@@ -8,7 +8,7 @@ function withPoweredLength(way, power, minSquared) {
   return way.map((value) => value * factor);
 }
 
-// Goals in metres as they are diffused, and back.
+// Goals in meters as they are diffused, and back.
 export const scaledGoal = (goal, deviation, encoding) =>
   withPoweredLength(goal, encoding.goal_length_power, encoding.min_squared_m2).map(
     (value, axis) => value / deviation[axis],

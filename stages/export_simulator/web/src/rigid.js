@@ -1,4 +1,4 @@
-// Rigid motions as rows of seven numbers: place x y z (metres), quaternion w x y z. Named a_from_b, as
+// Rigid motions as rows of seven numbers: place x y z (meters), quaternion w x y z. Named a_from_b, as
 // everywhere here.
 
 export const ROW = 7;
@@ -98,7 +98,7 @@ export function normalize(v) {
   return v.map((value) => value / length);
 }
 
-// Blend whole frames (many rows): linear for places, shortest normalised arc for turns.
+// Blend whole frames (many rows): linear for places, shortest normalized arc for turns.
 export function blend(first, second, share, out = new Float32Array(first.length)) {
   for (let at = 0; at < first.length; at += ROW) {
     for (let i = 0; i < 3; i++) out[at + i] = first[at + i] + share * (second[at + i] - first[at + i]);

@@ -99,7 +99,7 @@ export class Room {
     if (this.backdrop) this.backdrop.key = '';
   }
 
-  // The longer side of the room, metres.
+  // The longer side of the room, meters.
   get span() {
     const [low, high] = this.contract.scene.bounds_m;
     return Math.max(high[0] - low[0], high[2] - low[2]);

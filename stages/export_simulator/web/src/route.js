@@ -7,7 +7,7 @@ const AHEAD_M = 0.8; // how far beyond what is done the walker may be found
 export const ARRIVED_M = 0.12;
 
 export class Route {
-  // places: [[x, z], ...] in metres, in the order drawn.
+  // places: [[x, z], ...] in meters, in the order drawn.
   constructor(places) {
     this.points = evenly(places);
     this.length = SPACING_M * (this.points.length - 1);

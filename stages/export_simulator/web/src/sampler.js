@@ -173,7 +173,7 @@ export class Sampler {
     return Float32Array.from(each.flat());
   }
 
-  // The i-th of scaled goals in metres, and back.
+  // The i-th of scaled goals in meters, and back.
   goal(scaled, i = 0) {
     return goalFrom(
       scaled.subarray(3 * i, 3 * i + 3),
@@ -418,7 +418,7 @@ export class Sampler {
     };
   }
 
-  // Metres and channels, frame by frame.
+  // Meters and channels, frame by frame.
   unscaled(path, body) {
     const { body_mean: mean, body_std: deviation } = this.contract.scaling;
     const each = Array.from({ length: this.frames }, (_, i) => i);

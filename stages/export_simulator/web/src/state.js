@@ -1,4 +1,4 @@
-// The settings of the page, mirrored in the address after '#', so that a behaviour can be linked.
+// The settings of the page, mirrored in the address after '#', so that a behavior can be linked.
 
 export const SPEEDS = [1, 0.3]; // seconds of the animal's life a second
 export const VIEWS = ['room', 'animal', 'you'];
@@ -6,7 +6,7 @@ export const AWAY = 'off'; // what an animal does that is switched off
 const LARGEST_SEED = 999999;
 const SWITCHES = ['scene', 'observer', 'companions', 'past', 'goal', 'goals', 'path', 'outline'];
 
-// Every setting with its default; those of the behaviour model come with the contract.
+// Every setting with its default; those of the behavior model come with the contract.
 export function defaults({ controls: { interactivity, samples, steps }, animals }) {
   return {
     interactivity: interactivity.default,
@@ -91,20 +91,20 @@ export const doingsText = (doings) =>
     .map((each) => each.join(':'))
     .join(',');
 
-// 'x,y,z,dx,dz;...', furniture by a place in it and how far it was moved, to numbers in metres; none where it is
+// 'x,y,z,dx,dz;...', furniture by a place in it and how far it was moved, to numbers in meters; none where it is
 // something else.
 export function readMoves(text) {
   const moves = text.split(';').map((move) => move.split(',').map(Number));
   return moves.every((move) => move.length === 5 && move.every(Number.isFinite)) ? moves : [];
 }
 
-// 'x,z;x,z;...' in metres to a list of points; none where it is something else.
+// 'x,z;x,z;...' in meters to a list of points; none where it is something else.
 export function readPlaces(text) {
   const points = text.split(';').map(readPoint);
   return points.every(Boolean) ? points : [];
 }
 
-// 'x,z' in metres, or 'x,z,up' for what is above the floor, to numbers; or null.
+// 'x,z' in meters, or 'x,z,up' for what is above the floor, to numbers; or null.
 export function readPoint(text) {
   const point = text.split(',').map(Number);
   return text && (point.length === 2 || point.length === 3) && point.every(Number.isFinite) ? point : null;

@@ -6,7 +6,7 @@ import { rotate } from './rigid.js';
 const ARRIVED_M = 0.25;
 
 export class Stops {
-  // points: [[x, z], ...] on the floor, or [x, z, up] above it, metres; from: the root's row where the
+  // points: [[x, z], ...] on the floor, or [x, z, up] above it, meters; from: the root's row where the
   // journey begins; rootAt: a point to the height of the root there.
   constructor(points = [], from = null, rootAt = null) {
     Object.assign(this, { points, from, rootAt, reached: 0, nearest: new Map() });
@@ -44,22 +44,22 @@ export class Stops {
     return point[2] ? [point[0], this.rootAt(point), point[1]] : point.slice(0, 2);
   }
 
-  // The whole journey, with where it begins: metres, world frame; 0 degrees looks along +z, 90 along +x.
+  // The whole journey, with where it begins: meters, world frame; 0 degrees looks along +z, 90 along +x.
   get toml() {
     const [x, y, z, ...turn] = this.from;
     const nose = rotate(turn, [0, 0, 1]);
     const heading = (Math.atan2(nose[0], nose[2]) * 180) / Math.PI;
     const begin =
-      `# where it stood\n[[subgoal]]\nposition = [${[x, y, z].map(metres).join(', ')}]\n` +
+      `# where it stood\n[[subgoal]]\nposition = [${[x, y, z].map(meters).join(', ')}]\n` +
       `heading_deg = ${heading.toFixed(1)}\n`;
     const stops = this.points.map(
-      (point) => `[[subgoal]]\nposition = [${this.position(point).map(metres).join(', ')}]\n`,
+      (point) => `[[subgoal]]\nposition = [${this.position(point).map(meters).join(', ')}]\n`,
     );
     return new Blob([[begin, ...stops].join('\n')], { type: 'application/toml' });
   }
 }
 
-export const metres = (value) => value.toFixed(2);
+export const meters = (value) => value.toFixed(2);
 
 // Places on the floor as they stand in the address: 'x,z;x,z'.
-export const placesText = (points) => points.map((point) => point.map(metres).join(',')).join(';');
+export const placesText = (points) => points.map((point) => point.map(meters).join(',')).join(';');

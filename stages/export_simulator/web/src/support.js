@@ -8,7 +8,7 @@ export class Support {
     Object.assign(this, { volume, allowed });
   }
 
-  // The heights of the tops that carry the animal at [x, z], world metres, lowest first; none outside the
+  // The heights of the tops that carry the animal at [x, z], world meters, lowest first; none outside the
   // volume.
   tops(x, z) {
     const {

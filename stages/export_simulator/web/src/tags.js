@@ -1,4 +1,4 @@
-// Words beside what is drawn, so that nothing depends on colour alone.
+// Words beside what is drawn, so that nothing depends on color alone.
 
 export class Tags {
   constructor(camera) {

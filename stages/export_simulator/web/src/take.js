@@ -25,7 +25,7 @@ export class Take {
     return Math.max(0, this.rows.length - 1) / RATE_HZ;
   }
 
-  // One line per tick; metres, seconds, world frame, quaternion wxyz. The columns that `stages.simulate`
+  // One line per tick; meters, seconds, world frame, quaternion wxyz. The columns that `stages.simulate`
   // writes, then the goal.
   csv() {
     const head = [
