@@ -15,7 +15,7 @@ from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import Architecture, Scaling
 from pipeline.behavior.path_encoding import PATH_CHANNELS
-from pipeline.behavior.planning import Array, Networks, PlanCondition, SampledPlan, Sampler
+from pipeline.behavior.planning import Array, PlanCondition, SampledPlan, Sampler, TorchNetworks
 
 MEAN_STEP, LOG_STD_STEP = 0.0, 1.0
 """Steps at which the networks, given a zero sample, predict mean and log standard deviation."""
@@ -26,7 +26,7 @@ PLANS_AT_ONCE = 512
 
 
 def sampler_of(
-    architecture: Architecture, networks: Networks, schedule: Schedule, scaling: Scaling
+    architecture: Architecture, networks: TorchNetworks, schedule: Schedule, scaling: Scaling
 ) -> Sampler:
     """Return the sampler for the architecture's family."""
     match architecture.family:

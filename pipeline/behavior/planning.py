@@ -1,13 +1,12 @@
 """Hierarchical sampling of plans from an observation: goal, then path, then body (Fig. 3).
 
 `observe` encodes a context as network inputs, `Sampler.plan` samples plans, `SampledPlan.world_from_agent`
-transforms them to the world. The protocol `Networks` is implemented by torch modules and ONNX sessions.
+transforms them to the world.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -35,28 +34,8 @@ Denoise = Callable[[Array, float], Array]
 """maps noisy samples and a step to the predicted noise"""
 
 
-class Networks(Protocol):
-    """The four networks on NumPy arrays of float32, batch first."""
-
-    def perceive(self, scene_grid: Array, others: Array, past: Array, keep: Array) -> Array:
-        """Return the perception code."""
-        ...
-
-    def goal(self, x: Array, t: Array, condition: Array) -> Array:
-        """Return the noise in x; each row of the condition is repeated to match the rows of x."""
-        ...
-
-    def path(self, x: Array, t: Array, condition: Array, control: Array, keep: Array) -> Array:
-        """Return the noise in x."""
-        ...
-
-    def body(self, x: Array, t: Array, condition: Array, control: Array, keep: Array) -> Array:
-        """Return the noise in x."""
-        ...
-
-
 class TorchNetworks:
-    """`Networks` as torch modules on any device."""
+    """The four networks, on any device, on NumPy arrays of float32, batch first."""
 
     def __init__(self, nets: BehaviorNets, device: str = "cpu"):
         self.nets, self.device = nets.eval().to(device), device
@@ -67,15 +46,19 @@ class TorchNetworks:
             return module(*tensors).cpu().numpy()
 
     def perceive(self, scene_grid: Array, others: Array, past: Array, keep: Array) -> Array:
+        """Return the perception code."""
         return self._run(self.nets.perception, scene_grid, others, past, keep)
 
     def goal(self, x: Array, t: Array, condition: Array) -> Array:
+        """Return the noise in x; each row of the condition is repeated to match the rows of x."""
         return self._run(self.nets.goal, x, t, condition)
 
     def path(self, x: Array, t: Array, condition: Array, control: Array, keep: Array) -> Array:
+        """Return the noise in x."""
         return self._run(self.nets.path, x, t, condition, control, keep)
 
     def body(self, x: Array, t: Array, condition: Array, control: Array, keep: Array) -> Array:
+        """Return the noise in x."""
         return self._run(self.nets.body, x, t, condition, control, keep)
 
 
@@ -182,7 +165,7 @@ class PlanCondition:
 class Sampler:
     """Samples plans with networks, schedule and scaling."""
 
-    networks: Networks
+    networks: TorchNetworks
     schedule: Schedule
     scaling: Scaling
     guided: Guided = "observer"
