@@ -100,29 +100,18 @@ def draw(
     height: int, width: int, backend: Backend = "tiles",
 ) -> tuple[Float[Tensor, "height width channel"], Float[Tensor, "height width"]]:  # fmt: skip
     """Draw Gaussians with any values (color, depth, masks ...): returns blended values and coverage 0..1."""
+    camera = camera_from_world, intrinsics, height, width
     match backend:
         case "tiles" | "dense":
-            footprints = project(
-                means_world, rotation, log_scale, camera_from_world, intrinsics, height, width
-            )
+            footprints = project(means_world, rotation, log_scale, *camera)
             if backend == "dense":
                 return blend_dense(footprints, opacity, values, height, width)
             from pipeline.fields.rasterize_tiles import blend_tiles  # numba compiles on import
 
             return blend_tiles(footprints, opacity, values, height, width)
         case "gsplat":
-            from pipeline.fields.rasterize_cuda import Gsplat
+            from pipeline.fields import rasterize_cuda
 
-            return Gsplat().draw(
-                means_world,
-                rotation,
-                log_scale,
-                opacity,
-                values,
-                camera_from_world,
-                intrinsics,
-                height,
-                width,
-            )
+            return rasterize_cuda.draw(means_world, rotation, log_scale, opacity, values, *camera)
         case _:
             assert_never(backend)

@@ -10,44 +10,26 @@ from pipeline.core.errors import InputError
 from pipeline.fields.footprints import BLUR_PX2
 
 
-class Gsplat:
-    """Draws with gsplat; the same convention as `pipeline.fields.rasterize.draw`."""
+def draw(
+    means_world: Float[Tensor, "point 3"], rotation: Float[Tensor, "point 4"],
+    log_scale: Float[Tensor, "point 3"],
+    opacity: Float[Tensor, "point"], values: Float[Tensor, "point channel"],
+    camera_from_world: Float[Tensor, "4 4"], intrinsics: Float[Tensor, "3 3"], height: int, width: int,
+) -> tuple[Float[Tensor, "height width channel"], Float[Tensor, "height width"]]:  # fmt: skip
+    """Draw one view, meters, as `pipeline.fields.rasterize.draw` does.
 
-    def __init__(self):
-        """Raises `InputError` DEP-001 when gsplat is not installed or there is no CUDA device."""
-        try:
-            gsplat = importlib.import_module("gsplat")
-        except ImportError as error:
-            raise InputError(
-                "DEP-001",
-                what="gsplat is not installed",
-                where="rasterizer gsplat",
-                remedy='pip install gsplat, or set backend = "tiles"',
-            ) from error
-        if not torch.cuda.is_available():
-            raise InputError(
-                "DEP-001",
-                what="gsplat needs a CUDA device",
-                where="rasterizer gsplat",
-                remedy='set backend = "tiles"',
-            )
-        self._rasterization = gsplat.rasterization
-
-    def draw(
-        self,
-        means_world: Float[Tensor, "point 3"],
-        rotation: Float[Tensor, "point 4"],
-        log_scale: Float[Tensor, "point 3"],
-        opacity: Float[Tensor, "point"],
-        values: Float[Tensor, "point channel"],
-        camera_from_world: Float[Tensor, "4 4"],
-        intrinsics: Float[Tensor, "3 3"],
-        height: int,
-        width: int,
-    ) -> tuple[Float[Tensor, "height width channel"], Float[Tensor, "height width"]]:
-        """Draw one view, meters; see `pipeline.fields.rasterize.draw`."""
-        image, coverage, _ = self._rasterization(
-            means_world, torch.nn.functional.normalize(rotation, dim=-1), log_scale.exp(), opacity, values,
-            camera_from_world[None], intrinsics[None], width, height, near_plane=0.1, eps2d=BLUR_PX2,
-        )  # fmt: skip
-        return image[0], coverage[0, ..., 0]
+    Raises `InputError` DEP-001 when gsplat is not installed or there is no CUDA device.
+    """
+    where, tiles = "rasterizer gsplat", 'set backend = "tiles"'
+    try:
+        gsplat = importlib.import_module("gsplat")
+    except ImportError as error:
+        remedy = f"pip install gsplat, or {tiles}"
+        raise InputError("DEP-001", "gsplat is not installed", where, remedy) from error
+    if not torch.cuda.is_available():
+        raise InputError("DEP-001", "gsplat needs a CUDA device", where, tiles)
+    image, coverage, _ = gsplat.rasterization(
+        means_world, torch.nn.functional.normalize(rotation, dim=-1), log_scale.exp(), opacity, values,
+        camera_from_world[None], intrinsics[None], width, height, near_plane=0.1, eps2d=BLUR_PX2,
+    )  # fmt: skip
+    return image[0], coverage[0, ..., 0]
