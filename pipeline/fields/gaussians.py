@@ -82,16 +82,9 @@ class Gaussians(nn.Module):
 
     def cloud(self, which: Int[Tensor, "chosen"] | slice = slice(None)) -> Cloud:
         """Return all or some Gaussians in their own frame."""
+        ellipsoids = self.means[which], self.rotation[which], self.log_scale[which]
         opacity = self.opacity_logit[which].sigmoid()
-        color = self.band0[which] * BAND0 + 0.5
-        return Cloud(
-            self.means[which],
-            self.rotation[which],
-            self.log_scale[which],
-            opacity,
-            color,
-            torch.zeros_like(opacity),
-        )
+        return Cloud(*ellipsoids, opacity, self.band0[which] * BAND0 + 0.5, torch.zeros_like(opacity))
 
 
 @dataclass(frozen=True)
@@ -243,17 +236,9 @@ def render(
     """Draw a cloud: color, depth, the agent's share, and any further values per Gaussian."""
     depth = cloud.means @ camera_from_world[2, :3] + camera_from_world[2, 3]
     values = [cloud.color, depth[:, None], cloud.agent[:, None]] + ([] if extra is None else [extra])
+    ellipsoids, camera = (cloud.means, cloud.rotation, cloud.log_scale), (camera_from_world, intrinsics)
     image, coverage = rasterize.draw(
-        cloud.means,
-        cloud.rotation,
-        cloud.log_scale,
-        cloud.opacity,
-        torch.cat(values, dim=-1),
-        camera_from_world,
-        intrinsics,
-        height,
-        width,
-        backend,
+        *ellipsoids, cloud.opacity, torch.cat(values, dim=-1), *camera, height, width, backend
     )
     return RenderedCloud(
         image[..., :3], image[..., 3] / coverage.clamp_min(1e-3), image[..., 4], coverage, image[..., 5:]
@@ -266,18 +251,11 @@ def save_ply(path: Path, gaussians: Gaussians, which: Bool[Tensor, "point"]) -> 
         rotation = functional.normalize(gaussians.rotation, dim=-1)
         rest = torch.zeros(len(gaussians), HIGHER_BANDS, device=rotation.device)
         normals = torch.zeros_like(gaussians.means)
-        table = torch.cat(
-            [
-                gaussians.means,
-                normals,
-                gaussians.band0,
-                rest,
-                gaussians.opacity_logit[:, None],
-                gaussians.log_scale,
-                rotation,
-            ],
-            dim=-1,
-        )
+        columns = (
+            gaussians.means, normals, gaussians.band0, rest,
+            gaussians.opacity_logit[:, None], gaussians.log_scale, rotation,
+        )  # fmt: skip
+        table = torch.cat(columns, dim=-1)
     gaussian_ply.write(path, table[which].cpu().numpy())
 
 

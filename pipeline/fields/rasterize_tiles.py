@@ -176,13 +176,5 @@ def blend_tiles(
     width: int,
 ) -> tuple[Float[Tensor, "height width channel"], Float[Tensor, "height width"]]:
     """Blend Gaussians near to far, as `pipeline.fields.rasterize.blend_dense` does, in tiles of pixels."""
-    return _Blend.apply(
-        footprints.pixel,
-        footprints.conic,
-        opacity,
-        values,
-        footprints.radius_px,
-        footprints.depth,
-        height,
-        width,
-    )
+    f = footprints
+    return _Blend.apply(f.pixel, f.conic, opacity, values, f.radius_px, f.depth, height, width)
