@@ -47,20 +47,10 @@ class Volume:
         camera_from_world = rigid.inverse(world_from_camera)
         start = camera_from_world[:3, :3] @ self.origin + camera_from_world[:3, 3]
         steps = np.ascontiguousarray(camera_from_world[:3, :3].T * self.voxel_m)
-        _integrate(
-            self.distance,
-            self.weight,
-            self.color,
-            self.color_weight,
-            start,
-            steps,
-            np.ascontiguousarray(depth, np.float32),
-            trust,
-            _focal(depth_intrinsics),
-            np.ascontiguousarray(color),
-            _focal(intrinsics),
-            self.truncation_m,
-        )
+        grids = self.distance, self.weight, self.color, self.color_weight
+        depths = np.ascontiguousarray(depth, np.float32), trust, _focal(depth_intrinsics)
+        colors = np.ascontiguousarray(color), _focal(intrinsics)
+        _integrate(*grids, start, steps, *depths, *colors, self.truncation_m)
 
     def surface(self, min_weight: float) -> Mesh:
         """Extract the zero crossing between voxels seen often enough; what was never seen stays open."""
