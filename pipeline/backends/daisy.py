@@ -20,9 +20,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.data import npz
+from pipeline.data.features import BASIS, CHANNELS
 
-CHANNELS = 16
 WHITENING = 0.5
 """between the variance of each axis (0) and equal axes (1): strong axes do not drown the others, noise stays
 small"""
@@ -68,18 +67,12 @@ class FeatureBasis:
     @classmethod
     def load(cls, folder: Path) -> "FeatureBasis":
         """Open a finished ``feature_basis`` artifact."""
-        table = npz.load(folder / "basis.npz", ("mean", "components", "scale", "explained"))
+        table = BASIS.load(folder / "basis.npz")
         return cls(table["mean"], table["components"], float(table["scale"]), table["explained"])
 
     def save(self, folder: Path) -> None:
         """Write ``basis.npz``."""
-        npz.save(
-            folder / "basis.npz",
-            mean=self.mean,
-            components=self.components,
-            scale=np.array(self.scale, np.float32),
-            explained=self.explained,
-        )
+        BASIS.save(folder / "basis.npz", **vars(self))
 
     def project(self, raw: Float[np.ndarray, "*cell channel"]) -> Float[np.ndarray, "*cell 16"]:
         """Return unit-length features of raw descriptors."""
