@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.data.schema import FileSchema
+from pipeline.data.schema import FileSchema, Stored
 
 POSES = FileSchema.of(
     "registration/poses.npz",
@@ -20,9 +20,10 @@ POSES = FileSchema.of(
 
 
 @dataclass(frozen=True)
-class RegisteredPoses:
+class RegisteredPoses(Stored):
     """Poses of camera (OpenCV axes) and agent in the world, per frame."""
 
+    schema = POSES
     timestamp_s: Float[np.ndarray, "frame"]
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     world_from_agent: Float[np.ndarray, "frame 4 4"]
@@ -35,15 +36,10 @@ class RegisteredPoses:
     @classmethod
     def open(cls, folder: Path) -> "RegisteredPoses | None":
         """Read a recording's `poses.npz`; None if its registration was refused. Raises InputError ART-010."""
-        path = folder / "poses.npz"
-        return cls(**POSES.load(path)) if path.exists() else None
+        return super().open(folder) if (folder / "poses.npz").exists() else None
 
     @classmethod
     def unknown(cls, timestamp_s: Float[np.ndarray, "frame"]) -> "RegisteredPoses":
         """Return the poses of a refused recording: NaN with confidence 0."""
         nowhere, nothing = np.full((len(timestamp_s), 4, 4), np.nan), np.zeros(len(timestamp_s))
         return cls(timestamp_s, nowhere, nowhere, nothing, nothing, nothing > 0)
-
-    def write(self, folder: Path) -> None:
-        """Write `poses.npz` into an unfinished artifact."""
-        POSES.save(folder / "poses.npz", **vars(self))

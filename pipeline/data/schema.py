@@ -1,12 +1,13 @@
 """Schemas of the NPZ files of artifacts: key, axes and dtype of every array, checked on save and load.
 
-A module per artifact kind declares its files as `FileSchema` and offers typed readers and writers over it;
-`tests/test_data_layout.py` compares every schema with `data_layout.md`.
+A module per artifact kind declares its files as `FileSchema` and offers typed readers and writers over it
+(`Stored` has those of a dataclass); `tests/test_data_layout.py` compares every schema with `data_layout.md`.
 """
 
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar, Self
 
 import numpy as np
 from jaxtyping import Shaped
@@ -93,3 +94,18 @@ class FileSchema:
                 if lengths.setdefault(axis, int(axis) if axis.isdigit() else length) != length:
                     return f"{key} has {length} along {axis} instead of {lengths[axis]}"
         return None
+
+
+class Stored:
+    """The base of dataclasses whose fields are the arrays of one file."""
+
+    schema: ClassVar[FileSchema]
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Read the file of a finished artifact. Raises InputError ART-010."""
+        return cls(**cls.schema.load(folder / Path(cls.schema.file).name))
+
+    def write(self, folder: Path) -> None:
+        """Write the file into an artifact in the making."""
+        self.schema.save(folder / Path(self.schema.file).name, **vars(self))

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from pipeline.data.schema import FileSchema
+from pipeline.data.schema import FileSchema, Stored
 
 SCENE_CAMERAS = FileSchema.of(
     "scene_template/cameras.npz",
@@ -33,9 +33,10 @@ SKIN = FileSchema.of(
 
 
 @dataclass(frozen=True)
-class SceneCameras:
+class SceneCameras(Stored):
     """Cameras of the walk-through, OpenCV axes."""
 
+    schema = SCENE_CAMERAS
     timestamp_s: Float[np.ndarray, "frame"]
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     """of every frame; those not registered are placed by odometry"""
@@ -44,15 +45,6 @@ class SceneCameras:
     registered: Bool[np.ndarray, "frame"]
     keyframe: Bool[np.ndarray, "frame"]
     """jointly optimized frames; the others were aligned to the resulting surface"""
-
-    @classmethod
-    def open(cls, scene_template: Path) -> "SceneCameras":
-        """Read `cameras.npz` of a finished `scene_template`. Raises InputError ART-010."""
-        return cls(**SCENE_CAMERAS.load(scene_template / "cameras.npz"))
-
-    def write(self, scene_template: Path) -> None:
-        """Write `cameras.npz` into a template in the making."""
-        SCENE_CAMERAS.save(scene_template / "cameras.npz", **vars(self))
 
     @property
     def world_from_registered(self) -> Float[np.ndarray, "frame 4 4"]:
@@ -66,23 +58,15 @@ class SceneCameras:
 
 
 @dataclass(frozen=True)
-class AgentCameras:
+class AgentCameras(Stored):
     """Cameras of the turnaround, OpenCV axes; NaN where unusable."""
 
+    schema = AGENT_CAMERAS
     timestamp_s: Float[np.ndarray, "frame"]
     agent_from_camera: Float[np.ndarray, "frame 4 4"]
     intrinsics: Float[np.ndarray, "frame 3 3"]
     """color pixels"""
     registered: Bool[np.ndarray, "frame"]
-
-    @classmethod
-    def open(cls, agent_template: Path) -> "AgentCameras":
-        """Read `cameras.npz` of a finished `agent_template`. Raises InputError ART-010."""
-        return cls(**AGENT_CAMERAS.load(agent_template / "cameras.npz"))
-
-    def write(self, agent_template: Path) -> None:
-        """Write `cameras.npz` into a template in the making."""
-        AGENT_CAMERAS.save(agent_template / "cameras.npz", **vars(self))
 
     @property
     def agent_from_registered(self) -> Float[np.ndarray, "frame 4 4"]:
@@ -91,21 +75,13 @@ class AgentCameras:
 
 
 @dataclass(frozen=True)
-class SkinTable:
-    """Skinning of `agent.ply`: blend weights, bones at rest and the sizes of their Gaussians."""
+class SkinTable(Stored):
+    """Skinning of the adjacent `agent.ply`: blend weights, bones at rest and the sizes of their Gaussians."""
 
+    schema = SKIN
     weights: Float[np.ndarray, "vertex bone"]
     agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
     bone_scale_m: Float[np.ndarray, "bone 3"]
-
-    @classmethod
-    def open(cls, folder: Path) -> "SkinTable":
-        """Read `skin.npz` of a finished `agent_template` or `reconstruction`. Raises InputError ART-010."""
-        return cls(**SKIN.load(folder / "skin.npz"))
-
-    def write(self, folder: Path) -> None:
-        """Write `skin.npz` into an artifact in the making."""
-        SKIN.save(folder / "skin.npz", **vars(self))
 
 
 def bones_at_rest(folder: Path) -> Float32[np.ndarray, "bone 4 4"]:
