@@ -34,32 +34,26 @@ def write_contract(
     scaling: Scaling,
     schedule: Schedule,
     rest: Float[np.ndarray, "bone 4 4"],
-    *,
-    accompanied: bool = False,
 ) -> None:
-    """Write weights, `behavior.json` and, for diffusion models, `golden.json`, in which an ``accompanied``
-    animal has a companion.
-    """
+    """Write weights, `behavior.json` and, for diffusion models, `golden.json`."""
     state = {name: value.contiguous() for name, value in nets.state_dict().items()}
     save_file(state, folder / "behavior.safetensors")
     document = contract(architecture, scaling, schedule, rest)
     (folder / "behavior.json").write_text(json.dumps(document, indent=1) + "\n")
     if architecture.family == "diffusion":
         sampler = Sampler(TorchNetworks(nets), schedule, scaling)
-        golden = golden_plan(sampler, architecture, accompanied=accompanied)
+        golden = golden_plan(sampler, architecture)
         (folder / "golden.json").write_text(json.dumps(golden) + "\n")
 
 
-def write_networks(
-    folder: Path, nets: BehaviorNets, architecture: Architecture, *, accompanied: bool = False
-) -> float:
+def write_networks(folder: Path, nets: BehaviorNets, architecture: Architecture) -> float:
     """Write the four ONNX files; return the largest difference between ONNX and torch.
 
-    The perception of an ``accompanied`` animal takes any number of others, else the observer alone.
+    With companions, perception takes any number of others, else the observer alone.
     """
     differences = []
     for name in NETWORKS:
-        inputs, output = signature(name, architecture, accompanied=accompanied)
+        inputs, output = signature(name, architecture)
         path, network = folder / f"{name}.onnx", getattr(nets, name)
         export_network(network, path, inputs, output)
         differences.append(difference(network, path, inputs))
@@ -89,19 +83,17 @@ def export_network(
     onnx.checker.check_model(str(path))
 
 
-def signature(
-    name: str, a: Architecture, *, accompanied: bool = False
-) -> tuple[dict[str, tuple[int, ...]], str]:
+def signature(name: str, a: Architecture) -> tuple[dict[str, tuple[int, ...]], str]:
     """Return the inputs of a network (name and shape without batch) and the name of its output.
 
-    An ``accompanied`` animal has two others as an example.
+    With companions, the example has two others.
     """
     step: dict[str, tuple[int, ...]] = {"t": (), "condition": (a.condition_length,)}
     match name:
         case "perception":
             grid = {
                 "scene_grid": (a.scene_channels, *GRID_SHAPE),
-                "others": (1 + accompanied, a.past, POSE_CHANNELS + 1),
+                "others": (1 + a.companions, a.past, POSE_CHANNELS + 1),
                 "past": (a.past * (9 + 6 * a.bones),),
             }
             return grid | {"keep": (3,)}, "condition"
@@ -114,8 +106,8 @@ def signature(
             return {"x": (a.body_channels, a.future)} | step | controlled, "epsilon"
 
 
-def golden_observation(a: Architecture, *, accompanied: bool = False) -> Observation:
-    """Return the deterministic input of the golden plan; a companion walks away to the left."""
+def golden_observation(a: Architecture) -> Observation:
+    """Return the deterministic input of the golden plan; a companion, if any, walks away to the left."""
 
     def wave(*shape: int, amplitude: float, frequency: float) -> np.ndarray:
         number = np.arange(np.prod(shape), dtype=np.float64)
@@ -128,13 +120,13 @@ def golden_observation(a: Architecture, *, accompanied: bool = False) -> Observa
     past = wave(a.past * (9 + 6 * a.bones), amplitude=0.1, frequency=0.1)
     walk = np.linspace(0.5, 1.0, a.past)
     companion = np.stack([walk, np.full(a.past, 0.1), 0.5 * walk, np.ones(a.past)], axis=-1)
-    others = other_channels(facing[None], companion[None, None] if accompanied else None)
+    others = other_channels(facing[None], companion[None, None] if a.companions else None)
     return Observation(scene, others, past)
 
 
-def golden_plan(sampler: Sampler, architecture: Architecture, *, accompanied: bool = False) -> dict:
+def golden_plan(sampler: Sampler, architecture: Architecture) -> dict:
     """Sample plans by DPM-Solver++; return input, noise and results."""
-    observation = golden_observation(architecture, accompanied=accompanied)
+    observation = golden_observation(architecture)
     sampling = PlanSamplingConfig(method="dpm_solver", goal_steps=10, sequence_steps=10, max_path_draws=1)
     noise = np.random.default_rng(0)
     shapes = {

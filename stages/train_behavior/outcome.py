@@ -67,13 +67,9 @@ def write_trained(
     architecture: Architecture,
     schedule: Schedule,
     rest: Float[np.ndarray, "bone 4 4"],
-    *,
-    accompanied: bool = False,
 ) -> None:
     """Write weights, contract and the losses of every step."""
-    export.write_contract(
-        folder, fitted.nets.cpu(), architecture, fitted.scaling, schedule, rest, accompanied=accompanied
-    )
+    export.write_contract(folder, fitted.nets.cpu(), architecture, fitted.scaling, schedule, rest)
     losses = {f"loss/{name}": values for name, values in fitted.record.terms.items()}
     npz.save(folder / "losses.npz", compress=False, **losses)
 
@@ -90,7 +86,7 @@ def write_exported(
 ) -> None:
     """Write the ONNX networks, checks and pictures."""
     sampler = sampler_of(architecture, TorchNetworks(fitted.nets), schedule, fitted.scaling)
-    difference = export.write_networks(folder, fitted.nets, architecture, accompanied=data.accompanied)
+    difference = export.write_networks(folder, fitted.nets, architecture)
     moments = reactions.moments(data, scenes, architecture)
     radius_m = architecture.observer_radius_m
     reaction = reactions.measure(sampler, moments.observation, radius_m=radius_m, seed=seed)

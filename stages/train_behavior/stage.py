@@ -62,8 +62,7 @@ def run(
     )
     if not distributed.leave():
         return
-    rest = data.agent_from_bone_rest
-    outcome.write_trained(out, fitted, architecture, schedule, rest, accompanied=data.accompanied)
+    outcome.write_trained(out, fitted, architecture, schedule, data.agent_from_bone_rest)
     if config.export:
         outcome.write_exported(out, fitted, architecture, schedule, data, scenes, seed=config.seed)
 

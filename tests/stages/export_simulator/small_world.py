@@ -239,9 +239,8 @@ def write(build: Path, *, accompanied: bool = False) -> None:
         companions=accompanied,
     )
     nets, scaling = networks_that_flee(architecture)
-    shape = (architecture, scaling, Schedule(), rest())
-    write_contract(build / "behavior", nets, *shape, accompanied=accompanied)
-    write_networks(build / "behavior", nets, architecture, accompanied=accompanied)
+    write_contract(build / "behavior", nets, architecture, scaling, Schedule(), rest())
+    write_networks(build / "behavior", nets, architecture)
     assert json.loads((build / "behavior/behavior.json").read_bytes())["rate_hz"] == 10
 
 

@@ -589,7 +589,7 @@ def test_exported_network_accepts_any_number_of_companions(tmp_path):
     torch.manual_seed(0)
     shape = replace(ARCHITECTURE, companions=True)
     nets = model.BehaviorNets(shape, Schedule()).eval()
-    inputs, output = signature("perception", shape, accompanied=True)
+    inputs, output = signature("perception", shape)
     export_network(nets.perception, tmp_path / "perception.onnx", inputs, output)
     assert difference(nets.perception, tmp_path / "perception.onnx", inputs) < 1e-4
     session = onnxruntime.InferenceSession(tmp_path / "perception.onnx")
