@@ -57,12 +57,9 @@ class Motion:
         if not np.isfinite(self.world_from_agent[pair]).all():
             return None, None
         when, query = self.timestamp_s[pair], np.clip([query_s], *self.timestamp_s[pair])
-        root = rigid.interpolate(when, self.world_from_agent[pair], query)[0]
-        bones = [
-            rigid.interpolate(when, self.agent_from_bone[pair, bone], query)[0]
-            for bone in range(self.agent_from_bone.shape[1])
-        ]
-        return root, np.stack(bones)
+        body = self.world_from_agent[pair], self.agent_from_bone[pair]
+        root, bones = rigid.interpolate_body(when, *body, query)
+        return root[0], bones[0]
 
 
 def save(path: Path, motion: Motion) -> None:

@@ -153,6 +153,15 @@ def interpolate(
     return make(rotation, translation)
 
 
+def interpolate_body(
+    timestamp_s: Float[np.ndarray, "frame"], root: Float[np.ndarray, "frame 4 4"],
+    bones: Float[np.ndarray, "frame bone 4 4"], query_s: Float[np.ndarray, "sample"],
+) -> tuple[Float[np.ndarray, "sample 4 4"], Float[np.ndarray, "sample bone 4 4"]]:  # fmt: skip
+    """Interpolate the root and the bones of a body in time, each as `interpolate` does."""
+    tracks = [interpolate(timestamp_s, bone, query_s) for bone in np.moveaxis(bones, 1, 0)]
+    return interpolate(timestamp_s, root, query_s), np.stack(tracks, axis=1)
+
+
 def smoothed(a_from_b: Float[np.ndarray, "frame 4 4"], sigma_frames: float) -> Float[np.ndarray, "frame 4 4"]:
     """Smooth transforms in time: positions by a Gaussian, rotations by its chordal mean."""
     if sigma_frames <= 0:

@@ -92,7 +92,6 @@ def refine_at_rate(
     optimized = optimize_motion(raw, world.model.contact_body(world.body), world.scene.distance, settings)
     time_s = np.arange(len(optimized)) / RATE_HZ
     query_s = np.minimum(timestamp_s - timestamp_s[0], time_s[-1])
-    tracks = np.moveaxis(optimized.agent_from_bone, 1, 0)
-    bones = np.stack([rigid.interpolate(time_s, track, query_s) for track in tracks], axis=1)
-    motion = BodyMotion(rigid.interpolate(time_s, optimized.world_from_agent, query_s), bones)
+    body = optimized.world_from_agent, optimized.agent_from_bone
+    motion = BodyMotion(*rigid.interpolate_body(time_s, *body, query_s))
     return motion, meter.plausibility(raw, stance), meter.plausibility(optimized, stance)

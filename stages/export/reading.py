@@ -136,7 +136,6 @@ def gaussians(splats: Path) -> dict[str, Float[np.ndarray, "point 62"]]:
 def _resampled(action: Action, rate_hz: float) -> Action:
     count = int(np.floor((action.time_s[-1] - action.time_s[0]) * rate_hz + 1e-4)) + 1
     query_s = np.minimum(action.time_s[0] + np.arange(count) / rate_hz, action.time_s[-1])
-    tracks = np.swapaxes(action.agent_from_bone, 0, 1)
-    bones = [rigid.interpolate(action.time_s, track, query_s) for track in tracks]
-    root = rigid.interpolate(action.time_s, action.world_from_agent, query_s)
-    return Action(action.name, query_s - query_s[0], root, np.stack(bones, 1))
+    body = action.world_from_agent, action.agent_from_bone
+    resampled = rigid.interpolate_body(action.time_s, *body, query_s)
+    return Action(action.name, query_s - query_s[0], *resampled)

@@ -46,7 +46,5 @@ def animation(motion: SessionClip, rate_hz: float) -> Action:
     time_s = motion.timestamp_s
     count = int(np.floor((time_s[-1] - time_s[0]) * rate_hz + 1e-6)) + 1
     query_s = time_s[0] + np.arange(count) / rate_hz
-    root = rigid.interpolate(time_s, motion.world_from_agent, query_s)
-    tracks = np.swapaxes(motion.agent_from_bone, 0, 1)
-    bones = [rigid.interpolate(time_s, track, query_s) for track in tracks]
-    return Action(motion.name, query_s - query_s[0], root, np.stack(bones, 1))
+    body = rigid.interpolate_body(time_s, motion.world_from_agent, motion.agent_from_bone, query_s)
+    return Action(motion.name, query_s - query_s[0], *body)

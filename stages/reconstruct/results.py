@@ -93,10 +93,8 @@ def interpolate_gaps(
     if not observed.any():
         root[:] = np.nan
         return root, bones
-    observed_s = timestamp_s[observed]
-    root[~observed] = rigid.interpolate(observed_s, root[observed], timestamp_s[~observed])
-    for bone in range(bones.shape[1]):
-        bones[~observed, bone] = rigid.interpolate(observed_s, bones[observed, bone], timestamp_s[~observed])
+    known = timestamp_s[observed], root[observed], bones[observed]
+    root[~observed], bones[~observed] = rigid.interpolate_body(*known, timestamp_s[~observed])
     return root, bones
 
 

@@ -44,22 +44,21 @@ def trajectory_from_motion(
     time = motion.timestamp_s
     grid = np.arange(np.floor(time[-1] * rate_hz + 1e-6) + 1) / rate_hz
     grid = grid[grid >= time[0] - 0.5 / rate_hz]
-    bones = motion.agent_from_bone.shape[1]
     companions = motion.companions
     if companions is not None:
         companions = resampled(time, companions, grid, max_gap_s, rate_hz)
     if not trusted.any():
         still = np.broadcast_to(np.eye(4), (len(grid), 4, 4))
-        rest = np.broadcast_to(np.eye(4, dtype=np.float32), (len(grid), bones, 4, 4))
+        rest = np.broadcast_to(np.eye(4, dtype=np.float32), (len(grid), *motion.agent_from_bone.shape[1:]))
         invalid = np.zeros(len(grid), bool)
         return Trajectory(grid, still.copy(), rest.copy(), still.copy(), invalid, companions)
     good = time[trusted]
-    agent = rigid.interpolate(good, motion.world_from_agent[trusted], grid)
+    body = motion.world_from_agent[trusted], motion.agent_from_bone[trusted]
+    agent, bones = rigid.interpolate_body(good, *body, grid)
     agent = rigid.smoothed(agent, smooth_s * rate_hz)
-    bone = [rigid.interpolate(good, motion.agent_from_bone[trusted, b], grid) for b in range(bones)]
     camera = rigid.interpolate(good, motion.world_from_camera[trusted], grid)
     valid = subsampling.within_short_gaps(good, grid, max_gap_s, 0.5 / rate_hz)
-    return Trajectory(grid, agent, np.stack(bone, 1).astype(np.float32), camera, valid, companions)
+    return Trajectory(grid, agent, bones.astype(np.float32), camera, valid, companions)
 
 
 def resampled(
