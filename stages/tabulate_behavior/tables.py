@@ -38,13 +38,9 @@ def figures(
                 and baseline is not None
                 and np.array_equal(window, found[ours].windows_of(name))
             ):
-                if min(len(baseline), len(values)) > 1:
-                    both = min(len(baseline), len(values))
-                else:
-                    both = max(len(baseline), len(values))
-                difference = np.broadcast_to(baseline[:both], (both, baseline.shape[1])) - np.broadcast_to(
-                    values[:both], (both, values.shape[1])
-                )
+                both = min(len(baseline), len(values))
+                paired = slice(both if both > 1 else None)  # one seed alone is paired with all others
+                difference = baseline[paired] - values[paired]
                 table |= interval(difference, window, frames, draws, seed).as_figures(
                     f"behavior/{ours}_minus_{method}/{_figure(name)}"
                 )
