@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from pipeline.data import images
 from pipeline.geometry import rigid
+from pipeline.geometry.cameras import OPENCV_FROM_OPENGL
 from pipeline.geometry.meshes import Mesh
 from pipeline.geometry.subsampling import evenly
 from stages.export.reading import CameraFrame
@@ -20,7 +21,6 @@ from stages.export.writing import ExportRecord, version
 
 COLMAP_POINTS = 20_000
 """Points of the room in the COLMAP model: enough to start Gaussians from, a megabyte as text."""
-_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def write_nerfstudio(folder: Path, frames: list[CameraFrame]) -> ExportRecord:
@@ -40,7 +40,7 @@ def write_nerfstudio(folder: Path, frames: list[CameraFrame]) -> ExportRecord:
                 "file_path": f"images/{frame.name}.jpg",
                 "depth_file_path": f"depth/{frame.name}.png",
                 "mask_path": f"masks/{frame.name}.png",
-                "transform_matrix": (frame.world_from_camera @ _OPENGL_FROM_OPENCV).tolist(),
+                "transform_matrix": (frame.world_from_camera @ OPENCV_FROM_OPENGL).tolist(),
                 "fl_x": k[0, 0], "fl_y": k[1, 1], "cx": k[0, 2], "cy": k[1, 2], "w": width, "h": height,
             }
         )  # fmt: skip
