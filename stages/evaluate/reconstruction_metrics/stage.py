@@ -5,18 +5,19 @@ from pathlib import Path
 from pipeline.core import devices
 from pipeline.core.videos import Video
 from pipeline.data import qa
-from pipeline.metrics.bars import BARS
 from pipeline.metrics.metrics import Metrics
 from stages.evaluate.config import Config
 from stages.evaluate.reading import BuildFolders
 from stages.evaluate.reconstruction_metrics import measuring
 
-LIMITS = tuple(
-    qa.Check(bar.metric, None, bar.unit, bar.limit, better=bar.better)
-    for bar in BARS
-    if isinstance(bar.limit, float)
+LIMITS = (
+    qa.Check("registration/rotation_deg_median", None, "deg", 1.0),
+    qa.Check("registration/translation_m_median", None, "m", 0.04),
+    qa.Check("masks/iou_mean", None, "", 0.75, better="higher"),
+    qa.Check("reconstruction/depth_acc_all", None, "", 0.88, better="higher"),
+    qa.Check("reconstruction/agent_root_m_median", None, "m", 0.08),
 )
-"""What the quality page judges where it is measured, without values."""
+"""What the quality page judges, without values."""
 
 
 def run(
