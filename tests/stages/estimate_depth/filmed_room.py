@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from pipeline.data import images, ply
 from pipeline.data.clips import FRAMES, PICTURES
@@ -18,36 +17,38 @@ INTRINSICS = np.array([[178.0, 0, 90], [0, 178.0, 120], [0, 0, 1]])
 ANIMAL_COLOR = np.array([235, 120, 30])
 
 
-def render(room: Mesh, camera: np.ndarray, world_from_agent: np.ndarray | None, rng: np.random.Generator):
+def render(
+    room: RayCaster, camera: np.ndarray, world_from_agent: np.ndarray | None, rng: np.random.Generator
+):
     """Return color, z-depth and the mask of the animal."""
-    meshes, faces = [trimesh.Trimesh(room.vertices, room.faces, process=False)], len(room.faces)
-    if world_from_agent is not None:
-        meshes.append(animal().apply_transform(world_from_agent))
-    both = trimesh.util.concatenate(meshes)
-    caster = RayCaster(Mesh(np.asarray(both.vertices, np.float32), np.asarray(both.faces)))
     directions = cameras.ray_directions(INTRINSICS, *SIZE).reshape(-1, 3) @ camera[:3, :3].T
-    hits = caster.cast(camera[:3, 3], directions)
-    on_animal = hits.face >= faces
-    corner = room.color[room.faces[np.clip(hits.face, 0, faces - 1)]].astype(float)
-    color = np.einsum("rk,rkc->rc", hits.barycentric, corner)
-    points = camera[:3, 3] + directions * hits.distance[:, None]
+    hits = room.cast(camera[:3, 3], directions)
+    distance, color = hits.distance, hits.interpolate(room.mesh, room.mesh.color)
+    on_animal = np.zeros(len(directions), bool)
+    if world_from_agent is not None:
+        body = animal().apply_transform(world_from_agent)
+        caster = RayCaster(Mesh(np.asarray(body.vertices, np.float32), np.asarray(body.faces)))
+        nearest = caster.cast(camera[:3, 3], directions).distance
+        on_animal = nearest < distance
+        distance = np.minimum(distance, nearest)
+    points = camera[:3, 3] + directions * distance[:, None]
     stripes = np.where(np.floor(points[:, :1] / 0.05) % 2, 40, -40)
     color = np.where(on_animal[:, None], ANIMAL_COLOR + stripes, color) + rng.normal(0, 2, color.shape)
     shape = (*SIZE, 3)
     return (
         np.clip(color, 0, 255).astype(np.uint8).reshape(shape),
-        np.where(np.isfinite(hits.distance), hits.distance, 0).reshape(SIZE).astype(np.float32),
+        np.where(np.isfinite(distance), distance, 0).reshape(SIZE).astype(np.float32),
         on_animal.reshape(SIZE),
     )
 
 
 def write_walk(folder: Path, room: Mesh, path: np.ndarray) -> None:
     """Write `frames` of a walk-through along a path."""
-    rng = np.random.default_rng(0)
+    rng, caster = np.random.default_rng(0), RayCaster(room)
     for name in ("color", "depth", "confidence"):
         (folder / name).mkdir(parents=True)
     for frame, camera in enumerate(path):
-        color, depth, _ = render(room, camera, None, rng)
+        color, depth, _ = render(caster, camera, None, rng)
         images.write_color(folder / f"color/{frame:06d}.jpg", color, 95)
         images.write_depth(folder / f"depth/{frame:06d}.exr", depth)
         images.write_gray(folder / f"confidence/{frame:06d}.png", np.full(SIZE, 2, np.uint8))
@@ -72,11 +73,11 @@ def write_map(folder: Path, room: Mesh, path: np.ndarray) -> None:
 
 def write_pictures(folder: Path, room: Mesh, path: np.ndarray, agent: np.ndarray):
     """Write `pictures` of a video; return true depth and masks."""
-    rng = np.random.default_rng(1)
+    rng, caster = np.random.default_rng(1), RayCaster(room)
     (folder / "color").mkdir(parents=True)
     truth = []
     for frame, (camera, pose) in enumerate(zip(path, agent, strict=True)):
-        color, depth, mask = render(room, camera, pose, rng)
+        color, depth, mask = render(caster, camera, pose, rng)
         images.write_color(folder / f"color/{frame:06d}.jpg", color, 95)
         truth.append((depth, mask))
     each = np.ones(len(path), np.float32)

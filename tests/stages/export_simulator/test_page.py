@@ -55,6 +55,22 @@ WALKS_WHILE_THE_FIRST_PLAN_IS_AWAITED = """
     setTimeout(() => post.call(this, message, ...rest), 2000);
   };
 """
+STEPS_IN_ITS_WAY = """() => new Promise((done) => {
+  let last = null;
+  const look = () => {
+    const [x, , z] = ats.state().animal;
+    const [dx, dz] = last ? [x - last[0], z - last[1]] : [0, 0];
+    const step = Math.hypot(dx, dz);
+    if (last && step > 0.02) {
+      const person = [x + (0.25 * dx) / step, z + (0.25 * dz) / step];
+      ats.moveObserver(person);
+      return done(person);
+    }
+    last = [x, z];
+    setTimeout(look, 100);
+  };
+  look();
+})"""
 SEES_ALL = (
     "points => points.map(ats.screen).every(([x, y]) => x > 0 && x < innerWidth && y > 0 && y < innerHeight)"
 )
@@ -113,6 +129,25 @@ def test_animal_walks_around_a_standing_person(simulator: Path, chromium: Browse
             assert state["aim"] is None, f"half a minute, and it stands at {state['animal'][:3]}"
         min_m = clearance_of(small_world.rest()) - 0.04
         assert min(gaps[4:]) > min_m, "meters: two plans that fade into each other cut corners"
+        assert wrong == []
+
+
+def test_animal_stops_for_a_person_who_steps_in_its_way(simulator: Path, chromium: Browser) -> None:
+    """Nearer than the clearance, it does not come nearer, although its plan leads through the person."""
+    with browser.shown(chromium, (simulator / "index.html").as_uri()) as (page, wrong):
+        page.evaluate("ats.moveObserver([1.7, 1.7]); ats.visit([[-0.6, 0.5], [0.6, -0.5], [-0.6, 0.5]])")
+        for _ in range(3):
+            person = np.array(page.evaluate(STEPS_IN_ITS_WAY))
+            begin = state = page.evaluate("ats.state()")
+            gaps = []
+            while state["tick"] < begin["tick"] + 12:
+                gaps.append(np.linalg.norm(np.array(state["animal"])[[0, 2]] - person))
+                page.wait_for_timeout(30)
+                state = page.evaluate("ats.state()")
+            assert gaps[0] < 0.35, "meters: nearer than the clearance"
+            assert min(gaps) > gaps[0] - 0.03, "meters"
+            page.evaluate("ats.moveObserver([1.7, 1.7])")
+            page.wait_for_timeout(1500)
         assert wrong == []
 
 

@@ -19,6 +19,7 @@ const NOTICE_TICKS = 20; // how long is shown that it noticed the person
 // a click on furniture counts where a recorded root was this near, level and upright
 const BEEN_M = [0.45, 0.12];
 const AVOID_TICKS = 12; // so far ahead a plan is checked for the bodies of others
+const APPROACH_M = 0.002; // per tick, towards a body that is too near already: paths are not smoother
 const SEEN_TICKS = 16; // of the person, remembered
 export const COLORS = [0xc8722b, 0x8a5aa8, 0x3f8f8a, 0xb04a5a]; // of animals on the map and in outlines
 
@@ -167,7 +168,7 @@ export class Resident {
       return true;
     return this.bodies.some(([x, z]) => {
       const [gap, then] = [here, there].map((frame) => Math.hypot(frame[0] - x, frame[2] - z));
-      return then < Math.min(this.clearance, gap) - 0.05 && then < gap - 1e-4;
+      return then < Math.min(this.clearance - 0.05, gap - APPROACH_M * (next - this.home.now));
     });
   }
 
