@@ -8,6 +8,7 @@ import pytest
 from pipeline.data import images, npz
 from pipeline.data.clips import Clip
 from pipeline.data.flow import GAPS
+from stages.segment_agent import propagation
 from stages.segment_agent.config import LearningConfig
 from stages.segment_agent.follow import MOTION_GAPS, follow, segment_prompt
 from stages.segment_agent.footage import Footage
@@ -17,7 +18,6 @@ from stages.segment_agent.propagation import MAX_LOG_ODDS, Beliefs, connected, e
 SIZE = (120, 160)
 CELLS = (30, 40)
 SHIFT_PX = 4
-LEARNING = LearningConfig(examples=30, steps=60, batch=4, crop_px=96)
 
 
 def _footage(folder: Path, pictures: list[np.ndarray], steps: list[np.ndarray]) -> Footage:
@@ -82,11 +82,12 @@ def walk(tmp_path_factory) -> tuple[Footage, list[np.ndarray]]:
 
 
 @pytest.mark.parametrize("prompted", [0, 5])
-def test_animal_is_tracked_forward_and_backward(walk, prompted):
+def test_animal_is_tracked_forward_and_backward(walk, prompted, monkeypatch):
+    monkeypatch.setattr(propagation, "STEPS", (20, 30, 30))  # enough for flat colors
     footage, masks = walk
     left = 20.0 + SHIFT_PX * prompted
     prompt = Prompt(prompted, (left, 40, left + 50, 80))
-    found = list(follow(footage, prompt, LEARNING, np.random.default_rng(0)))
+    found = list(follow(footage, prompt, LearningConfig(), np.random.default_rng(0)))
     assert len(found) == len(masks)
     for mask, true in zip(found, masks, strict=True):
         assert ((mask.labels == 255) & true).sum() > 0.9 * ((mask.labels == 255) | true).sum()
