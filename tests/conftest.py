@@ -25,20 +25,24 @@ if WORKERS > 1:
     threads = max(1, (os.cpu_count() or 1) // WORKERS)
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
+    # else the first parallel loop of numba gives torch all cores
+    os.environ["NUMBA_NUM_THREADS"] = str(threads)
 
 
 TOY_FILES = ("test_data_layout.py", "test_docs_example.py", "test_restart.py", "test_toy_build.py")
 """Files with tests of the toy build; with several processes, one of them runs all of these first."""
+PAGES = "export_simulator"
+"""Folder of tests in which pages run in real time; with several processes, they run while the toy is built."""
 
 
 def pytest_collection_modifyitems(items):
-    """Run tests of the toy build last in a single process, first in several."""
+    """Run tests of the toy build last in a single process; in several first, beside tests that wait for pages."""
     for item in items:
         assert not item.get_closest_marker("toy") or item.path.name in TOY_FILES, f"{item.path}: TOY_FILES"
     if WORKERS == 1:
         items.sort(key=lambda item: item.get_closest_marker("toy") is not None)
     else:
-        items.sort(key=lambda item: item.path.name not in TOY_FILES)
+        items.sort(key=lambda item: (item.path.name not in TOY_FILES, item.path.parent.name != PAGES))
 
 
 @pytest.hookimpl(optionalhook=True)
