@@ -18,7 +18,7 @@ def draw(
 ) -> tuple[Float[Tensor, "height width channel"], Float[Tensor, "height width"]]:  # fmt: skip
     """Draw one view, meters, as `pipeline.fields.rasterize.draw` does.
 
-    Raises `InputError` DEP-001 when gsplat is not installed or there is no CUDA device.
+    Raises `InputError` DEP-001 when gsplat is not installed or compiled, or there is no CUDA device.
     """
     where, tiles = "rasterizer gsplat", 'set backend = "tiles"'
     try:
@@ -28,6 +28,8 @@ def draw(
         raise InputError("DEP-001", "gsplat is not installed", where, remedy) from error
     if not torch.cuda.is_available():
         raise InputError("DEP-001", "gsplat needs a CUDA device", where, tiles)
+    if importlib.import_module("gsplat.cuda._backend")._C is None:
+        raise InputError("DEP-001", "gsplat found no compiler (nvcc) for its kernels", where, tiles)
     image, coverage, _ = gsplat.rasterization(
         means_world, torch.nn.functional.normalize(rotation, dim=-1), log_scale.exp(), opacity, values,
         camera_from_world[None], intrinsics[None], width, height, near_plane=0.1, eps2d=BLUR_PX2,

@@ -49,4 +49,4 @@ class Config:
     save_every: int = 200
     """steps between checkpoints"""
     backend: Literal["auto", "tiles", "gsplat"] = "auto"
-    """rasterizer; auto: gsplat on CUDA, tiles otherwise"""
+    """rasterizer; auto: gsplat on CUDA if it is installed, otherwise tiles, which run on the CPU"""

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -31,10 +32,12 @@ def run(
     inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "cpu", resume: Path | None = None
 ) -> None:
     """Refine one reconstruction into `out`; the first process writes."""
-    distributed.join(device)
     backend = config.backend
     if backend == "auto":
-        backend = "gsplat" if device == "cuda" else "tiles"
+        backend = "gsplat" if device == "cuda" and find_spec("gsplat") else "tiles"
+    if backend == "tiles":
+        device = "cpu"  # the rasterizer is compiled for CPUs
+    distributed.join(device)
     videos = read_videos(inputs.reconstruction, inputs.frames, inputs.masks, inputs.flow)
     rng = np.random.default_rng(config.seed)
     splats = cover.splats(inputs.reconstruction, config.counts, videos, config.cover_frames, rng).to(device)
