@@ -27,6 +27,22 @@ _MIXING_ALLOWED = (
     "data_ptr",
 )
 """functions that accept tensors of different devices"""
+_FLOATS_ONLY = {
+    "matmul",
+    "mm",
+    "bmm",
+    "mv",
+    "addmm",
+    "addmv",
+    "baddbmm",
+    "einsum",
+    "dot",
+    "linear",
+    "__matmul__",
+    "__rmatmul__",
+    "tensordot",
+}
+"""products that CUDA has no integer kernels for"""
 
 
 class MixedDevicesError(RuntimeError):
@@ -104,6 +120,8 @@ class SimulatedDevice(TorchFunctionMode):
             kwargs["device"] = "cpu"
         if on_device and kwargs.get("generator") is not None:
             raise MixedDevicesError(f"{name} on {DEVICE} with a generator of the cpu")
+        if on_device and name in _FLOATS_ONLY and not any(part.is_floating_point() for part in tensors):
+            raise NotImplementedError(f"{name} of integers on {DEVICE}")
         result = func(*args, **kwargs)
         if name in ("copy_", "set_"):
             on_device = is_on_device(args[0])

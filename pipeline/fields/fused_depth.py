@@ -91,9 +91,8 @@ class FusedGeometry(nn.Module):
         self, block: Int[Tensor, "point"], within: Int[Tensor, "point 3"], offset: Float[Tensor, "point 3"]
     ) -> Float[Tensor, "point 5"]:
         """Interpolate in blocks: ``within`` counts cells from the block's corner, ``offset`` is the rest."""
-        nodes = (within[:, None] + self.corners) @ torch.tensor(
-            [NODES * NODES, NODES, 1], device=within.device
-        )
+        strides = torch.tensor([NODES * NODES, NODES, 1], device=within.device)
+        nodes = ((within[:, None] + self.corners) * strides).sum(-1)  # CUDA multiplies no integer matrices
         values = self.blocks.view(-1, CHANNELS)[(block * NODES**3)[:, None] + nodes].float()
         share = torch.where(self.corners.bool(), offset[:, None], 1 - offset[:, None]).prod(-1)
         mixed = (share[..., None] * values).sum(1)
