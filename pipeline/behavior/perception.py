@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from pipeline.behavior.config import AblatedInput, Ego, ObservedPast, SceneEncoder
 from pipeline.behavior.encoders import OtherPosesEncoder, OthersEncoder, PastEncoder
@@ -144,6 +145,9 @@ class PillarScene(nn.Module):
 class VolumeScene(nn.Module):
     """The paper's encoder: six 3-D convolutions of kernel 3 with residual connections."""
 
+    CHUNK = 64
+    """scenes whose activations are held at once in training; those of the paper's 1,024 take 85 GB"""
+
     def __init__(self, channels: int, width: int, code: int):
         super().__init__()
         strides = [(1, 1, 1), (2, 1, 2), (2, 2, 2), (2, 2, 2), (2, 2, 2), (2, 1, 2)]
@@ -154,9 +158,18 @@ class VolumeScene(nn.Module):
         self.out = nn.Linear(width, code)
 
     def forward(self, grid: Float[Tensor, "batch channel 64 8 64"]) -> SceneEncoding:
+        if self.training:
+            parts = grid.split(self.CHUNK)
+            code = torch.cat([checkpoint(self.code, part, use_reentrant=False) for part in parts])
+        else:
+            code = self.code(grid)
+        return grid.new_zeros(grid.shape[0], 0), code.float()
+
+    def code(self, grid: Float[Tensor, "batch channel 64 8 64"]) -> Float[Tensor, "batch code"]:
+        """Return the code alone."""
         for convolution, shortcut in zip(self.convolutions, self.shortcuts, strict=True):
             grid = nn.functional.silu(convolution(grid)) + shortcut(grid)
-        return grid.new_zeros(grid.shape[0], 0), self.out(grid.mean((2, 3, 4)))
+        return self.out(grid.mean((2, 3, 4)))
 
     encode = forward
 

@@ -27,7 +27,7 @@ class BehaviorOptimizerConfig:
     average: float = 0.995
     """Decay per step of the exponential moving average of the weights."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """Precision of the costly convolutions of path and body; mixed precision is faster on most GPUs."""
+    """Precision of the costly convolutions of path, body and 3-D scenes; bfloat16 is faster on most GPUs."""
     compile: bool = False
     """Compile path and body (a minute, needs a C++ compiler); on a GPU each runs as one CUDA graph."""
 

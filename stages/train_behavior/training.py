@@ -10,7 +10,7 @@ import torch
 from pipeline.behavior.body_denoiser import OneStageDenoiser
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import ROOT_CHANNELS, Architecture, BehaviorNets, Scaling
-from pipeline.behavior.perception import POSITION
+from pipeline.behavior.perception import POSITION, VolumeScene
 from pipeline.behavior.pointwise import WaypointUNet
 from pipeline.core import distributed
 from pipeline.core.training import FitRecord, fit
@@ -126,8 +126,11 @@ def _average(average: BehaviorNets, nets: BehaviorNets, step: int, goal_steps: i
 
 
 def accelerate(nets: BehaviorNets, optimization: BehaviorOptimizerConfig, device: str) -> None:
-    """Set precision and compilation of path and body as configured; weights stay float32."""
+    """Set precision of path, body and 3-D scenes, and compilation, as configured; weights stay float32."""
     kind = torch.device(device).type
+    for scene in (member.scene for member in nets.perception):
+        if optimization.precision == "bfloat16" and isinstance(scene, VolumeScene):
+            scene.code = torch.autocast(kind, torch.bfloat16)(scene.code)
     for net, unet in ((nets.path, nets.path), (nets.body, nets.body.unet)):
         if optimization.precision == "bfloat16":
             unet.velocity = torch.autocast(kind, torch.bfloat16)(unet.velocity)

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from pipeline.behavior.model import BehaviorNets
-from pipeline.behavior.perception import VELOCITY_CHANNELS, FeatureVolume, world_from_ego
+from pipeline.behavior.perception import VELOCITY_CHANNELS, FeatureVolume, VolumeScene, world_from_ego
 from pipeline.behavior.planning import observe
 from pipeline.behavior.trajectories import Context
 from pipeline.geometry import rigid
@@ -147,3 +147,16 @@ def test_dropped_conditions_do_not_reach_the_code():
         keep = torch.zeros(2, 3)
         keep[:, number] = 1
         assert equal_codes(nets.perception(*inputs, keep)) == [k != number for k in range(3)]
+
+
+def test_scenes_encoded_in_chunks_have_the_same_codes_and_gradients(monkeypatch):
+    torch.manual_seed(0)
+    net, grid, found = VolumeScene(3, 8, 4), torch.randn(5, 3, 64, 8, 64), []
+    monkeypatch.setattr(VolumeScene, "CHUNK", 2)
+    for mode in (True, False):
+        net.train(mode).zero_grad()
+        _, code = net(grid)
+        code.square().sum().backward()
+        found.append([code, *(parameter.grad for parameter in net.parameters())])
+    for ours, whole in zip(*found, strict=True):
+        torch.testing.assert_close(ours, whole)

@@ -310,15 +310,20 @@ def test_high_frequency_errors_have_larger_weight():
     assert found == pytest.approx([1 / 9, (1 + 16 * 39 / 40) / 9, 1.0], rel=0.03)
 
 
-def test_mixed_precision_is_accurate_and_keeps_float32_weights(data):
+@pytest.mark.parametrize(
+    ("shape", "names", "first"),
+    [(ARCHITECTURE, ("path", "body"), 1), (replace(ARCHITECTURE, scene="volume"), ("goal",), 0)],
+    ids=["unets", "volume"],
+)
+def test_mixed_precision_is_accurate_and_keeps_float32_weights(data, shape, names, first):
     settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=3, goal_steps=1, batch=8))
     half = replace(settings, optimization=replace(settings.optimization, precision="bfloat16"))
     exact, rough = (
-        train(TrainingHomes.of_one(data, Scenes.of(room())), ARCHITECTURE, Schedule(), each, seed=3)
+        train(TrainingHomes.of_one(data, Scenes.of(room())), shape, Schedule(), each, seed=3)
         for each in (settings, half)
     )
-    for name in ("path", "body"):
-        ours, theirs = rough.record.terms[name][1:], exact.record.terms[name][1:]
+    for name in names:
+        ours, theirs = rough.record.terms[name][first:], exact.record.terms[name][first:]
         np.testing.assert_allclose(ours, theirs, rtol=0.02)
         assert (ours != theirs).any(), "nothing was rounded"
     assert {value.dtype for value in rough.nets.state_dict().values() if value.is_floating_point()} == {
