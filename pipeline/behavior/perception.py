@@ -250,17 +250,6 @@ class Perception(nn.Module):
         """``keep`` holds 1 or 0 for scene, others and past."""
         return self.join(self.scene(scene_grid), others, self.past(past), keep)
 
-    def encode_training(
-        self,
-        pooled: Float[Tensor, "batch channel x y z"],
-        others: Float[Tensor, "batch other past_frame 10"],
-        past: Float[Tensor, "batch past"],
-        keep: Float[Tensor, "batch 3"],
-        bones_keep: Float[Tensor, "batch"],
-    ) -> PerceptionCode:
-        """Encode a scene already pooled over blocks; ``bones_keep`` 0 hides past bones."""
-        return self.join(self.scene.encode(pooled), others, self.past(past, bones_keep), keep)
-
     def join(
         self,
         scene_encoding: SceneEncoding,

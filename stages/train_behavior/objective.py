@@ -120,14 +120,11 @@ def perceive(
     keep = keep_mask(len(batch.goal), 3, generator).to(batch.goal.device) * joint
     keep[:, 1] = torch.maximum(keep[:, 1], batch.oversampled.float())
     others = with_some_absent(batch.others, batch.oversampled, generator)
-    encodings = [
-        member.encode_training(batch.scene, others, batch.past, keep, batch.bones_keep)
-        for member in nets.perception
-    ]
-    dropout = objective.code_dropout
-    encodings = [
-        (scene_map, nn.functional.dropout(code, dropout), attended) for scene_map, code, attended in encodings
-    ]
+    encodings = []
+    for member in nets.perception:
+        scene, past = member.scene.encode(batch.scene), member.past(batch.past, batch.bones_keep)
+        scene_map, code, attended = member.join(scene, others, past, keep)
+        encodings.append((scene_map, nn.functional.dropout(code, objective.code_dropout), attended))
     return nets.perception.condition(encodings, nets.perception.now(batch.held, keep[:, 2]))
 
 

@@ -161,10 +161,9 @@ def initial_nets(
     body.root_mean[:] = torch.from_numpy(scaling.body_mean[:ROOT_CHANNELS])
     body.root_std[:] = statistics.past_std[POSITION : POSITION + ROOT_CHANNELS]
     body.rotation_std[:] = torch.from_numpy(scaling.body_std[:ROOT_CHANNELS])
-    if nets.goal.map is not None:
-        nets.goal.map.goal_std[:] = torch.from_numpy(scaling.goal_std)
-    if nets.goal.others is not None:
-        nets.goal.others.goal_std[:] = torch.from_numpy(scaling.goal_std)
+    for part in (nets.goal.map, nets.goal.others):
+        if part is not None:
+            part.goal_std[:] = torch.from_numpy(scaling.goal_std)
     for net in (nets.path, nets.body):
         if isinstance(net, WaypointUNet | OneStageDenoiser):
             net.velocity_std[:] = torch.from_numpy(scaling.velocity_std)
