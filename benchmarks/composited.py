@@ -28,7 +28,7 @@ COLOR_FOCAL_PX, DEPTH_FOCAL_PX, BASELINE_M = 525.5, 585.0, 0.025
 to the right"""
 PROJECTOR_BASELINE_M = 0.075
 """Kinect v1: from infrared projector to infrared camera; surfaces in the projector's shadow have no depth"""
-MILLIMETRES = 1000
+MILLIMETERS = 1000
 FARTHEST_M = 6.0
 CELL_M = 0.04
 ABSENT_M = 100.0
@@ -64,7 +64,7 @@ class Sequence:
         """Read depth, meters."""
         raw = (
             np.asarray(cv2.imread(str(self._path(index, "depth.png")), cv2.IMREAD_UNCHANGED), np.float32)
-            / MILLIMETRES
+            / MILLIMETERS
         )
         raw[raw > FARTHEST_M] = 0
         return _reproject_depth(raw, DEPTH_FOCAL_PX, COLOR_FOCAL_PX, BASELINE_M) if self.registered else raw

@@ -143,7 +143,7 @@ def rows(build: Path, queries: int, per_session: int, settings: tuple[Setting, .
         )
         cells = [*render_errors, errors_of_sessions(localizer, build, per_session)]
         per_query = query_s / len(QUERIES) / queries
-        error_cells = " | ".join(f"{deg:.2f} / {metres:.3f} / {recall:.2f}" for deg, metres, recall in cells)
+        error_cells = " | ".join(f"{deg:.2f} / {meters:.3f} / {recall:.2f}" for deg, meters, recall in cells)
         yield f"| {setting.kind} | {setting.views} | {setting.steps or ''} | {training_s:.0f} | {per_query:.3f} | {error_cells} |"
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from stages.reconstruct import assemble, fuse, optimise, reading
+from stages.reconstruct import assemble, fuse, optimize, reading
 from stages.reconstruct.config import (
     FieldSizes,
     LearningRates,
@@ -83,13 +83,13 @@ def measure(build: Path, sessions: int, steps: int) -> dict[str, float]:
     before_mb = anonymous_mb()
     problem = load_problem(build, sessions)
     weights, batches, rates = LossWeights(), RayBatches(), LearningRates()
-    scene = optimise.field_groups(problem.scene, rates)
+    scene = optimize.field_groups(problem.scene, rates)
     return {
         "sessions": sessions,
         "frames": len(problem.video),
         "scene_step_ms": step_ms(problem, SceneLoss(problem, weights, batches, steps), scene, steps),
         "joint_step_ms": step_ms(
-            problem, JointLoss(problem, weights, batches, steps), optimise.joint_groups(problem, rates), steps
+            problem, JointLoss(problem, weights, batches, steps), optimize.joint_groups(problem, rates), steps
         ),
         "on_disk_kb_per_frame": stored_bytes(problem) / 1000 / len(problem.video),
         "memory_mb": anonymous_mb() - before_mb,

@@ -207,12 +207,12 @@ class BodyDenoiser(nn.Module):
         horizontal = step[:, ::2]
         square = horizontal.square().sum(1, keepdim=True)
         horizontal = horizontal * (square / (square + PATH_NOISE_M**2))
-        travelled = (horizontal.square().sum(1) + 1e-12).sqrt().cumsum(-1)
-        since = (travelled[:, None, :] - travelled[:, :, None]).clamp(max=0)
+        traveled = (horizontal.square().sum(1) + 1e-12).sqrt().cumsum(-1)
+        since = (traveled[:, None, :] - traveled[:, :, None]).clamp(max=0)
         displacement = horizontal @ (torch.exp(since / HEADING_MEMORY_M) * self.causal_mask).transpose(-1, -2)
         return soft_unit(
             displacement
-            + HEADING_MEMORY_M * torch.exp(-travelled / HEADING_MEMORY_M)[:, None] * horizontal_forward(root)
+            + HEADING_MEMORY_M * torch.exp(-traveled / HEADING_MEMORY_M)[:, None] * horizontal_forward(root)
         )
 
 

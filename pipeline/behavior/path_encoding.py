@@ -104,7 +104,7 @@ def snapped_to_goal(
     Each stride is shifted in proportion to its length, and by at most its length: rest is preserved, and a
     path that hardly moves does not reach the goal.
     """
-    travelled = np.linalg.norm(np.diff(path, axis=-2, prepend=start[..., None, :]), axis=-1).cumsum(-1)
+    traveled = np.linalg.norm(np.diff(path, axis=-2, prepend=start[..., None, :]), axis=-1).cumsum(-1)
     missing = goal - path[..., -1, :]
-    longest = np.maximum(np.linalg.norm(missing, axis=-1, keepdims=True), travelled[..., -1:])
-    return path + missing[..., None, :] * (pull * travelled / np.maximum(longest, MIN_SQUARED_M2))[..., None]
+    longest = np.maximum(np.linalg.norm(missing, axis=-1, keepdims=True), traveled[..., -1:])
+    return path + missing[..., None, :] * (pull * traveled / np.maximum(longest, MIN_SQUARED_M2))[..., None]

@@ -2,7 +2,7 @@
 
 Charts: `panels` makes axes, `floor_plan`, `loss_curves`, `histograms` and `time_series` draw on them,
 `pixels` returns the picture; no display, no global state. Pictures: `sample` chooses frames, `resized`,
-`outlined`, `depth_colors` and `labelled` change one, `grid` lays several out.
+`outlined`, `depth_colors` and `labeled` change one, `grid` lays several out.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-BLUE, ORANGE, GREEN, RED, GREY = "#3b6ea5", "#dd8452", "#55a868", "#c44e52", "#bbbbbb"
+BLUE, ORANGE, GREEN, RED, GRAY = "#3b6ea5", "#dd8452", "#55a868", "#c44e52", "#bbbbbb"
 """What was recorded of the animal; what was generated; the observer; what is wrong or sampled;
 surroundings."""
 BACKGROUND = 245
@@ -57,15 +57,15 @@ def loss_curves(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Draw smoothed losses, one panel per name and one color per label."""
     figure, axes = panels(1, max(len(curves), 1), width_in=width_in, height_in=3.0)
-    for axis, (title, labelled_curves) in zip(axes[0], curves.items(), strict=False):
-        for number, (label, values) in enumerate(labelled_curves.items()):
+    for axis, (title, labeled_curves) in zip(axes[0], curves.items(), strict=False):
+        for number, (label, values) in enumerate(labeled_curves.items()):
             for row, curve in enumerate(np.atleast_2d(values)):
                 means = running_mean(curve)
                 steps = np.arange(len(means)) + len(curve) - len(means) + 1
                 shown = label if row == 0 else None
                 axis.plot(steps, means, color=f"C{number % 10}", linewidth=0.8, label=shown)
         axis.set(title=title, xlabel="step", ylabel="loss", yscale="log" if log else "linear")
-        if len(labelled_curves) > 1:
+        if len(labeled_curves) > 1:
             axis.legend(fontsize=7)
     return pixels(figure)
 
@@ -137,7 +137,7 @@ def resized(
     return cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_NEAREST)
 
 
-def labelled(image: UInt8[np.ndarray, "height width 3"], text: str) -> UInt8[np.ndarray, "labeled width 3"]:
+def labeled(image: UInt8[np.ndarray, "height width 3"], text: str) -> UInt8[np.ndarray, "labeled width 3"]:
     """Return a picture with a line of text below it."""
     strip = np.full((LABEL_PX, image.shape[1], 3), BACKGROUND, np.uint8)
     place = (4, LABEL_PX - 6)

@@ -17,14 +17,14 @@ PERSON, ANIMAL, PLAN = (85, 168, 104), (59, 110, 165), (221, 132, 82)
 
 def bird_view(world: AnimalWorld, row: int) -> UInt8[np.ndarray, "400 400 3"]:
     """Draw one pair, the person in the middle of the picture; world +x is right, +z down."""
-    centre, scale = world.persons.position[row], SIDE_PX / SIDE_M
+    center, scale = world.persons.position[row], SIDE_PX / SIDE_M
     axis = (np.arange(SIDE_PX) + 0.5) / scale - SIDE_M / 2
-    x, z = np.meshgrid(axis + centre[0], axis + centre[1])
+    x, z = np.meshgrid(axis + center[0], axis + center[1])
     blocked = world.floors[world.scene[row]].blocks(np.stack([x, z], axis=-1))
     picture = np.where(blocked[..., None], SOLID, GROUND).astype(np.uint8)
 
     def pixel(point: Float[np.ndarray, "2"]) -> tuple[int, int]:
-        u, v = np.round((point - centre) * scale + SIDE_PX / 2).astype(int)
+        u, v = np.round((point - center) * scale + SIDE_PX / 2).astype(int)
         return int(u), int(v)
 
     animals = world.animals
@@ -38,8 +38,8 @@ def bird_view(world: AnimalWorld, row: int) -> UInt8[np.ndarray, "400 400 3"]:
     cv2.circle(picture, pixel(root[[0, 2], 3]), 6, ANIMAL, -1)
     heading = world.persons.heading[row]
     ahead = np.array([np.sin(heading), np.cos(heading)])
-    cv2.line(picture, pixel(centre), pixel(centre + 0.5 * ahead), PERSON, 2)
-    cv2.circle(picture, pixel(centre), 8, PERSON, -1)
+    cv2.line(picture, pixel(center), pixel(center + 0.5 * ahead), PERSON, 2)
+    cv2.circle(picture, pixel(center), 8, PERSON, -1)
     return picture
 
 

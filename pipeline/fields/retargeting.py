@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from pipeline.fields.skinning import SkinnedShape
 from pipeline.geometry import rigid, subsampling
 
-NEIGHBOURS = 4
+NEIGHBORS = 4
 """Nearest source vertices from which skinning weights are interpolated."""
 EXTENT_PERCENT = (1.0, 99.0)
 """Percentiles of the vertices that define a body's extent along each axis."""
@@ -64,7 +64,7 @@ def find_correspondences(
     """Map points of the target into the source by aligning extents; also return the source's skinning weights
     there."""
     place = _scaled(target, source, points)
-    distance, nearest = KDTree(source.vertices).query(place, k=NEIGHBOURS)
+    distance, nearest = KDTree(source.vertices).query(place, k=NEIGHBORS)
     share = 1 / np.maximum(distance, 1e-6)
     share /= share.sum(1, keepdims=True)
     return place, np.einsum("pk,pkb->pb", share, source.weights[nearest])
@@ -127,9 +127,9 @@ def _fit_rigid(
     square = (weight**2).sum()
     rest_centroid = weight**2 @ rest / square
     centroid = np.einsum("v,fvi->fi", weight, goal) / square
-    centred = rest - rest_centroid
-    variance = (weight**2 * (centred**2).sum(-1)).sum()
-    covariance = np.einsum("v,fvi,vj->fij", weight, goal - weight[:, None] * centroid[:, None], centred)
+    centered = rest - rest_centroid
+    variance = (weight**2 * (centered**2).sum(-1)).sum()
+    covariance = np.einsum("v,fvi,vj->fij", weight, goal - weight[:, None] * centroid[:, None], centered)
     covariance += (ROTATION_PRIOR * variance + 1e-12) * np.einsum(
         "v,fvij->fij", weight / weight.sum(), rotations
     )

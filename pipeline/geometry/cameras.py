@@ -21,10 +21,10 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 def pixel_grid(height: int, width: int) -> Float[np.ndarray, "height width 2"]:
     """Return the pixel centers (x, y) of an image."""
-    return pixel_centres(*np.indices((height, width)))
+    return pixel_centers(*np.indices((height, width)))
 
 
-def pixel_centres(
+def pixel_centers(
     row: Int[np.ndarray, "*batch"], column: Int[np.ndarray, "*batch"]
 ) -> Float[np.ndarray, "*batch 2"]:
     """Return the centers (x, y) of pixels given by row and column."""

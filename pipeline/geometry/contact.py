@@ -63,7 +63,7 @@ def depth_of(
     and where rays miss the body. Meters, world +y up."""
     rows, columns = np.nonzero(mask)
     eye = world_from_camera[:3, 3]
-    rays = cameras.unproject(cameras.pixel_centres(rows, columns), intrinsics) @ world_from_camera[:3, :3].T
+    rays = cameras.unproject(cameras.pixel_centers(rows, columns), intrinsics) @ world_from_camera[:3, :3].T
     towards = (eye - point_world) * [1, 0, 1]
     towards /= max(float(np.linalg.norm(towards)), 1e-6)
     facing = rays @ towards

@@ -13,6 +13,6 @@ def supported(depth: Float[np.ndarray, "height width"]) -> Bool[np.ndarray, "hei
     around = np.pad(depth, 1)
     count = np.zeros(depth.shape, np.uint8)
     for row, column in np.ndindex(3, 3):
-        neighbour = around[row : row + height, column : column + width]
-        count += (np.abs(neighbour - depth) < TOLERANCE_M) & (neighbour > 0)
+        neighbor = around[row : row + height, column : column + width]
+        count += (np.abs(neighbor - depth) < TOLERANCE_M) & (neighbor > 0)
     return (depth > 0) & (count > SUPPORTERS)

@@ -81,11 +81,11 @@ def floor_direction(
 
 
 def _spherical_cap(
-    centre: Float[np.ndarray, "3"], radius_rad: float, count: int
+    center: Float[np.ndarray, "3"], radius_rad: float, count: int
 ) -> Float[np.ndarray, "direction 3"]:
     """Return directions on a Fibonacci spiral within an angle of a center, the center first."""
     share = np.arange(count) / count
     cosine, turn = 1 - share * (1 - np.cos(radius_rad)), np.pi * (3 - np.sqrt(5)) * np.arange(count)
     sine = np.sqrt(1 - cosine**2)
     around_z = np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine], axis=-1)
-    return around_z @ align.rotation_between(np.array([0.0, 0.0, 1.0]), centre).T
+    return around_z @ align.rotation_between(np.array([0.0, 0.0, 1.0]), center).T

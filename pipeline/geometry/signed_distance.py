@@ -76,7 +76,7 @@ def surface_points(mesh: Mesh, spacing_m: float) -> SurfacePoints:
     return SurfacePoints(points, normal[face] / np.maximum(twice_area[face], 1e-12)[:, None])
 
 
-def voxel_centres(
+def voxel_centers(
     low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], voxel_m: float
 ) -> Float[np.ndarray, "x y z 3"]:
     """Return the centers of the voxels between two corners of a box, the first one at ``low``; meters."""
@@ -99,14 +99,14 @@ def from_mesh(
     filter corrects it. Surfaces with solid on both sides, which fusion leaves in walls, are ignored, since
     their gradient would lead deeper.
     """
-    grid, surface = voxel_centres(low, high, voxel_m), surface_points(mesh, spacing_m)
-    centres, shape = grid.reshape(-1, 3), grid.shape[:3]
-    inside, coarse_m = _inside(mesh, centres).reshape(shape), _distance_to_points(surface, grid, voxel_m)
+    grid, surface = voxel_centers(low, high, voxel_m), surface_points(mesh, spacing_m)
+    centers, shape = grid.reshape(-1, 3), grid.shape[:3]
+    inside, coarse_m = _inside(mesh, centers).reshape(shape), _distance_to_points(surface, grid, voxel_m)
     solid = _majority(inside, coarse_m, voxel_m)
     surface = _without_interior(surface, solid, np.asarray(low, np.float64), voxel_m)
     distance = _distance_to_points(surface, grid, voxel_m).reshape(-1)
     near = np.flatnonzero(distance < 3 * voxel_m)
-    distance[near] = _distance_to_patches(surface, centres[near], spacing_m)
+    distance[near] = _distance_to_patches(surface, centers[near], spacing_m)
     values = torch.from_numpy(np.where(solid, -1.0, 1.0) * distance.reshape(shape)).float()
     return SignedDistance(values, torch.from_numpy(np.asarray(low, np.float64)).float(), voxel_m)
 
@@ -135,11 +135,11 @@ def _without_interior(
 
 
 def _distance_to_points(
-    surface: SurfacePoints, centres: Float[np.ndarray, "x y z 3"], voxel_m: float
+    surface: SurfacePoints, centers: Float[np.ndarray, "x y z 3"], voxel_m: float
 ) -> Float[np.ndarray, "x y z"]:
     """Return the distance to a point of the nearest voxel with points: fast, accurate to half a voxel."""
-    shape = centres.shape[:3]
-    index = np.rint((surface.points - centres[0, 0, 0]) / voxel_m).astype(np.int64)
+    shape = centers.shape[:3]
+    index = np.rint((surface.points - centers[0, 0, 0]) / voxel_m).astype(np.int64)
     inside = ((index >= 0) & (index < shape)).all(1)
     flat = np.ravel_multi_index(index[inside].T, shape)
     chosen = np.full(np.prod(shape), -1)
@@ -148,7 +148,7 @@ def _distance_to_points(
         return np.full(shape, np.inf)
     far = (chosen < 0).reshape(shape)
     nearest = np.asarray(ndimage.distance_transform_edt(far, return_distances=False, return_indices=True))
-    return np.linalg.norm(centres - surface.points[chosen.reshape(shape)[tuple(nearest)]], axis=-1)
+    return np.linalg.norm(centers - surface.points[chosen.reshape(shape)[tuple(nearest)]], axis=-1)
 
 
 def _distance_to_patches(

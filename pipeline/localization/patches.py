@@ -24,7 +24,7 @@ MIN_MASK_PX, MIN_DEPTH_PX, DEPTH_SAMPLES = 30, 10, 400
 """Agent: least mask pixels, least of them with depth, and mask pixels sampled for the median depth."""
 MIN_DEPTH_M = 0.1
 """Smaller depth counts as missing, meters."""
-GREY = 128
+GRAY = 128
 """Gray value outside the mask."""
 KEYPOINT_PX = 8.0
 """Size of DAISY's keypoints, pixels; no effect on unrotated descriptors."""
@@ -143,8 +143,8 @@ def describe_cells(
 ) -> tuple[Float[np.ndarray, "patch channel"], Float[np.ndarray, "patch 2"]]:
     """Return a network's descriptors of a resized picture and their cell centers, pixels."""
     cells = describe(picture, stride_px)
-    centre = (cameras.pixel_grid(*cells.shape[:2]) * stride_px).reshape(-1, 2)
-    return cells.reshape(-1, cells.shape[-1]), centre
+    center = (cameras.pixel_grid(*cells.shape[:2]) * stride_px).reshape(-1, 2)
+    return cells.reshape(-1, cells.shape[-1]), center
 
 
 def extract_patches(
@@ -197,7 +197,7 @@ def _crop(color, depth, depth_intrinsics, intrinsics, mask, sampling):
     row, column = np.nonzero(mask)
     if len(row) < MIN_MASK_PX:
         return None
-    sample = cameras.pixel_centres(row, column)[:: max(1, len(row) // DEPTH_SAMPLES)]
+    sample = cameras.pixel_centers(row, column)[:: max(1, len(row) // DEPTH_SAMPLES)]
     points = cameras.back_project_pixels(sample, intrinsics, depth, depth_intrinsics)
     valid = points[:, 2] > MIN_DEPTH_M
     if valid.sum() < MIN_DEPTH_PX:
@@ -207,6 +207,6 @@ def _crop(color, depth, depth_intrinsics, intrinsics, mask, sampling):
     origin = np.array([(column.min() + column.max() + 1) / 2, (row.min() + row.max() + 1) / 2]) - half
     warp = np.array([[scale, 0, -origin[0] * scale], [0, scale, -origin[1] * scale]])
     size = (sampling.window_px, sampling.window_px)
-    filled = np.where(mask[..., None], color, np.uint8(GREY))
-    crop = cv2.warpAffine(filled, warp, size, flags=cv2.INTER_LINEAR, borderValue=(GREY, GREY, GREY))
+    filled = np.where(mask[..., None], color, np.uint8(GRAY))
+    crop = cv2.warpAffine(filled, warp, size, flags=cv2.INTER_LINEAR, borderValue=(GRAY, GRAY, GRAY))
     return crop, origin, scale

@@ -137,19 +137,19 @@ def encode_places(
 ) -> EncodedPlaces:
     """Encode the places of static bodies: heading frame, clearance, orientation, scene points."""
     world_from_place = world_from_ego(world_from_agent, "yaw")
-    centre = np.asarray(world_from_agent)[:, :3, 3]
+    center = np.asarray(world_from_agent)[:, :3, 3]
     clearance = torch.zeros(len(scene), 1)
     for index, each in enumerate(scenes):
         rows = np.flatnonzero(scene == index)
-        clearance[rows, 0] = each.distance.at(torch.from_numpy(centre[rows]).float())
+        clearance[rows, 0] = each.distance.at(torch.from_numpy(center[rows]).float())
     r = root_channels(rigid.inverse(world_from_place) @ world_from_agent)[:, 3:]
-    seen = _points(world_from_place, centre, scene, scenes, BODY_REACH_M, points, rng)
+    seen = _points(world_from_place, center, scene, scenes, BODY_REACH_M, points, rng)
     return EncodedPlaces(world_from_place, torch.cat([clearance, r], dim=-1), seen)
 
 
 def _points(
     frames: np.ndarray,
-    centre: np.ndarray,
+    center: np.ndarray,
     scene: np.ndarray,
     scenes: Sequence[MotionScene],
     reach_m: float,
@@ -159,5 +159,5 @@ def _points(
     sampled = np.zeros((len(scene), count, 3), np.float32)
     for index, each in enumerate(scenes):
         rows = np.flatnonzero(scene == index)
-        sampled[rows] = each.around(frames[rows], centre[rows], reach_m, count, rng)
+        sampled[rows] = each.around(frames[rows], center[rows], reach_m, count, rng)
     return torch.from_numpy(sampled)

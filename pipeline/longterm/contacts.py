@@ -58,7 +58,7 @@ class ContactVertices:
         """Number of feet."""
         return int(self.foot.max()) + 1 if len(self.foot) else 0
 
-    def centres(self, vertices_world: Float[Tensor, "frame vertex 3"]) -> Float[Tensor, "frame foot 3"]:
+    def centers(self, vertices_world: Float[Tensor, "frame vertex 3"]) -> Float[Tensor, "frame foot 3"]:
         """Return the centroid of each foot from the positions of the contact vertices."""
         share = vertices_world.new_zeros(self.feet, len(self.foot))
         share[torch.from_numpy(self.foot), torch.arange(len(self.foot))] = 1
@@ -105,7 +105,7 @@ def _feet(
 
 
 def detect_stance(
-    centres_world: Float[np.ndarray, "frame foot 3"],
+    centers_world: Float[np.ndarray, "frame foot 3"],
     height_m: Float[np.ndarray, "frame foot"],
     root_world: Float[np.ndarray, "frame 3"],
     *,
@@ -118,7 +118,7 @@ def detect_stance(
     are removed. With ``should_stand``, return which feet should stand in motion with foot skate: the slowest
     near the ground, at any speed, as in the paper, and any that is slower than the body.
     """
-    foot, body = _speed(centres_world), _speed(root_world[:, None])
+    foot, body = _speed(centers_world), _speed(root_world[:, None])
     smoothed = ndimage.uniform_filter1d(foot, round(RATE_HZ / 6), axis=0, mode="nearest")
     ground = np.percentile(height_m, GROUND_PERCENTILE, axis=0, keepdims=True)
     low = height_m < ground.clip(-GROUND_ERROR_M, GROUND_ERROR_M) + LIFTED_M
@@ -131,11 +131,11 @@ def detect_stance(
         slow |= slowest & (smoothed < SLOWEST_FOOT_LIFTED * body)
     closed = ndimage.binary_closing(slow & low, np.ones((3, 1)))
     stance = ndimage.binary_opening(np.pad(closed, ((1, 1), (0, 0)), mode="edge"), np.ones((3, 1)))[1:-1]
-    return enforce_swing_time(stance, centres_world) if should_stand else stance
+    return enforce_swing_time(stance, centers_world) if should_stand else stance
 
 
 def enforce_swing_time(
-    stance: Bool[np.ndarray, "frame foot"], centres_world: Float[np.ndarray, "frame foot 3"]
+    stance: Bool[np.ndarray, "frame foot"], centers_world: Float[np.ndarray, "frame foot 3"]
 ) -> Bool[np.ndarray, "frame foot"]:
     """Split, shorten or drop stance phases so that each foot has time to swing between two of them.
 
@@ -143,12 +143,12 @@ def enforce_swing_time(
     sqrt(6 d / `SWING_M_S2`) seconds (a cubic in time, at rest at both ends).
     """
     enforced = np.zeros_like(stance)
-    for foot, centres in enumerate(np.moveaxis(centres_world, 1, 0)):
+    for foot, centers in enumerate(np.moveaxis(centers_world, 1, 0)):
         phases: list[range] = []
-        for phase in _split_phases(stance[:, foot], centres):
+        for phase in _split_phases(stance[:, foot], centers):
             while (
                 phases
-                and (pair := _make_room_to_swing(phases[-1], phase, centres)) is None
+                and (pair := _make_room_to_swing(phases[-1], phase, centers)) is None
                 and len(phase) > len(phases[-1])
             ):
                 phases.pop()
@@ -161,21 +161,21 @@ def enforce_swing_time(
 
 
 def _split_phases(
-    stance: Bool[np.ndarray, "frame"], centres: Float[np.ndarray, "frame 3"]
+    stance: Bool[np.ndarray, "frame"], centers: Float[np.ndarray, "frame 3"]
 ) -> Iterator[range]:
     """Yield the frames of each stance phase, split where the foot slides too far."""
     for start, end in runs(stance):
-        skate = np.linalg.norm(np.diff(centres[start:end], axis=0), axis=1).sum()
+        skate = np.linalg.norm(np.diff(centers[start:end], axis=0), axis=1).sum()
         count = max(1, min(int(np.ceil(skate / STRIDE_M)), (end - start) // SHORTEST_PHASE_FRAMES))
         cuts = np.linspace(start, end, count + 1).round().astype(int).tolist()
         yield from (range(*pair) for pair in pairwise(cuts))
 
 
 def _make_room_to_swing(
-    before: range, after: range, centres: Float[np.ndarray, "frame 3"]
+    before: range, after: range, centers: Float[np.ndarray, "frame 3"]
 ) -> tuple[range, range] | None:
     """Shorten two phases until the foot has time to swing between them; None if they are too short."""
-    step_m = np.linalg.norm(centres[after].mean(0) - centres[before].mean(0))
+    step_m = np.linalg.norm(centers[after].mean(0) - centers[before].mean(0))
     lacking = max(int(np.ceil(np.sqrt(6 * step_m / SWING_M_S2) * RATE_HZ)) - (after.start - before.stop), 0)
     spare = [max(len(phase) - SHORTEST_PHASE_FRAMES, 0) for phase in (before, after)]
     if lacking > sum(spare):

@@ -190,7 +190,7 @@ class _Objective:
         collision_weight: Float[Tensor, "frame 1"],
     ) -> Float[Tensor, ""]:
         terms, both = self.terms, self.given.shape[1]
-        feet = self.contacts.centres(points[:, self.count : both])
+        feet = self.contacts.centers(points[:, self.count : both])
         near = distance[:, self.count : both]
         inside = collision_error(distance, terms.margin_m)
         smooth = sum(_mean(smooth_error(each)) for each in (points[:, : self.count], feet))

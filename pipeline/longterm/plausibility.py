@@ -58,9 +58,9 @@ class PlausibilityMeter:
     def stance(self, motion: BodyMotion, *, should_stand: bool = False) -> Bool[np.ndarray, "frame foot"]:
         """Return the stance of each foot, or with ``should_stand`` which feet should be in stance."""
         points = PosedSurface(self.body, self.contacts.vertices)(*motion_tensors(motion))
-        centres, height = self.contacts.centres(points), self.contacts.lowest(self.scene.at(points))
+        centers, height = self.contacts.centers(points), self.contacts.lowest(self.scene.at(points))
         roots = motion.world_from_agent[:, :3, 3]
-        return detect_stance(centres.numpy(), height.numpy(), roots, should_stand=should_stand)
+        return detect_stance(centers.numpy(), height.numpy(), roots, should_stand=should_stand)
 
     def gap_and_penetration(
         self, motion: BodyMotion
@@ -78,9 +78,9 @@ class PlausibilityMeter:
             distances.append(self.scene.at(vertices))
             points.append(vertices[:, self.contacts.vertices])
         distance = torch.cat(distances)
-        centres = self.contacts.centres(torch.cat(points)).numpy()
+        centers = self.contacts.centers(torch.cat(points)).numpy()
         both = stance[1:] & stance[:-1]
-        speed = np.linalg.norm(np.diff(centres, axis=0)[..., [0, 2]], axis=-1) * RATE_HZ
+        speed = np.linalg.norm(np.diff(centers, axis=0)[..., [0, 2]], axis=-1) * RATE_HZ
         near = self.contacts.lowest(distance[1:, self.contacts.vertices]).numpy() < CONTACT_M
         slowest = np.where(near, speed, np.inf).min(axis=1, initial=np.inf)
         skate, slowest = speed[both], slowest[np.isfinite(slowest)]

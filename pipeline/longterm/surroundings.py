@@ -78,7 +78,7 @@ class MotionScene:
     def around(
         self,
         world_from_frame: Float[np.ndarray, "batch 4 4"],
-        centre_world: Float[np.ndarray, "batch 3"],
+        center_world: Float[np.ndarray, "batch 3"],
         reach_m: float,
         count: int,
         rng: np.random.Generator,
@@ -87,11 +87,11 @@ class MotionScene:
         points = self.surface.points.astype(np.float32)
         standing = np.abs(self.surface.normals[:, 1]) < VERTICAL_SURFACE
         frame_from_world = rigid.inverse(world_from_frame)
-        drawn = np.zeros((len(centre_world), count, 3), np.float32)
+        drawn = np.zeros((len(center_world), count, 3), np.float32)
         if not count:
             return drawn
-        for row, centre in enumerate(np.asarray(centre_world, np.float32)):
-            near = np.flatnonzero(((points - centre) ** 2).sum(1) < reach_m**2)
+        for row, center in enumerate(np.asarray(center_world, np.float32)):
+            near = np.flatnonzero(((points - center) ** 2).sum(1) < reach_m**2)
             if not len(near):
                 continue
             upright = near[standing[near]]

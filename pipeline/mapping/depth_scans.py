@@ -58,9 +58,9 @@ def image_normals(
     down = points[2 * SPAN_PX :, inner] - points[: -2 * SPAN_PX, inner]
     cross = np.cross(down, right)
     length = np.linalg.norm(cross, axis=-1)
-    centre = depth[inner, inner]
-    limit = MAX_NORMAL_STEP_M + MAX_NORMAL_STEP_SHARE * centre
-    known = (centre > 0) & (length > 1e-9) & (np.abs(right[..., 2]) < limit) & (np.abs(down[..., 2]) < limit)
+    center = depth[inner, inner]
+    limit = MAX_NORMAL_STEP_M + MAX_NORMAL_STEP_SHARE * center
+    known = (center > 0) & (length > 1e-9) & (np.abs(right[..., 2]) < limit) & (np.abs(down[..., 2]) < limit)
     for end in (slice(2 * SPAN_PX, None), slice(None, -2 * SPAN_PX)):
         known &= (depth[inner, end] > 0) & (depth[end, inner] > 0)
     normals[inner, inner] = np.where(known[..., None], cross / np.maximum(length, 1e-9)[..., None], 0)

@@ -119,9 +119,9 @@ def _normals(points: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "
     across = points[1:-1, 2:] - points[1:-1, :-2]
     down = points[2:, 1:-1] - points[:-2, 1:-1]
     z = points[..., 2]
-    neighbours = np.stack([z[1:-1, 2:], z[1:-1, :-2], z[2:, 1:-1], z[:-2, 1:-1], z[1:-1, 1:-1]])
-    smooth = (neighbours.min(0) > 0) & (
-        np.ptp(neighbours, axis=0) < NORMAL_JUMP * np.maximum(neighbours[-1], NORMAL_JUMP_DEPTH_M)
+    neighbors = np.stack([z[1:-1, 2:], z[1:-1, :-2], z[2:, 1:-1], z[:-2, 1:-1], z[1:-1, 1:-1]])
+    smooth = (neighbors.min(0) > 0) & (
+        np.ptp(neighbors, axis=0) < NORMAL_JUMP * np.maximum(neighbors[-1], NORMAL_JUMP_DEPTH_M)
     )
     normal = np.cross(down, across)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)

@@ -134,11 +134,11 @@ def _is_reliable(result: IcpResult) -> bool:
 def _keyframe_pairs(poses: Float[np.ndarray, "frame 4 4"], loops: int) -> list[tuple[int, int]]:
     """Pair each keyframe with its predecessor and its nearest loop candidates."""
     keys = np.arange(0, len(poses), KEYFRAME_STEP)
-    centre, forward = poses[keys, :3, 3], poses[keys, :3, 2]
+    center, forward = poses[keys, :3, 3], poses[keys, :3, 2]
     pairs = []
     for key in range(1, len(keys)):
         pairs.append((int(keys[key - 1]), int(keys[key])))
-        separation = np.linalg.norm(centre[: key - 1] - centre[key], axis=1) / LOOP_RADIUS_M
+        separation = np.linalg.norm(center[: key - 1] - center[key], axis=1) / LOOP_RADIUS_M
         separation += np.arccos(np.clip(forward[: key - 1] @ forward[key], -1, 1)) / LOOP_RADIUS_RAD
         for _ in range(loops):
             if not len(separation) or separation.min() > LOOP_DISTANCE:

@@ -61,7 +61,7 @@ class Reading:
     """factor on depth"""
     focal: float = 1.0
     """factor on the focal length"""
-    centre: tuple[float, float] = (0.0, 0.0)
+    center: tuple[float, float] = (0.0, 0.0)
     """shift of the principal point, shares of width and height"""
     mirrored: tuple[Literal["picture", "depth"], ...] = ()
     depth_of: Clock = ""
@@ -76,7 +76,7 @@ READINGS = (
     *(Reading(f"a focal length times {factor:g}", focal=factor) for factor in (0.8, 0.9, 1.1, 1.25)),
     *(
         Reading(
-            f"a principal point moved by {x:g} and {y:g} % of width and height", centre=(x / 100, y / 100)
+            f"a principal point moved by {x:g} and {y:g} % of width and height", center=(x / 100, y / 100)
         )
         for x, y in itertools.product((-5, 0, 5), repeat=2)
         if x or y
@@ -184,17 +184,17 @@ def correlation(first: PosedPicture, second: PosedPicture, reading: Reading) -> 
     grid = np.mgrid[step // 2 : depth_size[0] : step, step // 2 : depth_size[1] : step]
     row, column = grid.reshape(2, -1)
     row, column = row[depth[row, column] > 0], column[depth[row, column] > 0]
-    centre = cameras.pixel_centres(row, column)
-    rays = cameras.unproject(centre, _intrinsics(first.depth_intrinsics, depth_size, reading))
+    center = cameras.pixel_centers(row, column)
+    rays = cameras.unproject(center, _intrinsics(first.depth_intrinsics, depth_size, reading))
     points = rigid.apply(_second_from_first(first, second, reading), rays * depth[row, column, None])
     pixel, z = cameras.project(points, _intrinsics(second.intrinsics, size, reading))
     inside = (z > NEAREST_M) & (pixel >= 1).all(-1) & (pixel < np.array(size[::-1]) - 1).all(-1)
-    pixel, z, centre = pixel[inside], z[inside], centre[inside]
+    pixel, z, center = pixel[inside], z[inside], center[inside]
     measured = seen_depth[cameras.pixel_index(pixel * np.array(depth_size[::-1]) / size[::-1])]
     shown = (measured == 0) | (z < measured * (1 + OCCLUDED_SHARE) + OCCLUDED_M)
     if shown.sum() < MIN_POINTS:
         return np.nan
-    own = centre[shown] * np.array(size[::-1]) / depth_size[::-1]
+    own = center[shown] * np.array(size[::-1]) / depth_size[::-1]
     pairs = zip(grays, (own, pixel[shown]), strict=True)
     return correlated(*(cameras.sample_bilinear(gray, at[:, None])[:, 0] for gray, at in pairs))
 
@@ -209,7 +209,7 @@ def _intrinsics(
 ) -> Float[np.ndarray, "3 3"]:
     read = intrinsics.astype(float)
     read[[0, 1], [0, 1]] *= reading.focal
-    read[:2, 2] += np.array(reading.centre) * size[::-1]
+    read[:2, 2] += np.array(reading.center) * size[::-1]
     return read
 
 

@@ -48,7 +48,7 @@ def source_views(sparse: SparseModel, max_views: int) -> list[Int[np.ndarray, "s
     count = len(sparse.frame)
     seen = np.zeros((count, len(sparse.points_model)), bool)
     seen[sparse.observed_key, sparse.observed_point] = True
-    centres = sparse.model_from_camera[:, :3, 3]
+    centers = sparse.model_from_camera[:, :3, 3]
     low, high = TRIANGULATION_DEG
     chosen = []
     for key in range(count):
@@ -57,7 +57,7 @@ def source_views(sparse: SparseModel, max_views: int) -> list[Int[np.ndarray, "s
         for other in np.flatnonzero(shared.sum(1) >= MIN_SHARED):
             if other != key:
                 points = sparse.points_model[shared[other]]
-                rays, theirs = centres[key] - points, centres[other] - points
+                rays, theirs = centers[key] - points, centers[other] - points
                 length = np.linalg.norm(rays, axis=1) * np.linalg.norm(theirs, axis=1)
                 cosine = (rays * theirs).sum(1) / np.maximum(length, 1e-12)
                 angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))

@@ -24,9 +24,9 @@ class TriangleSurface:
     def __init__(self, corners: Float[np.ndarray, "face 3 3"]):
         area = triangles.area(corners)
         self.corners = split(corners[area > 0], EDGE_FACTOR * float(np.sqrt(area.mean())))
-        centre = self.corners.mean(1)
-        self._reach = float(np.linalg.norm(self.corners - centre[:, None], axis=-1).max())
-        self._centres = KDTree(centre)
+        center = self.corners.mean(1)
+        self._reach = float(np.linalg.norm(self.corners - center[:, None], axis=-1).max())
+        self._centers = KDTree(center)
 
     def sample(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "point 3"]:
         """Draw points uniformly over the surface, meters."""
@@ -40,8 +40,8 @@ class TriangleSurface:
         return np.concatenate([self._distance(part) for part in parts])
 
     def _distance(self, points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point"]:
-        nearest = _to_triangles(points, self.corners[self._centres.query(points)[1]])
-        near = self._centres.query_ball_point(points, nearest + self._reach, return_sorted=False)
+        nearest = _to_triangles(points, self.corners[self._centers.query(points)[1]])
+        near = self._centers.query_ball_point(points, nearest + self._reach, return_sorted=False)
         point = np.repeat(np.arange(len(points)), [len(each) for each in near])
         face = np.concatenate(near).astype(int)
         np.minimum.at(nearest, point, _to_triangles(points[point], self.corners[face]))

@@ -45,12 +45,12 @@ def find_heading(inside_world: Float[np.ndarray, "cell 3"], ground: GroundPlane,
     The head is thick and high, the tail thin, and the rump of a curled animal low. An animal that stands
     upright or lies curled may be wider than long: ``turn_deg``, counterclockwise from above, corrects this.
     """
-    centre = np.median(inside_world, axis=0)
+    center = np.median(inside_world, axis=0)
     level = (inside_world - inside_world.mean(0))[:, [0, 2]]
     variance, axes = np.linalg.eigh(level.T @ level)
     axis = axes[:, -1]
     axis = axis if axis[np.abs(axis).argmax()] > 0 else -axis
-    along = (inside_world - centre)[:, [0, 2]] @ axis
+    along = (inside_world - center)[:, [0, 2]] @ axis
     end = END_SHARE * np.ptp(along)
     height = np.maximum(ground.above(inside_world), 0)
     ahead, behind = height[along > along.max() - end].sum(), height[along < along.min() + end].sum()
@@ -59,7 +59,7 @@ def find_heading(inside_world: Float[np.ndarray, "cell 3"], ground: GroundPlane,
         axis = -axis
     up = np.array([0.0, 1.0, 0.0])
     forward = rigid.exp(np.r_[np.radians(turn_deg) * up, 0, 0, 0])[:3, :3] @ np.array([axis[0], 0, axis[1]])
-    world_from_agent = rigid.make(np.stack([np.cross(up, forward), up, forward], axis=1), centre)
+    world_from_agent = rigid.make(np.stack([np.cross(up, forward), up, forward], axis=1), center)
     return Heading(world_from_agent, float(share), float(np.sqrt(variance[1] / max(variance[0], 1e-12))))
 
 
@@ -76,7 +76,7 @@ def fit_bones(
 ) -> Bones:
     """Cluster the body's voxels (agent frame) into bones, front to back; a bone's z is its longest axis."""
     cells = inside_agent[np.sort(rng.permutation(len(inside_agent))[:MAX_CELLS])]
-    graph = neighbour_graph(cells, voxel_m * max(1.0, (len(inside_agent) / len(cells)) ** (1 / 3)))
+    graph = neighbor_graph(cells, voxel_m * max(1.0, (len(inside_agent) / len(cells)) ** (1 / 3)))
     near = KDTree(inside_agent).query_ball_point(cells, DENSITY_RADIUS_M, return_length=True)
     label = k_medoids(graph, cells, 1.0 / np.maximum(near, 1), bones)
     frames, scales = [], []
@@ -92,7 +92,7 @@ def fit_bones(
     return Bones(np.stack(frames)[order], np.stack(scales)[order])
 
 
-def neighbour_graph(cells: Float[np.ndarray, "cell 3"], spacing_m: float) -> scipy.sparse.csr_matrix:
+def neighbor_graph(cells: Float[np.ndarray, "cell 3"], spacing_m: float) -> scipy.sparse.csr_matrix:
     """Connect voxels within two spacings, weighted by distance; join components at their nearest points."""
     pairs = KDTree(cells).query_pairs(2 * spacing_m, output_type="ndarray")
     length = np.linalg.norm(cells[pairs[:, 0]] - cells[pairs[:, 1]], axis=1)

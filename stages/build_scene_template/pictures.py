@@ -38,14 +38,14 @@ def pictures(template: SceneTemplate, clip: Clip) -> list[Picture]:
 def turntable(mesh: Mesh) -> UInt8[np.ndarray, "height width 3"]:
     """Render a mesh's front faces from four elevated viewpoints."""
     low, high = np.quantile(mesh.vertices, EXTENT, axis=0)
-    centre, reach = (low + high) / 2, np.linalg.norm(high - low) * REACH
+    center, reach = (low + high) / 2, np.linalg.norm(high - low) * REACH
     intrinsics = np.array([[FOCAL_PX, 0, WIDTH_PX // 2], [0, FOCAL_PX, HEIGHT_PX // 2], [0, 0, 1]])
     views = []
     for angle in np.pi * (np.arange(4) / 2 + 0.25):
-        eye = centre + reach * np.array([np.cos(angle) * EYE_OFFSET, EYE_HEIGHT, np.sin(angle) * EYE_OFFSET])
+        eye = center + reach * np.array([np.cos(angle) * EYE_OFFSET, EYE_HEIGHT, np.sin(angle) * EYE_OFFSET])
         facing = (mesh.face_normals() * (eye - mesh.vertices[mesh.faces[:, 0]])).sum(1) > 0
         caster = RayCaster(replace(mesh, faces=mesh.faces[facing]))
-        views.append(overview.view(caster, rigid.look_at(eye, centre, UP), intrinsics, HEIGHT_PX, WIDTH_PX))
+        views.append(overview.view(caster, rigid.look_at(eye, center, UP), intrinsics, HEIGHT_PX, WIDTH_PX))
     return plots.grid(views, 2)
 
 

@@ -137,8 +137,8 @@ def write_model(
     if sparse is None:
         (folder / "README.txt").write_text("COLMAP found no model in this walk-through.\n")
         return
-    centres = sparse.model_from_camera[:, :3, 3], world_from_camera[sparse.frame][:, :3, 3]
-    world_from_model = pycolmap.estimate_sim3d(*centres)
+    centers = sparse.model_from_camera[:, :3, 3], world_from_camera[sparse.frame][:, :3, 3]
+    world_from_model = pycolmap.estimate_sim3d(*centers)
     if world_from_model is not None:
         sparse.reconstruction.transform(world_from_model)
     sparse.reconstruction.write_text(folder)

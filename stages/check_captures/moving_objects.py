@@ -83,5 +83,5 @@ def _clusters(
     return [(np.median(points[region], axis=0), float(area[region].sum())) for region in regions]
 
 
-def _far_apart(centres: Sequence[Float[np.ndarray, "3"]]) -> bool:
-    return any(np.linalg.norm(a - b) > TWO_APART_M for i, a in enumerate(centres) for b in centres[i + 1 :])
+def _far_apart(centers: Sequence[Float[np.ndarray, "3"]]) -> bool:
+    return any(np.linalg.norm(a - b) > TWO_APART_M for i, a in enumerate(centers) for b in centers[i + 1 :])

@@ -168,9 +168,9 @@ def _source_frames(number: int, shown: Sequence[ColorView]) -> list[int]:
     known = view.depth[view.depth > 0]
     if not len(known):
         return []
-    centres = np.stack([each.view.world_from_camera[:3, 3] for each in shown])
+    centers = np.stack([each.view.world_from_camera[:3, 3] for each in shown])
     middle = view.world_from_camera[:3, 3] + view.world_from_camera[:3, 2] * float(np.median(known))
-    rays = centres - middle
+    rays = centers - middle
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
     angle = np.degrees(np.arccos(np.clip(rays @ rays[number], -1, 1)))
     fit = np.flatnonzero((angle > ANGLES_DEG[0]) & (angle < ANGLES_DEG[1]))

@@ -70,9 +70,9 @@ class Lens:
         """Undistort a picture."""
         if not self.is_distorted:
             return color
-        centred = self.intrinsics
-        centred[:2, 2] -= 0.5
-        return cv2.undistort(color, centred, np.array([self.radial, 0, 0, 0]))
+        centered = self.intrinsics
+        centered[:2, 2] -= 0.5
+        return cv2.undistort(color, centered, np.array([self.radial, 0, 0, 0]))
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def bundle_adjust(lens: Lens, located: Sequence[PnPResult], *, distortion: bool 
     frame = np.repeat(np.arange(len(located)), count)
     pixel = np.concatenate([each.matches.pixel for each in located])
     points = np.concatenate([each.matches.points_world for each in located])
-    centre = np.array(lens.size[::-1]) / 2
+    center = np.array(lens.size[::-1]) / 2
 
     def residuals(values):
         (scale, radial), twist = values[:2], values[2:].reshape(-1, 6)
@@ -150,7 +150,7 @@ def bundle_adjust(lens: Lens, located: Sequence[PnPResult], *, distortion: bool 
         moved += (camera_from_world[:, :3, 3] + twist[:, 3:])[frame]
         flat = moved[:, :2] / np.maximum(moved[:, 2:], 1e-3)
         distorted = flat * (1 + radial * (flat**2).sum(1, keepdims=True))
-        off_px = (scale * lens.focal_px * distorted + centre - pixel).ravel()
+        off_px = (scale * lens.focal_px * distorted + center - pixel).ravel()
         sigma = RADIAL_SIGMA if distortion else 1e-6
         return np.append(off_px, (radial - lens.radial) * np.sqrt(len(pixel)) / sigma)
 

@@ -25,7 +25,7 @@ from stages.estimate_depth.views import View
 
 WALK_VIEWS = 2
 """Pictures of the walk-through that each frame is compared with: those with most overlap."""
-NEIGHBOURS = (1, 3)
+NEIGHBORS = (1, 3)
 """Frame gaps of the flow between neighbors."""
 PROBES = 60
 """Sample pixels that measure the overlap with pictures of the walk-through."""
@@ -168,7 +168,7 @@ def walk_views(target: View, room: MapViews) -> list[View]:
     rows, columns = np.nonzero(target.depth > 0)
     chosen = np.linspace(0, len(rows) - 1, PROBES).astype(int) if len(rows) else np.zeros(0, int)
     z = target.depth[rows[chosen], columns[chosen]]
-    pixel = cameras.pixel_centres(rows, columns)[chosen]
+    pixel = cameras.pixel_centers(rows, columns)[chosen]
     points = rigid.apply(target.world_from_camera, cameras.unproject(pixel, target.intrinsics) * z[:, None])
     scores = np.zeros(len(room.walk))
     for number, each in enumerate(room.walk):
@@ -206,7 +206,7 @@ def _optimize(
         for walk in walk_views(seen[number], room):
             matches = _inliers(views.flow_matches(seen[number], walk), footage.lens, seed)
             factors.append(_FlowFactor(number, MAP, matches.pixel, matches.points_world))
-        for other in (at[frame + gap] for gap in NEIGHBOURS if frame + gap in at):
+        for other in (at[frame + gap] for gap in NEIGHBORS if frame + gap in at):
             matches = _inliers(views.flow_matches(seen[other], seen[number]), footage.lens, seed)
             points_camera = rigid.apply(rigid.inverse(poses[number]), matches.points_world)
             factors.append(_FlowFactor(other, number, matches.pixel, points_camera))

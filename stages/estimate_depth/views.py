@@ -94,7 +94,7 @@ def flow_matches(target: View, source: View) -> Matches:
     flow = dense.calc(shown, target.gray, np.zeros(0, np.float32))
     inner = tuple(slice(MARGIN_PX, side - MARGIN_PX, STRIDE_PX) for side in shown.shape)
     rows, columns = np.mgrid[inner].reshape(2, -1)
-    start, moved = cameras.pixel_centres(rows, columns), flow[rows, columns]
+    start, moved = cameras.pixel_centers(rows, columns), flow[rows, columns]
     good = warped.known[rows, columns] & (np.abs(moved).max(1) < MAX_FLOW_PX)
     rays = cameras.unproject(start[good], target.intrinsics) * target.depth[rows, columns][good, None]
     return Matches(start[good] + moved[good], rigid.apply(target.world_from_camera, rays))

@@ -67,7 +67,7 @@ class Estimator:
         height, width = self.dense_size
         return cv2.resize(gray, (2 * width, 2 * height), interpolation=cv2.INTER_AREA)
 
-    def neighbours(self, first: Gray, second: Gray) -> Dense:
+    def neighbors(self, first: Gray, second: Gray) -> Dense:
         """Search from coarse to fine and on the finest level only; keep per place what matches better."""
         candidates = [self._searched(search, first, second) for search in (self._coarse, self._fine)]
         return self._better(first, second, candidates)
@@ -129,7 +129,7 @@ def flows(
                 break
             first = gray(i)
             if gap == 1:
-                there, back = estimator.neighbours(first, last), estimator.neighbours(last, first)
+                there, back = estimator.neighbors(first, last), estimator.neighbors(last, first)
             else:
                 (there_1, back_1), (there_2, back_2) = known.pop((gap // 2, i)), known[gap // 2, i + gap // 2]
                 there = estimator.chained(first, last, there_1, there_2)

@@ -47,7 +47,7 @@ def _chart(
 ) -> UInt8[np.ndarray, "height width 3"]:
     figure, axes = plots.panels(1, 1, width_in=4, height_in=4)
     axis, filled = axes[0, 0], count > 0
-    axis.plot((0, 1), (0, 1), color=plots.GREY, linewidth=1)
+    axis.plot((0, 1), (0, 1), color=plots.GRAY, linewidth=1)
     area = np.interp(count[filled] / count.max(), (0, 1), DOT_AREAS)
     axis.scatter(confidence[filled], accuracy[filled], s=area, color=plots.BLUE, clip_on=False, zorder=3)
     axis.set(xlim=(0, 1), ylim=(0, 1), xlabel="confidence", ylabel="share that was right", aspect="equal")

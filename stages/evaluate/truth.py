@@ -95,8 +95,8 @@ def read_flow(folder: Path, name: str, source_index: Int[np.ndarray, "frame"]) -
         (position.get(first, -1), position.get(second, -9), row)
         for row, (first, second) in enumerate(sources)
     ]
-    neighbours = [(first, row) for first, second, row in pairs if first >= 0 and second == first + 1]
-    first, row = np.array(neighbours, int).reshape(-1, 2).T
+    neighbors = [(first, row) for first, second, row in pairs if first >= 0 and second == first + 1]
+    first, row = np.array(neighbors, int).reshape(-1, 2).T
     return TrueFlow(first, table["flow"][row].astype(np.float32))
 
 

@@ -99,5 +99,5 @@ def _write_picture(folder: Path, frame: CameraFrame) -> tuple[int, int]:
 
 def _write_depth(path: Path, depth: Float[np.ndarray, "height width"], width: int, height: int) -> None:
     enlarged = cv2.resize(depth.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST)
-    millimetres = np.clip(np.rint(np.where(np.isfinite(enlarged), enlarged, 0) * 1000), 0, 65535)
-    path.write_bytes(cv2.imencode(".png", millimetres.astype(np.uint16))[1].tobytes())
+    millimeters = np.clip(np.rint(np.where(np.isfinite(enlarged), enlarged, 0) * 1000), 0, 65535)
+    path.write_bytes(cv2.imencode(".png", millimeters.astype(np.uint16))[1].tobytes())

@@ -14,7 +14,7 @@ from pipeline.geometry import rigid
 from stages.export.reading import Agent, Occupancy
 from stages.export.writing import ExportRecord, extra, version
 
-GREY = 150
+GRAY = 150
 """of an animal without colors, 0..255"""
 ZUP_FROM_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
@@ -81,7 +81,7 @@ def model(
             moving = f'vertid="{vertices}" vertweight="{_row(weight[moved])}"'
             bones.append(f'<bone body="{name}" {bound} {moving}/>')
     vertices, faces = _row(agent.mesh.vertices.ravel()), " ".join(map(str, agent.mesh.faces.ravel()))
-    color = _row((np.full(3, GREY) if agent.mesh.color is None else agent.mesh.color.mean(0)) / 255)
+    color = _row((np.full(3, GRAY) if agent.mesh.color is None else agent.mesh.color.mean(0)) / 255)
     lines = [
         '<mujoco model="agent">',
         '<visual><headlight ambient="0.4 0.4 0.4"/></visual>',

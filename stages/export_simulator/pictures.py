@@ -33,8 +33,8 @@ def heat_maps(mesh: Mesh, floor_m: float, motions: list[SessionClip]) -> UInt8[n
     low, high = np.quantile(mesh.vertices, _EXTENT, axis=0)
     below = (mesh.vertices[mesh.faces, 1] < floor_m + _HEADROOM_M).all(1)
     caster = RayCaster(Mesh(mesh.vertices, mesh.faces[below], mesh.color))
-    centre, reach = (low + high) / 2 * [1, 0, 1] + [0, floor_m, 0], np.linalg.norm((high - low)[[0, 2]])
-    camera = rigid.look_at(centre + reach * _FROM, centre, UP)
+    center, reach = (low + high) / 2 * [1, 0, 1] + [0, floor_m, 0], np.linalg.norm((high - low)[[0, 2]])
+    camera = rigid.look_at(center + reach * _FROM, center, UP)
     height, width = _HEAT_SIZE
     lens = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]])
     depth, hits = render_view(caster, camera, lens, height, width)

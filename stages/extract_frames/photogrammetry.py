@@ -88,7 +88,7 @@ def _write_keyframes(
             sharpness.append(extraction.picture_statistics(color)[0])
     if len(rows) < structure.MIN_KEYFRAMES:
         raise no_map(recording, f"only {len(rows)} pictures can be read")
-    keys = structure.choose_keyframes(np.array(motion.travelled), np.array(sharpness), config)
+    keys = structure.choose_keyframes(np.array(motion.traveled), np.array(sharpness), config)
     chosen = np.array(rows)[keys]
     for row in chosen.tolist():
         color = extraction.picture(recording, row, size)
@@ -125,9 +125,9 @@ def no_map(recording: Recording, why: str) -> InputError:
 
 
 def _undistorted(path: Path, solved: Structure) -> UInt8[np.ndarray, "height width 3"]:
-    centred = solved.intrinsics.copy()
-    centred[:2, 2] -= 0.5
-    return cv2.undistort(images.read_color(path), centred, np.array([solved.radial, 0, 0, 0]))
+    centered = solved.intrinsics.copy()
+    centered[:2, 2] -= 0.5
+    return cv2.undistort(images.read_color(path), centered, np.array([solved.radial, 0, 0, 0]))
 
 
 def _view(
@@ -224,10 +224,10 @@ def _summary(recording: Recording, rows: np.ndarray, solved: Structure, scale: s
     left_out = f"; {len(lost)} were not registered, at {seconds}{' ...' if len(lost) > LISTED else ''} s"
     split = f", the largest of {solved.models} models" if solved.models > 1 else ""
     relative = "the scale is relative: lengths are no meters"
-    metres = relative if scale == extraction.RELATIVE else f"meters from the depth of {scale}"
+    meters = relative if scale == extraction.RELATIVE else f"meters from the depth of {scale}"
     focal_source = "given" if recording.intrinsics is not None else "calibrated"
     mapped = f"mapped from {len(solved.sparse.frame)} of {len(rows)} pictures{split}"
     lens = f"focal length {solved.intrinsics[0, 0]:.0f} px ({focal_source})"
     reprojection = f"reprojection {solved.sparse.reprojection_px:.2f} px"
     mapped += left_out if len(lost) else ""
-    return f"{recording.where}: {recording.kind}, {mapped}; {lens}, {reprojection}; {metres}"
+    return f"{recording.where}: {recording.kind}, {mapped}; {lens}, {reprojection}; {meters}"

@@ -44,8 +44,8 @@ def meters_per_unit(mapped: Sequence[SiftPoints], measured: Recording, seed: int
         scales += [scale for known in mapped if (scale := _scale(known, frame, seed)) is not None]
     if not scales:
         return None
-    centre = float(np.median(scales))
-    agreeing = np.abs(np.array(scales) / centre - 1) < AGREE_SHARE
+    center = float(np.median(scales))
+    agreeing = np.abs(np.array(scales) / center - 1) < AGREE_SHARE
     if agreeing.sum() < max(MIN_PAIRS, 0.5 * len(scales)):
         return None
     return float(np.median(np.array(scales)[agreeing]))

@@ -52,7 +52,7 @@ class PictureMotion:
     """Accumulates the motion of a video's pictures, in shares of their width."""
 
     def __init__(self) -> None:
-        self.travelled: list[float] = []
+        self.traveled: list[float] = []
         self._last: UInt8[np.ndarray, "height width"] | None = None
 
     def add(self, gray: UInt8[np.ndarray, "height width"]) -> None:
@@ -60,7 +60,7 @@ class PictureMotion:
         size = MOTION_WIDTH_PX, round(MOTION_WIDTH_PX * gray.shape[0] / gray.shape[1])
         small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
         step = 0.0 if self._last is None else self._step(self._last, small)
-        self.travelled.append(step + (self.travelled[-1] if self.travelled else 0.0))
+        self.traveled.append(step + (self.traveled[-1] if self.traveled else 0.0))
         self._last = small
 
     @staticmethod
@@ -79,11 +79,11 @@ class PictureMotion:
 
 
 def choose_keyframes(
-    travelled: Float[np.ndarray, "frame"], sharpness: Float[np.ndarray, "frame"], config: PhotogrammetryConfig
+    traveled: Float[np.ndarray, "frame"], sharpness: Float[np.ndarray, "frame"], config: PhotogrammetryConfig
 ) -> Int[np.ndarray, "key"]:
     """Pick the sharpest frame of every step of motion."""
-    steps = min(travelled[-1] / config.keyframe_share, config.max_keyframes - 1)
-    step = np.floor(travelled / max(travelled[-1], 1e-9) * steps).astype(int)
+    steps = min(traveled[-1] / config.keyframe_share, config.max_keyframes - 1)
+    step = np.floor(traveled / max(traveled[-1], 1e-9) * steps).astype(int)
     return subsampling.sharpest_of_steps(step, sharpness)
 
 
@@ -166,9 +166,9 @@ def _bag_of_words_similarity(
         return np.zeros((len(descriptors), len(descriptors)))
     cv2.setRNGSeed(seed)
     no_guess, rounds = np.zeros(0, np.int32), (cv2.TERM_CRITERIA_MAX_ITER, 8, 0)
-    centres = cv2.kmeans(sample, words, no_guess, rounds, 1, cv2.KMEANS_PP_CENTERS)[2]
+    centers = cv2.kmeans(sample, words, no_guess, rounds, 1, cv2.KMEANS_PP_CENTERS)[2]
     matcher = cv2.BFMatcher(cv2.NORM_L2)
-    nearest = ([match.trainIdx for match in matcher.match(rows, centres)] for rows in descriptors)
+    nearest = ([match.trainIdx for match in matcher.match(rows, centers)] for rows in descriptors)
     counts = np.stack([np.bincount(held, minlength=words) for held in nearest])
     weighted = np.sqrt(counts) * np.log(len(counts) / np.maximum((counts > 0).sum(0), 1))
     weighted /= np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-9)

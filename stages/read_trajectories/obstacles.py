@@ -47,7 +47,7 @@ def volume_from_csv(path: Path, visited: Float[np.ndarray, "frame 3"], cell_m: f
     high = np.nanmax(corners, axis=0) + around + [0.0, HEADROOM_M, 0.0]
     size = np.ceil((high - low) / cell_m)
     if size.prod() > MAX_VOXELS:
-        span = " x ".join(f"{metres:g}" for metres in high - low)
+        span = " x ".join(f"{meters:g}" for meters in high - low)
         what = f"tracks and obstacles span {span} m, too much for cells of {cell_m:g} m"
         raise InputError("TRJ-001", what, str(path), "write meters; or set cell_m in the recipe")
     shape = size.astype(int)

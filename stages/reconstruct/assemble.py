@@ -265,15 +265,15 @@ def measured_box(videos: Sequence[RegisteredVideo], max_points: int = 200_000) -
     step = max(7, sum(len(video.store.scene) for video in videos) // max_points)
     stores = (usable_rays(video).scene for video in videos)
     rays = [store.at(torch.nonzero(store.depth > 0)[:, 0][::step]) for store in stores]
-    points, centres = [], []
+    points, centers = [], []
     for video, some in zip(videos, rays, strict=True):
         poses, frame = video.world_from_camera, some.frame.numpy()
         points_camera = (some.direction * some.depth[:, None]).numpy()
         points.append(rigid.apply(poses[frame], points_camera[:, None])[:, 0])
-        centres.append(poses[np.unique(frame), :3, 3])
-    points, centres = np.concatenate(points), np.concatenate(centres)
-    low = np.minimum(np.quantile(points, BOX_QUANTILE, axis=0), centres.min(0)) - SCENE_MARGIN_M
-    high = np.maximum(np.quantile(points, 1 - BOX_QUANTILE, axis=0), centres.max(0)) + SCENE_MARGIN_M
+        centers.append(poses[np.unique(frame), :3, 3])
+    points, centers = np.concatenate(points), np.concatenate(centers)
+    low = np.minimum(np.quantile(points, BOX_QUANTILE, axis=0), centers.min(0)) - SCENE_MARGIN_M
+    high = np.maximum(np.quantile(points, 1 - BOX_QUANTILE, axis=0), centers.max(0)) + SCENE_MARGIN_M
     return corner(low), corner(high)
 
 

@@ -19,7 +19,7 @@ from stages.reconstruct.problem import Problem, pick
 from stages.reconstruct.rays import AGENT, THUMBNAIL, Rays
 from stages.reconstruct.scene import Terms
 
-DECIMETRE = 0.1
+DECIMETER = 0.1
 """unit of most losses of the posed surface, meters"""
 REACH_M = 0.05
 """signed distances on the agent are truncated here"""
@@ -110,7 +110,7 @@ def measured_terms(
     if weights.cycle:
         at_depth, at_rest = (each.view(frames, number, 1 + near, 3)[:, :, 0] for each in (points, rest))
         back = problem.body.pose(at_rest, pose.agent_from_bone)
-        terms["cycle"] = (weights.cycle, ((back - at_depth).square().sum(-1).view(-1) / DECIMETRE**2)[good])
+        terms["cycle"] = (weights.cycle, ((back - at_depth).square().sum(-1).view(-1) / DECIMETER**2)[good])
     return terms
 
 
@@ -144,20 +144,20 @@ def surface_terms(
         occluded = (nearest > 0) & (nearest < depth - MARGIN_M)
     focal_px = views.intrinsics[pose.frame, 0, 0][:, None]
     outside_m = functional.relu(outside_px * depth.detach() / focal_px - EDGE_M)
-    in_front_m = functional.relu(measured - MARGIN_M - depth).clamp_max(2 * DECIMETRE)
+    in_front_m = functional.relu(measured - MARGIN_M - depth).clamp_max(2 * DECIMETER)
     trust = problem.trust[pose.frame, None]
     on_mask = outside_px.detach() < THUMBNAIL
-    in_front = (trust * in_front_m / DECIMETRE)[in_view & on_mask & (measured > 0)]
+    in_front = (trust * in_front_m / DECIMETER)[in_view & on_mask & (measured > 0)]
     terms = {
-        "outside": (OUTSIDE_WEIGHT, (trust * outside_m / DECIMETRE)[in_view & ~occluded]),
+        "outside": (OUTSIDE_WEIGHT, (trust * outside_m / DECIMETER)[in_view & ~occluded]),
         "in front": (FREE_WEIGHT, in_front),
     }
     if problem.scene.fused:
         depth_m = penetration_depth_m(problem, pose, posed[:, ::FLOOR_EVERY])
         with_scene = problem.has_scene[pose.frame]
-        terms["penetration"] = PENETRATION_WEIGHT, (trust * depth_m / DECIMETRE)[with_scene]
+        terms["penetration"] = PENETRATION_WEIGHT, (trust * depth_m / DECIMETER)[with_scene]
     if masked is not None:
-        terms["uncovered"] = UNCOVERED_WEIGHT, trust * silhouette_residual_m(points, masked) / DECIMETRE
+        terms["uncovered"] = UNCOVERED_WEIGHT, trust * silhouette_residual_m(points, masked) / DECIMETER
     return {name: (weights.posed_surface * weight, values) for name, (weight, values) in terms.items()}
 
 
@@ -193,7 +193,7 @@ def silhouette_residual_m(
         near = torch.baddbmm(squared, target, image_point.mT, alpha=-2).argmin(-1, keepdim=True)
     gap = image_point.gather(1, near.expand(-1, -1, 2)) - target
     gap_m = gap.norm(dim=-1) * depth.gather(1, near)[..., 0].detach()
-    return functional.relu(gap_m - COVER_M).clamp_max(2 * DECIMETRE)
+    return functional.relu(gap_m - COVER_M).clamp_max(2 * DECIMETER)
 
 
 def prior_terms(
@@ -206,7 +206,7 @@ def prior_terms(
     def moved(bone: Int[Tensor, "joint"]) -> Float[Tensor, "frame joint 3"]:
         return (motion[:, bone, :3, :3] @ joints.place[..., None])[..., 0] + motion[:, bone, :3, 3]
 
-    joint_gap = (moved(joints.first) - moved(joints.second)) / DECIMETRE
+    joint_gap = (moved(joints.first) - moved(joints.second)) / DECIMETER
     root = rigid_torch.inverse(pose.world_from_initial) @ pose.world_from_agent
     root_error = (root[:, :3, 3] / ROOT_M).square().sum(-1) + _squared_angle(root) / ROOT_RAD**2
     common = twist.mean(1, keepdim=True).square().sum(-1)
@@ -218,7 +218,7 @@ def prior_terms(
         change, roots = twist.view(-1, run, *twist.shape[1:]), pose.world_from_agent.reshape(-1, run, 4, 4)
         acceleration = torch.diff(roots[:, :, :3].flatten(2), n=2, dim=1)
         step = rigid_torch.inverse(roots[:, :-1]) @ roots[:, 1:]
-        root_step = (step[..., :3, 3] / DECIMETRE).square().sum(-1) + _squared_angle(step)
+        root_step = (step[..., :3, 3] / DECIMETER).square().sum(-1) + _squared_angle(step)
         bone_step = torch.diff(change, dim=1).square().sum(-1)
         terms["smoothness"] = SMOOTH_WEIGHT, torch.diff(change, n=2, dim=1).square().sum(-1)
         terms["root smoothness"] = ROOT_SMOOTH * SMOOTH_WEIGHT, acceleration.square().sum(-1)

@@ -198,8 +198,8 @@ def field_terms(problem: Problem, weights: LossWeights, generator: Generator) ->
     field, surface = problem.agent, problem.surface
     index = pick(len(surface.around), FIELD_POINTS, generator, problem.device)
     points = surface.around[index]
-    neighbours = points + EIKONAL_STEP_M * torch.eye(3, device=problem.device)[:, None]
-    encoded = field.encode(torch.cat([points[None], neighbours]).view(-1, 3))
+    neighbors = points + EIKONAL_STEP_M * torch.eye(3, device=problem.device)[:, None]
+    encoded = field.encode(torch.cat([points[None], neighbors]).view(-1, 3))
     distance, *shifted = field.distance(encoded).view(4, -1)
     close = surface.distance[index].abs() < body.REACH_M
     color = field.color_and_feature(encoded[: len(index)][close])[0]

@@ -61,14 +61,14 @@ class KinematicTree:
         Lengths are squared, so that a leg hangs on the near side of the body. By shared skin alone, or by
         plain length, it may hang on the other leg of its pair, and move with it.
         """
-        centre = agent_from_bone_rest[:, :3, 3].double().numpy()
-        neighbours = joined(shared_skin(weights)).numpy()
-        cost = np.zeros((len(centre) + 1,) * 2)
-        cost[:-1, :-1] = np.where(neighbours, np.square(centre[:, None] - centre).sum(-1), 0)
-        cost[-1, :-1] = DETOUR * np.square(centre).sum(-1)
+        center = agent_from_bone_rest[:, :3, 3].double().numpy()
+        neighbors = joined(shared_skin(weights)).numpy()
+        cost = np.zeros((len(center) + 1,) * 2)
+        cost[:-1, :-1] = np.where(neighbors, np.square(center[:, None] - center).sum(-1), 0)
+        cost[-1, :-1] = DETOUR * np.square(center).sum(-1)
         length, parents = dijkstra(cost, directed=False, indices=-1, return_predecessors=True)
         root = int(cost[-1, :-1].argmin())
-        length[root], parents[parents == len(centre)], parents[root] = 0, root, root
+        length[root], parents[parents == len(center)], parents[root] = 0, root, root
         order = torch.from_numpy(length[:-1].argsort(kind="stable"))
         parent = torch.from_numpy(parents[:-1]).long()[order]
         both = weights[:, order] * weights[:, parent] + MIN_SHARE

@@ -271,7 +271,7 @@ def choose_agent_pixels(
 def _read(source: RaySource, frame: int, mask, depth, slope, place, rng: Generator) -> Rays:
     """Read the measurements at pixels (row, column) ``place`` of one frame."""
     clip, features, (row, column) = source.clip, source.features, place.T
-    pixel = cameras.pixel_centres(row, column)
+    pixel = cameras.pixel_centers(row, column)
     direction = cameras.unproject(pixel, clip.intrinsics[frame])
     at_depth = cameras.project(direction, clip.depth_intrinsics[frame])[0].astype(int)
     x, y = np.clip(at_depth, 0, np.array(depth.shape[::-1]) - 1).T

@@ -112,9 +112,9 @@ def eikonal(
     code_of: Int[Tensor, "point"],
 ) -> Float[Tensor, "point"]:
     """Return the eikonal loss of the scene's field at points, by finite differences."""
-    neighbours = points_world + EIKONAL_STEP_M * torch.eye(3, device=points_world.device)[:, None]
+    neighbors = points_world + EIKONAL_STEP_M * torch.eye(3, device=points_world.device)[:, None]
     distance = field.distance_at(points_world, video, code_of)
-    shifted = field.distance_at(neighbours.reshape(-1, 3), video.repeat(3), code_of.repeat(3)).view(3, -1)
+    shifted = field.distance_at(neighbors.reshape(-1, 3), video.repeat(3), code_of.repeat(3)).view(3, -1)
     return losses.eikonal(distance, shifted, EIKONAL_STEP_M)
 
 

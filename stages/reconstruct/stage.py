@@ -5,7 +5,7 @@ from pathlib import Path
 from pipeline.core import devices, distributed, progress
 from pipeline.core.videos import Video
 from pipeline.fields.fields import Reconstruction
-from stages.reconstruct import assemble, former, fuse, optimise, pictures, reading, results
+from stages.reconstruct import assemble, former, fuse, optimize, pictures, reading, results
 from stages.reconstruct.config import Config
 from stages.reconstruct.reading import Inputs
 
@@ -43,10 +43,10 @@ def run(
     if inputs.former is not None:
         known, steps = former.begin(problem, registered, inputs.former), former.shorter(steps)
         progress.log(f"reconstruct: {len(known.frame)} frames begin as in {inputs.former}")
-    plan = optimise.OptimizationPlan(
+    plan = optimize.OptimizationPlan(
         steps, config.weights, config.batches, config.rates, config.seed, resume, workers, known, rendered
     )
-    records = optimise.optimise(problem, plan)
+    records = optimize.optimize(problem, plan)
     if not distributed.leave():
         return
     ids = assemble.scene_ids(registered)

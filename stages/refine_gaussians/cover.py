@@ -42,9 +42,9 @@ RIDGE = 0.001
 """ridge regularization of exposures towards the identity"""
 NEAREST_M = 0.2
 """near plane: nearer points are ignored"""
-NEIGHBOURS = 6
+NEIGHBORS = 6
 """neighbors over which a point's color gradient is averaged"""
-SPACING_NEIGHBOUR, MIN_SPACING_M = 4, 0.001
+SPACING_NEIGHBOR, MIN_SPACING_M = 4, 0.001
 """a point's spacing is the distance to this neighbor, with this lower bound"""
 MORTON_CELL_M, MORTON_BITS = 0.005, 20
 """cell size of the Morton curve, and bits per axis"""
@@ -234,7 +234,7 @@ def subsample(
     absent[~shown] |= np.isfinite(
         KDTree(points[shown]).query(points[~shown], distance_upper_bound=SHELL_M)[0]
     )
-    near = np.asarray(KDTree(points).query(points, NEIGHBOURS + 1)[1])[:, 1:]
+    near = np.asarray(KDTree(points).query(points, NEIGHBORS + 1)[1])[:, 1:]
     gradient = np.abs(seen.color[near] - seen.color[:, None]).mean((1, 2)) + BASE_GRADIENT
     visits = seen.weight / max(seen.weight.mean(), 1e-9)
     density = np.where(absent, 0, gradient * np.sqrt(visits))
@@ -247,7 +247,7 @@ def subsample(
     for one in np.unique(layer[chosen]):
         own = layer[chosen] == one
         here = points[chosen[own]]
-        distance_m = KDTree(here).query(here, min(SPACING_NEIGHBOUR + 1, len(here)))[0]
+        distance_m = KDTree(here).query(here, min(SPACING_NEIGHBOR + 1, len(here)))[0]
         fourth_m[own] = distance_m.reshape(len(here), -1)[:, -1]
     return chosen, np.clip(fourth_m, MIN_SPACING_M, np.quantile(fourth_m, MAX_SPACING_QUANTILE))
 

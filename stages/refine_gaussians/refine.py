@@ -126,9 +126,9 @@ class FrameLoss:
             return False
         root = torch.from_numpy(video.motion.world_from_agent[frame]).float().to(self.device)
         radius = self.splats.agent.means.detach().norm(dim=-1).amax() / CUTOFF
-        centre = root[None, :3, 3]
+        center = root[None, :3, 3]
         size = radius.log().expand(1, 3)
-        return len(in_view(centre, size, camera_from_world, target.intrinsics, *target.depth.shape)) > 0
+        return len(in_view(center, size, camera_from_world, target.intrinsics, *target.depth.shape)) > 0
 
     def _pose(self, video: DrawnVideo, frame: int) -> tuple[Tensor, Tensor]:
         root, bones = (

@@ -16,7 +16,7 @@ BLUR_PX = 9.0
 """Neighborhood of the local contrast normalization, standard deviation in half-size pixels."""
 MIN_VARIANCE = 9.0
 """Floor of the local variance of gray values."""
-MEAN_GREY, GREY_PER_SIGMA = 128, 48
+MEAN_GRAY, GRAY_PER_SIGMA = 128, 48
 """Output gray value of the local mean, and gray values per standard deviation."""
 SHARE_FLOOR = 1e-3
 """Added to the share of known pixels, against division by zero."""
@@ -66,7 +66,7 @@ def local_contrast_normalization(
     share = _blur(weight) + SHARE_FLOOR
     mean = _blur(gray * weight) / share
     deviation = np.sqrt(np.maximum(_blur((gray - mean) ** 2 * weight) / share, MIN_VARIANCE))
-    return np.clip(MEAN_GREY + GREY_PER_SIGMA * (gray - mean) / deviation * weight, 0, 255).astype(np.uint8)
+    return np.clip(MEAN_GRAY + GRAY_PER_SIGMA * (gray - mean) / deviation * weight, 0, 255).astype(np.uint8)
 
 
 def _blur(picture):

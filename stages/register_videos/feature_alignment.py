@@ -67,15 +67,15 @@ def feature_correspondences(
     tensor = np.swapaxes(gradient, 1, 2) @ gradient
     rhs = np.einsum("mck,mc->mk", gradient, (rendered - observed)[good])
     eigenvalue, axes = np.linalg.eigh(tensor)
-    centre, z = cameras.pixel_grid(rows, columns)[good], depth[good]
-    ray = cameras.unproject(centre, intrinsics)
+    center, z = cameras.pixel_grid(rows, columns)[good], depth[good]
+    ray = cameras.unproject(center, intrinsics)
     points_map = rigid.apply(world_from_camera, ray * z[:, None])
     parts = []
     for index in range(2):
         axis, precision = axes[..., index], np.maximum(eigenvalue[:, index], MIN_EIGENVALUE)
         step = np.einsum("mk,mk->m", axis, rhs) / precision
         valid = (eigenvalue[:, index] > MIN_EIGENVALUE) & (np.abs(step) < MAX_STEP_CELLS)
-        moved = cameras.unproject(centre + step[:, None] * axis, intrinsics) * z[:, None]
+        moved = cameras.unproject(center + step[:, None] * axis, intrinsics) * z[:, None]
         # Gradient of the pixel by the point, times depth over focal length: perpendicular to the ray.
         across = np.column_stack([axis, -(axis * ray[:, :2]).sum(1)])
         direction = across @ world_from_camera[:3, :3].T

@@ -39,7 +39,7 @@ def flow_correspondences(
     )
     inner = tuple(slice(MARGIN_PX, size - MARGIN_PX, STRIDE_PX) for size in known.shape)
     rows, columns = np.mgrid[inner].reshape(2, -1)
-    start = cameras.pixel_centres(rows, columns)
+    start = cameras.pixel_centers(rows, columns)
     points_camera = cameras.back_project_pixels(
         start + flow[rows, columns], intrinsics, clip.depth(frame), clip.depth_intrinsics[frame]
     )

@@ -135,8 +135,8 @@ def are_close(
 def rejection_reason(votes: FrameVotes, inliers: Bool[np.ndarray, "vote"] | None) -> str | None:
     """Return why the votes are insufficient; None if they suffice."""
     if len(votes.frame) < MIN_VOTES:
-        recognised = f"only {len(votes.frame)} of {votes.queries} frames were recognized"
-        return f"{recognised}: the recording shows little of the walk-through's room"
+        recognized = f"only {len(votes.frame)} of {votes.queries} frames were recognized"
+        return f"{recognized}: the recording shows little of the walk-through's room"
     count = 0 if inliers is None else int(inliers.sum())
     if count < MIN_VOTES or count < MIN_SHARE * len(votes.frame):
         return f"only {count} of {len(votes.frame)} recognized frames agree on where the recording lies"

@@ -61,7 +61,7 @@ def motion_evidence(references: References) -> EvidenceOf:
 
     def evidence_of(frame: int, window: Window, sphere: Sphere) -> Evidence:
         known = np.isfinite(window.points_world[..., 0])
-        near = np.linalg.norm(window.points_world - sphere.centre_world, axis=-1) < sphere.radius_m
+        near = np.linalg.norm(window.points_world - sphere.center_world, axis=-1) < sphere.radius_m
         points = np.where(near[..., None], window.points_world, np.nan)
         votes = free_space.vote(references, points, frame, surfaces=True)
         animal = movers.moving(votes)

@@ -154,7 +154,7 @@ def measure_noise(
         inner = cv2.erode((depth[first] > 0).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         chosen = np.flatnonzero(inner)[:: max(1, int(inner.sum()) // probes)]
         rows, columns = np.unravel_index(chosen, inner.shape)
-        rays = cameras.unproject(cameras.pixel_centres(rows, columns), intrinsics[first])
+        rays = cameras.unproject(cameras.pixel_centers(rows, columns), intrinsics[first])
         points = rays * depth[first][rows, columns][:, None]
         relative = camera_from_world[second] @ rigid.inverse(camera_from_world[first])
         points = rigid.apply(relative, points)

@@ -60,7 +60,7 @@ def find_mover(
     radii = [each.radius_m for each, sure in zip(chosen, reliable, strict=True) if each and sure]
     radius = float(np.clip(SCALE * np.quantile(radii, 0.9), MIN_RADIUS_M, animal.largest_m)) if radii else 0.0
     spheres = [
-        Sphere(candidate.centre_world, radius, presumed=not sure) if candidate else None
+        Sphere(candidate.center_world, radius, presumed=not sure) if candidate else None
         for candidate, sure in zip(chosen, reliable, strict=True)
     ]
     return fill_gaps(spheres, clip.timestamp_s)
@@ -71,8 +71,8 @@ def fill_gaps(spheres: list[Sphere | None], timestamp_s: Float[np.ndarray, "fram
     seen = np.array([frame for frame, sphere in enumerate(spheres) if sphere is not None])
     if not len(seen):
         return spheres
-    centres = np.stack([spheres[frame].centre_world for frame in seen])
-    guess = np.stack([np.interp(timestamp_s, timestamp_s[seen], axis) for axis in centres.T], axis=1)
+    centers = np.stack([spheres[frame].center_world for frame in seen])
+    guess = np.stack([np.interp(timestamp_s, timestamp_s[seen], axis) for axis in centers.T], axis=1)
     after = np.minimum(np.searchsorted(seen, np.arange(len(spheres))), len(seen) - 1)
     wait = np.abs(timestamp_s - timestamp_s[seen[[np.maximum(after - 1, 0), after]]]).min(0)
     radius = spheres[seen[0]].radius_m

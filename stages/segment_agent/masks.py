@@ -112,7 +112,7 @@ def _standing_segmenter(
     clip: Clip, poses: Float[np.ndarray, "frame 4 4"], placed: PlacedPrompt | None, config: Config
 ) -> Segmenter:
     """Prepare the masks of a turnaround: what stands on the ground where the optical axes meet."""
-    focus = axes_focus(poses) if placed is None else placed.centre_world
+    focus = axes_focus(poses) if placed is None else placed.center_world
     spheres, evidence_of = find_standing(clip, poses, focus)
     segmenter = Segmenter(clip, poses, spheres, evidence_of, config.height_px, ColorHistogram(), EDGES)
     return replace(segmenter, appearance=learn_color_histogram(segmenter))

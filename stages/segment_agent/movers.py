@@ -54,7 +54,7 @@ APPEAR_COST = 2.0
 class Candidate:
     """A connected group of points seen through by other frames."""
 
-    centre_world: Float[np.ndarray, "3"]
+    center_world: Float[np.ndarray, "3"]
     area_m2: float
     radius_m: float
     """95th percentile of the points' distances from the center"""
@@ -67,7 +67,7 @@ class PlacedPrompt:
     """A prompt lifted to the world."""
 
     frame: int
-    centre_world: Float[np.ndarray, "3"]
+    center_world: Float[np.ndarray, "3"]
     reach_m: float = 0.5
     """extent of the animal around that point; the default for a click"""
 
@@ -116,10 +116,10 @@ def candidates(
         if area < MIN_AREA_M2:
             continue
         points = points_world[own]
-        centre = np.median(points, axis=0)
-        radius = float(np.quantile(np.linalg.norm(points - centre, axis=1), 0.95))
+        center = np.median(points, axis=0)
+        radius = float(np.quantile(np.linalg.norm(points - center, axis=1), 0.95))
         if radius < animal.largest_m:
-            found.append(Candidate(centre, area, radius, float(probability[own].mean())))
+            found.append(Candidate(center, area, radius, float(probability[own].mean())))
     return sorted(found, key=lambda candidate: -candidate.area_m2)[:CANDIDATES]
 
 
@@ -173,7 +173,7 @@ def split_track(
 ) -> Int[np.ndarray, "seen"]:
     """Number the segments of a track between absences and jumps."""
     gap_s = np.diff(timestamp_s[seen])
-    apart_m = np.linalg.norm(np.diff([chosen[frame].centre_world for frame in seen], axis=0), axis=1)
+    apart_m = np.linalg.norm(np.diff([chosen[frame].center_world for frame in seen], axis=0), axis=1)
     jump = (gap_s > ABSENT_S) | (apart_m > JUMP_M + animal.speed_m_s * gap_s)
     return np.cumsum(np.r_[False, jump])
 
@@ -194,9 +194,9 @@ def self_moving(
         own = seen[segment == number]
         if timestamp_s[own[-1]] - timestamp_s[own[0]] < ABSENT_S:
             continue
-        centre = np.array([chosen[frame].centre_world for frame in own])
-        centre = scipy.ndimage.median_filter(centre, (5, 1), mode="nearest")
-        if np.linalg.norm(np.ptp(centre, axis=0)) > TRAVEL_M:
+        center = np.array([chosen[frame].center_world for frame in own])
+        center = scipy.ndimage.median_filter(center, (5, 1), mode="nearest")
+        if np.linalg.norm(np.ptp(center, axis=0)) > TRAVEL_M:
             reliable[own] = True
     return reliable
 
@@ -204,7 +204,7 @@ def self_moving(
 def _at_prompt(candidate: Candidate, prompt: PlacedPrompt) -> bool:
     """Return whether a prompt lies at a candidate."""
     return bool(
-        np.linalg.norm(candidate.centre_world - prompt.centre_world) < candidate.radius_m + PROMPT_SLACK_M
+        np.linalg.norm(candidate.center_world - prompt.center_world) < candidate.radius_m + PROMPT_SLACK_M
     )
 
 
@@ -221,7 +221,7 @@ def _transition(
     step = np.full((len(before) + 1, len(after) + 1), -APPEAR_COST)
     step[0, 0] = 0.0
     if before and after:
-        first, second = (np.stack([each.centre_world for each in group]) for group in (before, after))
+        first, second = (np.stack([each.center_world for each in group]) for group in (before, after))
         distance_m = np.linalg.norm(first[:, None] - second[None], axis=-1)
         excess = np.maximum(distance_m - JUMP_M - animal.speed_m_s * seconds, 0) / EXCESS_M
         step[1:, 1:] = -np.minimum(excess, 2 * APPEAR_COST)

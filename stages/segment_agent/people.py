@@ -92,7 +92,7 @@ def find_people(
         for frame in np.flatnonzero(person):
             mover = picked[frame]
             assert mover is not None, "a person's frames have a mover"
-            axis[frame] = mover.candidate.centre_world[[0, 2]]
+            axis[frame] = mover.candidate.center_world[[0, 2]]
             tops += [mover.top_m] if mover.whole else []
             found[frame].remove(mover)
         axes.append(_fill_gaps(axis, clip.timestamp_s))
@@ -141,12 +141,12 @@ def _upright(
         width = np.ptp(np.quantile(group[:, [0, 2]], [0.1, 0.9], axis=0), axis=0).max()
         if top - bottom < max(MIN_HEIGHT_M, MIN_ASPECT * width):
             continue
-        centre = np.median(group, axis=0)
-        away = (centre - world_from_camera[:3, 3]) * [1, 0, 1]
-        centre += BODY_RADIUS_M * away / max(float(np.linalg.norm(away)), BODY_RADIUS_M)
-        radius = float(np.quantile(np.linalg.norm(group - centre, axis=1), 0.95))
+        center = np.median(group, axis=0)
+        away = (center - world_from_camera[:3, 3]) * [1, 0, 1]
+        center += BODY_RADIUS_M * away / max(float(np.linalg.norm(away)), BODY_RADIUS_M)
+        radius = float(np.quantile(np.linalg.norm(group - center, axis=1), 0.95))
         whole = bool(np.nonzero(own)[0].min() > 1)
-        candidate = Candidate(centre, float(area[own].sum()), radius)
+        candidate = Candidate(center, float(area[own].sum()), radius)
         found.append(UprightMover(candidate, float(top - bottom), float(top), whole))
     return found, low
 
@@ -164,7 +164,7 @@ def _persistent(
     own = [seen[segment == number] for number in range(segment[-1] + 1)]
     tall = np.array([mover is not None and mover.extent_m > UPRIGHT_M for mover in picked])
     is_person = [int(tall[frames].sum()) >= MIN_UPRIGHT_FRAMES for frames in own]
-    place = np.array([[np.nan] * 3 if mover is None else mover.candidate.centre_world for mover in picked])
+    place = np.array([[np.nan] * 3 if mover is None else mover.candidate.center_world for mover in picked])
     for step in (1, -1):
         for number, following in pairwise(range(len(own))[::step]):
             ends = [own[number][-1 if step > 0 else 0], own[following][0 if step > 0 else -1]]

@@ -57,11 +57,11 @@ def parse(path: Path, clip: Clip) -> Prompt:
 
 def place(prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]) -> PlacedPrompt:
     """Lift a prompt to the world; a box gives the animal's reach. Raises InputError MSK-002."""
-    centre = position(prompt, clip, world_from_camera)
+    center = position(prompt, clip, world_from_camera)
     x0, y0, x1, y1 = prompt.box_px
-    distance = rigid.apply(rigid.inverse(world_from_camera[prompt.frame]), centre[None])[0, 2]
+    distance = rigid.apply(rigid.inverse(world_from_camera[prompt.frame]), center[None])[0, 2]
     half_m = max(x1 - x0, y1 - y0) / 2 * distance / clip.intrinsics[prompt.frame, 0, 0]
-    placed = PlacedPrompt(prompt.frame, centre)
+    placed = PlacedPrompt(prompt.frame, center)
     return replace(placed, reach_m=FORESHORTENED * half_m) if half_m > MIN_BOX_M else placed
 
 
@@ -71,14 +71,14 @@ def position(
     """Return a near surface point in the box's middle third, in the world. Raises InputError MSK-002."""
     x0, y0, x1, y1 = prompt.box_px
     scale = np.divide(clip.depth_size, clip.color_size)[::-1]
-    centre = np.array([x0 + x1, y0 + y1]) / 2 * scale
+    center = np.array([x0 + x1, y0 + y1]) / 2 * scale
     half = np.maximum(np.array([x1 - x0, y1 - y0]) / 6 * scale, 2)
-    low, high = np.maximum(np.floor(centre - half), 0).astype(int), np.ceil(centre + half).astype(int)
+    low, high = np.maximum(np.floor(center - half), 0).astype(int), np.ceil(center + half).astype(int)
     depth = clean_depth(clip, prompt.frame)[low[1] : high[1] + 1, low[0] : high[0] + 1]
     if not (depth > 0).any():
         what = "the prompt lies where depth is unknown"
         remedy = "point at another part of the animal or another frame"
         raise InputError("MSK-002", what, f"frame {prompt.frame}", remedy)
     z = float(np.quantile(depth[depth > 0], 0.3))
-    point_camera = cameras.unproject(centre / scale, clip.intrinsics[prompt.frame]) * z
+    point_camera = cameras.unproject(center / scale, clip.intrinsics[prompt.frame]) * z
     return rigid.apply(world_from_camera[prompt.frame], point_camera[None])[0]

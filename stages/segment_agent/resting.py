@@ -39,7 +39,7 @@ def is_resting(
     depth = free_space.clean_depth(clip, prompt.frame)
     points = cameras.back_project(depth, clip.depth_intrinsics[prompt.frame])[depth > 0]
     points = rigid.apply(world_from_camera[prompt.frame], points)
-    points = points[np.linalg.norm(points - prompt.centre_world, axis=1) < PROMPT_RADIUS_M]
+    points = points[np.linalg.norm(points - prompt.center_world, axis=1) < PROMPT_RADIUS_M]
     through = movers.moving(free_space.vote(references, points, prompt.frame))
     return bool(through.sum() < 0.5 * len(points))
 
@@ -55,7 +55,7 @@ def find_resting(
 
     Raises InputError MSK-003 if nothing stands out from the ground there.
     """
-    _, ground = surroundings(clip, world_from_camera, prompt.centre_world)
+    _, ground = surroundings(clip, world_from_camera, prompt.center_world)
     pose = world_from_camera[prompt.frame]
     shown = None if ground is None else _segment_prompted_points(clip, pose, prompt, ground, height_px, rng)
     if ground is None or shown is None:
@@ -63,18 +63,18 @@ def find_resting(
         remedy = "point at the middle of the animal, or draw a box, in a frame that shows the ground too"
         what = "nothing stands out from level ground where the prompt points"
         raise InputError("MSK-003", what, where, remedy)
-    cluster = find_cluster(shown, prompt.centre_world, min_hits=1)
+    cluster = find_cluster(shown, prompt.center_world, min_hits=1)
     return [cluster.sphere] * len(clip), cluster_evidence(cluster, ground, whole=False)
 
 
 def _segment_prompted_points(clip, world_from_camera, prompt, ground, height_px, rng):
     """Return the points of the animal that the prompted frame shows, in the world; None if hardly any."""
     color = working_picture(clip, prompt.frame, height_px)
-    sphere = Sphere(prompt.centre_world, 2 * prompt.reach_m)
+    sphere = Sphere(prompt.center_world, 2 * prompt.reach_m)
     window = crop_window(clip, prompt.frame, world_from_camera, sphere, color)
     if window is None:
         return None
-    away_m = np.linalg.norm(window.points_world - prompt.centre_world, axis=-1)
+    away_m = np.linalg.norm(window.points_world - prompt.center_world, axis=-1)
     raised = ground.above(window.points_world) > CLEARANCE_M
     possible, sure = raised & (away_m < prompt.reach_m), raised & (away_m < SURE_RADIUS_M)
     if not sure.any() or min(possible.sum(), (~possible).sum()) < MIN_PX:

@@ -66,9 +66,9 @@ class Cluster:
     @property
     def sphere(self) -> Sphere:
         """Return a bounding sphere of the voxels."""
-        centres = self.origin + (np.argwhere(self.cells) + 0.5) * self.voxel_m
-        middle = (centres.min(0) + centres.max(0)) / 2
-        return Sphere(middle, float(np.linalg.norm(centres - middle, axis=1).max() + MARGIN_M))
+        centers = self.origin + (np.argwhere(self.cells) + 0.5) * self.voxel_m
+        middle = (centers.min(0) + centers.max(0)) / 2
+        return Sphere(middle, float(np.linalg.norm(centers - middle, axis=1).max() + MARGIN_M))
 
 
 def find_standing(
@@ -108,17 +108,17 @@ def axes_focus(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.nd
 
     None if they are parallel, or meet behind most cameras because the phone turns on the spot.
     """
-    centre, forward = world_from_camera[:, :3, 3], world_from_camera[:, :3, 2]
+    center, forward = world_from_camera[:, :3, 3], world_from_camera[:, :3, 2]
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    weight = np.ones(len(centre))
+    weight = np.ones(len(center))
     for _ in range(10):
         total = (weight[:, None, None] * across).sum(0)
         if np.linalg.eigvalsh(total)[0] < MIN_AXIS_SPREAD * weight.sum():
             return None
-        point = np.linalg.solve(total, np.einsum("f,fij,fj->i", weight, across, centre))
-        distance = np.linalg.norm(np.einsum("fij,fj->fi", across, point - centre), axis=1)
+        point = np.linalg.solve(total, np.einsum("f,fij,fj->i", weight, across, center))
+        distance = np.linalg.norm(np.einsum("fij,fj->fi", across, point - center), axis=1)
         weight = 1 / (1 + (distance / AXIS_OUTLIER_M) ** 2)
-    before_m = np.einsum("fi,fi->f", point - centre, forward)
+    before_m = np.einsum("fi,fi->f", point - center, forward)
     return point if np.median(before_m) > NEAREST_M else None
 
 
@@ -135,8 +135,8 @@ def find_cluster(
     around = np.ones((3, 3, 3), bool)
     closed = np.asarray(scipy.ndimage.binary_closing(filled, around), bool) | filled
     component, components = cast("tuple[np.ndarray, int]", scipy.ndimage.label(closed, around))
-    centre = origin + (np.argwhere(filled) + 0.5) * VOXEL_M
-    nearness = np.exp(-((np.linalg.norm(centre - focus, axis=1) / 0.25) ** 2))
+    center = origin + (np.argwhere(filled) + 0.5) * VOXEL_M
+    nearness = np.exp(-((np.linalg.norm(center - focus, axis=1) / 0.25) ** 2))
     score = np.bincount(component[filled], nearness, minlength=components + 1)
     own = (component == score.argmax()) & filled
     return Cluster(scipy.ndimage.binary_dilation(own, around, iterations=2), origin, VOXEL_M)
@@ -173,7 +173,7 @@ def cluster_evidence(cluster: Cluster, ground: GroundPlane, whole: bool = True) 
         log_odds[~known] = 0.0
         certainty = np.where(known, np.where(window.trusted, 1.0, 0.5), UNKNOWN)
         if not whole:
-            near = np.linalg.norm(window.points_world - sphere.centre_world, axis=-1) < sphere.radius_m
+            near = np.linalg.norm(window.points_world - sphere.center_world, axis=-1) < sphere.radius_m
             uncertain = near & ~inside & (height > CLEARANCE_M)
             log_odds[uncertain], certainty[uncertain] = 0.0, UNKNOWN
         sure = window.trusted & (log_odds > 2)

@@ -23,7 +23,7 @@ RIM_PX = 8
 class Sphere:
     """Bounding sphere of the animal at one time, in the recording's world, meters."""
 
-    centre_world: Float[np.ndarray, "3"]
+    center_world: Float[np.ndarray, "3"]
     radius_m: float
     presumed: bool = False
     """interpolated or extrapolated in time, or not connected to the prompt"""
@@ -68,8 +68,8 @@ def project_sphere(
 ) -> tuple[slice, slice]:
     """Return the rows and columns of a sphere's bounding box with a margin, in a picture of ``size``."""
     intrinsics = cameras.scale_intrinsics(clip.intrinsics[frame], clip.color_size, size)
-    centre = rigid.apply(rigid.inverse(world_from_camera), sphere.centre_world[None])[0]
-    pixel, depth = cameras.project(centre, intrinsics)
+    center = rigid.apply(rigid.inverse(world_from_camera), sphere.center_world[None])[0]
+    pixel, depth = cameras.project(center, intrinsics)
     if depth < 0.1:
         return slice(0, 0), slice(0, 0)
     focal_px, radius_m = intrinsics[[0, 1], [0, 1]], sphere.radius_m

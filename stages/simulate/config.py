@@ -32,7 +32,7 @@ class Config:
     one after the other; none: a take of the behavior model."""
     place_count: int = 20
     """How many of them."""
-    optimise: bool = True
+    optimize: bool = True
     """Make the motion physically plausible; a take of the behavior model only where `--longterm` and
     `--reconstruction` are given."""
     pictures_per_s: float = 10.0

@@ -92,11 +92,11 @@ def write_frames(
 
 
 def follow_camera(
-    roots_world: Float[np.ndarray, "frame 3"], centre: Float[np.ndarray, "3"]
+    roots_world: Float[np.ndarray, "frame 3"], center: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "frame 4 4"]:
     """Return poses of a smoothly moving camera above the animal, on the side of the room's center."""
     target = np.asarray(gaussian_filter1d(roots_world, SMOOTHED_FRAMES, axis=0, mode="nearest"))
-    away = (centre - target) * [1.0, 0.0, 1.0]
+    away = (center - target) * [1.0, 0.0, 1.0]
     away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), OFF_CENTER_M)
     away = gaussian_filter1d(away, TURNED_FRAMES, axis=0, mode="nearest")
     return rigid.look_at(target + ASIDE_M * away + ABOVE_M, target, np.array([0.0, 1.0, 0.0]))

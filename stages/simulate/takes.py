@@ -64,7 +64,7 @@ def of_behavior(inputs: Inputs, c: Config, device: str) -> FinishedTake:
     take = rollout(simulator, _observer(simulator, c), seconds=c.seconds, seed=c.seed)
     blocked = float(take.blocked.mean())
     summary = f"{c.seconds:g} s, {blocked:.1%} of the plans' frames outside the allowed space"
-    if not (c.optimise and inputs.longterm and inputs.reconstruction):
+    if not (c.optimize and inputs.longterm and inputs.reconstruction):
         return FinishedTake(summary, lambda folder: write_take(folder, take))
     motion = BodyMotion(take.world_from_agent, take.agent_from_bone.astype(np.float64))
     motion, before, after = journeys.refine_at_rate(
@@ -174,7 +174,7 @@ def through_subgoals(inputs: Inputs, written: list[Subgoal] | None, c: Config, d
         learned = [data.trajectories[data.videos[video]] for video in videos]
         been = np.concatenate([track.world_from_agent[track.valid, :3, 3] for track in learned])
         subgoals = sample_visited_subgoals(been, c.place_count + 1, rng)
-    made = journeys.travel(world, subgoals, MotionOptimizationConfig() if c.optimise else None, rng)
+    made = journeys.travel(world, subgoals, MotionOptimizationConfig() if c.optimize else None, rng)
     asked = np.stack([goal.position_world for goal in subgoals])
     moved = int((np.nan_to_num(np.abs(asked - made.subgoals_world)).max(1) > MOVED_M).sum())
 

@@ -34,14 +34,14 @@ def _harlequin(
     """Draw a fawn coat with gray-brown patches, a white collar, blaze, belly and feet, and dark ears."""
     x, y, z = vertices.T
     phase = rng.uniform(0, 2 * np.pi, 4)
-    fawn, grey, white = np.array([[0.42, 0.26, 0.13], [0.09, 0.075, 0.065], [0.76, 0.73, 0.69]])
+    fawn, gray, white = np.array([[0.42, 0.26, 0.13], [0.09, 0.075, 0.065], [0.76, 0.73, 0.69]])
     wave = np.sin(z / 0.028 + phase[0] + np.sin(x / 0.03 + phase[1])) + np.sin(y / 0.03 + phase[2])
     dark = np.clip(2 * wave, 0, 1)[:, None]
-    color = fawn * (1 - dark) + grey * dark
+    color = fawn * (1 - dark) + gray * dark
     collar = (np.abs(z - 0.085) < 0.022 + 0.008 * np.sin(x / 0.012 + phase[3])) & (y < 0.09)
     blaze = (z > 0.14) & (np.abs(x) < 0.014) & (y < 0.105)
     color[collar | blaze | (y < -0.125) | ((y < -0.06) & (np.abs(x) < 0.05)) | (z < -0.2)] = white
-    color[y > 0.118] = grey
+    color[y > 0.118] = gray
     eye = np.stack([np.abs(x) - 0.04, y - 0.072, z - 0.178], axis=-1)
     color[np.linalg.norm(eye, axis=-1) < 0.014] = 0.01
     return np.concatenate([color, 0.5 * np.ones((len(vertices), 1))], axis=-1).astype(np.float32)

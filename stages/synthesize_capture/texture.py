@@ -69,9 +69,9 @@ def planks(size: Size, rng: np.random.Generator, color: Color) -> Picture:
     board[:, :1] -= 30
     line = np.tile(board, (1, columns // length + 2))
     shifts = [(row % 3) * length // 3 for row in range(rows // breadth + 2)]
-    grey = np.concatenate([np.roll(line, shift, axis=1)[:, :columns] for shift in shifts])[:rows]
-    grey = grey + 2.0 * _noise(rng, size, 40)
-    return _bytes(np.asarray(color) + grey[..., None] * np.array([1.0, 0.92, 0.8]))
+    gray = np.concatenate([np.roll(line, shift, axis=1)[:, :columns] for shift in shifts])[:rows]
+    gray = gray + 2.0 * _noise(rng, size, 40)
+    return _bytes(np.asarray(color) + gray[..., None] * np.array([1.0, 0.92, 0.8]))
 
 
 @_maker(TEXEL_M)

@@ -30,18 +30,18 @@ def volume_of(home: Room) -> FeatureVolume:
     origin = np.array([-WIDTH_M / 2 - MARGIN_M, -MARGIN_M, -DEPTH_M / 2 - MARGIN_M])
     extent = np.array([WIDTH_M, HEIGHT_M, DEPTH_M]) + 2 * MARGIN_M
     shape = tuple(np.ceil(extent / VOXEL_M - 1e-9).astype(int))
-    centres = origin + (np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1) + 0.5) * VOXEL_M
+    centers = origin + (np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1) + 0.5) * VOXEL_M
     kind = np.full(shape, -1)
-    outside = (np.abs(centres[..., 0]) > WIDTH_M / 2) | (np.abs(centres[..., 2]) > DEPTH_M / 2)
+    outside = (np.abs(centers[..., 0]) > WIDTH_M / 2) | (np.abs(centers[..., 2]) > DEPTH_M / 2)
     kind[outside] = KINDS.index("wall")
-    kind[centres[..., 1] < 0] = KINDS.index("floor")
+    kind[centers[..., 1] < 0] = KINDS.index("floor")
     for thing in (*home.standing, *home.loose):
-        kind[_taken(thing, centres, origin)] = KINDS.index(thing.name)
+        kind[_taken(thing, centers, origin)] = KINDS.index(thing.name)
     for place in home.places:
         x, height, z = place.position
         if height > 0.1:
-            near = np.hypot(centres[..., 0] - x, centres[..., 2] - z) < 0.3
-            level = (centres[..., 1] > height + 0.05) & (centres[..., 1] < height + HEADROOM_M)
+            near = np.hypot(centers[..., 0] - x, centers[..., 2] - z) < 0.3
+            level = (centers[..., 1] > height + 0.05) & (centers[..., 1] < height + HEADROOM_M)
             kind[near & level] = -1
     codes = np.concatenate([CODES, np.zeros((1, CHANNELS))])
     features = np.moveaxis(codes[kind], -1, 0).astype(np.float16)
@@ -49,22 +49,22 @@ def volume_of(home: Room) -> FeatureVolume:
 
 
 def _taken(
-    thing: Standing, centres: Float[np.ndarray, "x y z 3"], origin: Float[np.ndarray, "3"]
+    thing: Standing, centers: Float[np.ndarray, "x y z 3"], origin: Float[np.ndarray, "3"]
 ) -> np.ndarray:
     """Return a thing's voxels: surfaces above its clearance, and in its block all below the topmost one."""
-    block = (thing.axis_distance(centres[..., 0], centres[..., 2]) < np.array(thing.piece.size) / 2).all(-1)
+    block = (thing.axis_distance(centers[..., 0], centers[..., 2]) < np.array(thing.piece.size) / 2).all(-1)
     if thing.name == "rug":  # colors the floor
-        return block & (np.abs(centres[..., 1] + VOXEL_M / 2) < VOXEL_M / 2)
+        return block & (np.abs(centers[..., 1] + VOXEL_M / 2) < VOXEL_M / 2)
     if thing.name == "window":  # radiator and curtains hang on the wall
-        return block & (centres[..., 1] > 0) & (centres[..., 1] < thing.piece.top)
-    taken: np.ndarray = np.zeros(centres.shape[:3], bool)
+        return block & (centers[..., 1] > 0) & (centers[..., 1] < thing.piece.top)
+    taken: np.ndarray = np.zeros(centers.shape[:3], bool)
     points = np.concatenate([surface_points(sheet) for sheet in thing.sheets()])
     index = np.floor((points[points[:, 1] > max(thing.piece.bottom, 0.01)] - origin) / VOXEL_M).astype(int)
     index = index[((index >= 0) & (index < taken.shape)).all(-1)]
     taken[tuple(index.T)] = True
     top = np.where(taken.any(1), taken.shape[1] - 1 - np.argmax(taken[:, ::-1], axis=1), -1)
     below = np.arange(taken.shape[1])[None, :, None] <= top[:, None]
-    return taken | (block & below & (centres[..., 1] > max(thing.piece.bottom, 0.0)))
+    return taken | (block & below & (centers[..., 1] > max(thing.piece.bottom, 0.0)))
 
 
 def surface_points(sheet: Sheet, spacing_m: float = 0.04) -> Float[np.ndarray, "point 3"]:

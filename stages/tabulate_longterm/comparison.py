@@ -32,8 +32,8 @@ def figures(prefix: str, source: MotionSource, config: Config) -> dict[str, floa
     if dataset is None:
         return {}
     rng = np.random.default_rng(config.seed)
-    travelled = select_clips(dataset, rng, stride=CLIP_STRIDE, resting=0.0)
-    cuts = select_runs(travelled, 2, config.clips)
+    traveled = select_clips(dataset, rng, stride=CLIP_STRIDE, resting=0.0)
+    cuts = select_runs(traveled, 2, config.clips)
     if not len(cuts.start):
         return {}
     clips = encode_selection(dataset, cuts, model.poses, model.sizes.points, rng)
@@ -65,7 +65,7 @@ def figures(prefix: str, source: MotionSource, config: Config) -> dict[str, floa
             rows = {name: values[chosen] for name, values in plain.items()}
             found |= tables.figures(rows, episode[chosen], prefix + ending, seed=config.seed)
     found |= tables.figures(done, episode[some], prefix, seed=config.seed)
-    return found | _figures_of_lengths(prefix, source, travelled, optimized, config)
+    return found | _figures_of_lengths(prefix, source, traveled, optimized, config)
 
 
 def _figures_of_lengths(

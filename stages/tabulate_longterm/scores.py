@@ -20,7 +20,7 @@ from pipeline.longterm.short_motions import STEPS, BodyMotion, concatenate_motio
 
 METRICS = (
     "translation", "orientation", "pose", "mpjpe_mm", "mpvpe_mm",
-    "end_v2v_share", "neighbour_v2v_mm", "neighbour_v2v_share", "seam_share", "seam_worst_mm",
+    "end_v2v_share", "neighbor_v2v_mm", "neighbor_v2v_share", "seam_share", "seam_worst_mm",
     "non_collision", "contact", "penetration_mm", "slide_m_s", "planted", "min_slide_m_s",
 )  # fmt: skip
 """translation, orientation, pose: L1 x 100 of root position (m), 6D root rotation, and the bones' channels

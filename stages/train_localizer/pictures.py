@@ -62,4 +62,4 @@ def _tile(picture: UInt8[np.ndarray, "height width 3"], text: str) -> UInt8[np.n
     """Resize a picture's longer side to 240 pixels and label it."""
     scale = EDGE_PX / max(picture.shape[:2])
     size = (round(picture.shape[0] * scale), round(picture.shape[1] * scale))
-    return plots.labelled(plots.resized(picture, size), text)
+    return plots.labeled(plots.resized(picture, size), text)

@@ -102,13 +102,13 @@ def scene_views(
 def agent_views(mesh: Mesh, config: AgentConfig, rng: np.random.Generator) -> TrainingViews:
     """Render random views of the canonical agent from all sides."""
     caster = RayCaster(mesh)
-    centre = (mesh.vertices.min(0) + mesh.vertices.max(0)).astype(float) / 2
-    radius = float(np.linalg.norm(mesh.vertices - centre, axis=1).max())
+    center = (mesh.vertices.min(0) + mesh.vertices.max(0)).astype(float) / 2
+    radius = float(np.linalg.norm(mesh.vertices - center, axis=1).max())
     focal = RENDER_SCALE * AGENT_SAMPLING.focal_px
 
     def draw(rng: np.random.Generator) -> RenderedView:
-        camera = views.agent_camera(centre, config.distance_m, rng)
-        distance = float(np.linalg.norm(camera[:3, 3] - centre))
+        camera = views.agent_camera(center, config.distance_m, rng)
+        distance = float(np.linalg.norm(camera[:3, 3] - center))
         size = int(np.clip(VIEW_MARGIN * radius / max(distance - radius, MIN_DISTANCE_M) * focal, *VIEW_PX))
         intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
         return views.render(caster, camera, intrinsics, (size, size), rng)

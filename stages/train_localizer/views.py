@@ -73,7 +73,7 @@ def scene_camera(
 
 
 def agent_camera(
-    centre: Float[np.ndarray, "3"], distance_m: tuple[float, float], rng: np.random.Generator
+    center: Float[np.ndarray, "3"], distance_m: tuple[float, float], rng: np.random.Generator
 ) -> Float[np.ndarray, "4 4"]:
     """Sample a camera that looks at the agent from any azimuth."""
     azimuth = rng.uniform(-np.pi, np.pi)
@@ -81,9 +81,9 @@ def agent_camera(
     direction = np.array(
         [np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)]
     )
-    eye = centre + direction * rng.uniform(*distance_m)
+    eye = center + direction * rng.uniform(*distance_m)
     roll = np.deg2rad(rng.normal(0, ROLL_DEG))
-    return rigid.look_at(eye, centre + rng.normal(0, TARGET_SIGMA_M, 3), UP) @ rigid.exp(
+    return rigid.look_at(eye, center + rng.normal(0, TARGET_SIGMA_M, 3), UP) @ rigid.exp(
         np.array([0, 0, roll, 0, 0, 0])
     )
 
@@ -136,10 +136,10 @@ def plausible(view: RenderedView, caster: RayCaster) -> bool:
 def occlude(view: RenderedView, rng: np.random.Generator) -> RenderedView:
     """Add a uniform elliptic occluder, nearer than what it hides."""
     height, width = view.depth.shape
-    centre = (int(rng.integers(width // 5, width * 4 // 5)), int(rng.integers(height // 3, height)))
+    center = (int(rng.integers(width // 5, width * 4 // 5)), int(rng.integers(height // 3, height)))
     axes = tuple(int(rng.integers(width // small, width // large)) for small, large in OCCLUDER_AXES)
     shape = np.zeros(view.depth.shape, np.uint8)
-    cv2.ellipse(shape, centre, axes, float(rng.uniform(-OCCLUDER_TURN_DEG, OCCLUDER_TURN_DEG)), 0, 360, 1, -1)
+    cv2.ellipse(shape, center, axes, float(rng.uniform(-OCCLUDER_TURN_DEG, OCCLUDER_TURN_DEG)), 0, 360, 1, -1)
     color = np.where(shape[..., None] > 0, rng.integers(0, 255, 3).astype(np.uint8), view.color)
     return replace(view, color=color, depth=np.where(shape > 0, view.depth * OCCLUDER_DEPTH, view.depth))
 

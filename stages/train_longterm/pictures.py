@@ -89,7 +89,7 @@ def routes(
         local = rigid.apply(rigid.inverse(clips.world_from_clip[index]), points)
         near = (local[:, 1] > SLICE_M[0]) & (local[:, 1] < SLICE_M[1])
         near &= (np.abs(local[:, [0, 2]]) < SHOWN_M).all(1)
-        axis.plot(*local[near][:, [0, 2]].T, ".", color=plots.GREY, markersize=1)
+        axis.plot(*local[near][:, [0, 2]].T, ".", color=plots.GRAY, markersize=1)
         for channels, color in ((clips.channels[index], plots.BLUE), (made[index], plots.ORANGE)):
             axis.plot(*channels[:, [0, 2]].T.numpy(), color=color)
             some = channels[::ARROW_FRAMES]

@@ -22,7 +22,7 @@ from scipy import ndimage
 from pipeline.core.errors import InputError
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
-from pipeline.geometry.signed_distance import SignedDistance, voxel_centres
+from pipeline.geometry.signed_distance import SignedDistance, voxel_centers
 from pipeline.longterm.short_motions import RATE_HZ, STEPS, BodyMotion, resample_motion
 from pipeline.longterm.smplx_bodies import BODY, Person, motion_from_parameters, smplx_body
 from pipeline.longterm.surroundings import MotionScene
@@ -175,10 +175,10 @@ def _distances(file: Path, world_from_scan: np.ndarray, scene: MotionScene) -> S
         values = values.reshape(side, side, side)
     except (ValueError, EOFError, OSError) as error:
         raise _damaged(f"is no grid of distances ({error})", file) from error
-    centres = voxel_centres(scene.low, scene.high, scene.voxel_m)
-    points = rigid.apply(rigid.inverse(world_from_scan), centres.reshape(-1, 3))
+    centers = voxel_centers(scene.low, scene.high, scene.voxel_m)
+    points = rigid.apply(rigid.inverse(world_from_scan), centers.reshape(-1, 3))
     index = (points - low) / (high - low) * (side - 1)
-    sampled = ndimage.map_coordinates(values, index.T, order=1, mode="nearest").reshape(centres.shape[:3])
+    sampled = ndimage.map_coordinates(values, index.T, order=1, mode="nearest").reshape(centers.shape[:3])
     return SignedDistance(torch.from_numpy(sampled), torch.from_numpy(scene.low).float(), scene.voxel_m)
 
 

@@ -49,9 +49,9 @@ def walk(tmp_path_factory) -> Walk:
     )
     writing.write_table(out, recording, mapped.plan, written)
     clip, kept = Clip.open(out), mapped.plan.chosen[written.usable]
-    centres, true = clip.odometry_from_camera[:, :3, 3], truth.world_from_camera[kept][:, :3, 3]
-    fitted = pycolmap.estimate_sim3d(centres, true)
-    moved = fitted.scale * centres @ fitted.rotation.matrix().T + fitted.translation
+    centers, true = clip.odometry_from_camera[:, :3, 3], truth.world_from_camera[kept][:, :3, 3]
+    fitted = pycolmap.estimate_sim3d(centers, true)
+    moved = fitted.scale * centers @ fitted.rotation.matrix().T + fitted.translation
     return Walk(clip, truth, kept, float(fitted.scale), np.linalg.norm(moved - true, axis=1))
 
 

@@ -29,7 +29,7 @@ def test_recording_is_extracted_with_its_ground_truth(drawn):
     assert 0.15 < there.mean() < 0.9, "the animal comes and goes"
 
 
-def test_animal_changes_colour_and_depth_only_in_its_mask(drawn):
+def test_animal_changes_color_and_depth_only_in_its_mask(drawn):
     sequence, out = drawn
     recording = open_recording(out / "recordings" / "session-1")
     truth = semi_real.read_truth(out / "truth" / "session-1.npz", recording.index)

@@ -26,7 +26,7 @@ class RaftEstimator(Estimator):
         height, width = self.dense_size
         return cv2.resize(color, (2 * width, 2 * height), interpolation=cv2.INTER_AREA)
 
-    def neighbours(self, first: Color, second: Color) -> Dense:
+    def neighbors(self, first: Color, second: Color) -> Dense:
         """Estimate from nothing."""
         return self._estimated(first, second, None)
 

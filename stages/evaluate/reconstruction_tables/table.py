@@ -169,7 +169,7 @@ def rooms(folders: Mapping[str, Path]) -> dict[str, tuple[UInt8[np.ndarray, "hei
         mesh = ply.read_ply(folder / "scene.ply")
         floor_m = float(np.quantile(mesh.vertices[:, 1], FLOOR_QUANTILE))
         image = views.bird_view(mesh, floor_m=floor_m, width_px=ROOM_PX).image
-        drawn.append(plots.labelled(image, NAMES.get(variant, variant)))
+        drawn.append(plots.labeled(image, NAMES.get(variant, variant)))
     caption = "the reconstructed room from above, by method (Fig. 4)"
     return {"rooms": (plots.grid(drawn, min(len(drawn), 3)), caption)}
 

@@ -63,7 +63,7 @@ def widened(prompt: Prompt, size: tuple[int, int], least: float = 0.04) -> Float
 def _follow(clip: Clip, tracker: Sam2, start: int, box_px: Float[np.ndarray, "4"]) -> Iterator[Mask]:
     before: list[tuple[bytes, bool, float]] = []
     for log_odds, presence in tracker.track(clip.color, range(start, -1, -1), box_px):
-        mask = labelled(log_odds, presence, UNSURE)
+        mask = labeled(log_odds, presence, UNSURE)
         before.append((cv2.imencode(".png", mask.labels)[1].tobytes(), mask.visible, mask.confidence))
     while len(before) > 1:
         png, visible, confidence = before.pop()
@@ -71,10 +71,10 @@ def _follow(clip: Clip, tracker: Sam2, start: int, box_px: Float[np.ndarray, "4"
         assert labels is not None, "a PNG of our own"
         yield Mask(labels, visible, confidence)
     for log_odds, presence in tracker.track(clip.color, range(start, len(clip)), box_px):
-        yield labelled(log_odds, presence, UNSURE)
+        yield labeled(log_odds, presence, UNSURE)
 
 
-def labelled(log_odds: Float[np.ndarray, "height width"], presence: float, unsure: float) -> Mask:
+def labeled(log_odds: Float[np.ndarray, "height width"], presence: float, unsure: float) -> Mask:
     """Turn log-odds into 255 agent, 0 not, 128 unknown; an empty mask where presence has log-odds <= 0."""
     labels = np.where(log_odds > unsure, 255, np.where(log_odds < -unsure, 0, 128)).astype(np.uint8)
     inside = labels == 255

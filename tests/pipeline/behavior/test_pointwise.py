@@ -18,9 +18,9 @@ CELL_M = 2 * HALF_MAP_M / CELLS
 
 def coordinate_map() -> torch.Tensor:
     """A map whose first two channels are x and z of the center of each cell, in meters."""
-    centre = (torch.arange(CELLS) + 0.5) * CELL_M - HALF_MAP_M
+    center = (torch.arange(CELLS) + 0.5) * CELL_M - HALF_MAP_M
     chart = torch.zeros(1, 1, MAP_CHANNELS, CELLS, CELLS)
-    chart[:, :, 0], chart[:, :, 1] = centre, centre[:, None]
+    chart[:, :, 0], chart[:, :, 1] = center, center[:, None]
     return chart.flatten(2)
 
 

@@ -29,7 +29,7 @@ def test_row_writer_gives_the_same_file_as_save(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["none.npz", "rows.npz", "whole.npz"]
 
 
-def test_depth_is_stored_as_half_floats_in_metres(tmp_path):
+def test_depth_is_stored_as_half_floats_in_meters(tmp_path):
     depth = np.random.default_rng(0).uniform(0.2, 5, (64, 48)).astype(np.float32)
     depth[:5] = 0
     images.write_depth(tmp_path / "a.exr", depth)

@@ -28,10 +28,10 @@ def test_lookups_return_what_was_back_projected_and_nothing_out_of_view():
     pixel = rng.uniform([0, 0], [240, 320], (500, 2))
     row, column = cameras.pixel_index(pixel)
     assert np.array_equal(cameras.sample_nearest(depth, pixel), depth[row, column])
-    assert np.abs(cameras.pixel_centres(row, column) - pixel).max() <= 0.5
+    assert np.abs(cameras.pixel_centers(row, column) - pixel).max() <= 0.5
     assert not cameras.sample_nearest(depth, pixel + np.array([240, 0])).any()
-    at_centres = cameras.sample_bilinear(depth, cameras.pixel_grid(320, 240))
-    assert np.array_equal(at_centres, depth)
+    at_centers = cameras.sample_bilinear(depth, cameras.pixel_grid(320, 240))
+    assert np.array_equal(at_centers, depth)
     small = cameras.scale_intrinsics(INTRINSICS, (320, 240), (640, 480))
     own = cameras.back_project_pixels(cameras.pixel_grid(640, 480), small, depth, INTRINSICS)
     assert np.array_equal(own[..., 2], depth.repeat(2, 0).repeat(2, 1))

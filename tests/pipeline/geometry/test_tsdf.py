@@ -28,7 +28,7 @@ def test_room_is_fused_where_it_was_observed():
     assert np.quantile(off_wall, 0.95) < 0.05, "meters"
     assert mesh.vertices[:, 2].min() > -1.3, "the wall behind was never seen"
     assert (np.abs(mesh.color.astype(int) - (10, 200, 90)).max(1) <= 1).mean() > 0.99
-    centre = mesh.vertices[mesh.faces].mean(1)
-    assert (np.einsum("fi,fi->f", mesh.face_normals(), -centre) > 0).mean() > 0.99, (
+    center = mesh.vertices[mesh.faces].mean(1)
+    assert (np.einsum("fi,fi->f", mesh.face_normals(), -center) > 0).mean() > 0.99, (
         "normals point into free space"
     )

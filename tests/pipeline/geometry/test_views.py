@@ -7,7 +7,7 @@ from pipeline.geometry import views
 from pipeline.geometry.meshes import Mesh
 
 
-def test_bird_view_shows_a_coloured_box_at_its_position():
+def test_bird_view_shows_a_colored_box_at_its_position():
     floor = trimesh.creation.box((4, 0.02, 3)).subdivide_to_size(0.3)
     box = trimesh.creation.box((0.6, 0.4, 0.6), trimesh.transformations.translation_matrix((1.0, 0.2, -0.5)))
     color = np.repeat(

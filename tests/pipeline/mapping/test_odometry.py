@@ -54,11 +54,11 @@ def circle(room):
     return poses, views
 
 
-def drifted(poses, rng, radians=0.002, metres=0.004):
+def drifted(poses, rng, radians=0.002, meters=0.004):
     """Accumulate small random errors like odometry."""
     relative = rigid.inverse(poses[:-1]) @ poses[1:]
     steps = relative @ rigid.exp(
-        np.c_[rng.normal(0, radians, (len(relative), 3)), rng.normal(0, metres, (len(relative), 3))]
+        np.c_[rng.normal(0, radians, (len(relative), 3)), rng.normal(0, meters, (len(relative), 3))]
     )
     return rigid.accumulate(steps, poses[0])
 

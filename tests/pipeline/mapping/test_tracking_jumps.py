@@ -11,10 +11,10 @@ from tests.stages.textured_room import INTRINSICS, SIZE, aligned_errors, driftin
 TIME_S = 0.1 * np.arange(60)
 
 
-def jumping(odometry, frame, metres=0.6):
+def jumping(odometry, frame, meters=0.6):
     """Insert a tracking jump before a frame: all later poses are displaced and rotated."""
     displaced = odometry.copy()
-    displaced[frame:] = rigid.exp(np.array([0, 0.2, 0, metres, 0, 0])) @ odometry[frame:]
+    displaced[frame:] = rigid.exp(np.array([0, 0.2, 0, meters, 0, 0])) @ odometry[frame:]
     return displaced
 
 

@@ -21,7 +21,7 @@ DEPTH_FROM_COLOR = rigid.make(
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5], ids=["same size", "half the size"])
-def test_reprojected_depth_equals_that_of_the_colour_camera(share):
+def test_reprojected_depth_equals_that_of_the_color_camera(share):
     mesh = textured_room.textured_room(edge_m=0.05)
     caster, place = RayCaster(mesh), textured_room.walk(20)[7]
     size = tuple(round(side * share) for side in DEPTH_SIZE)

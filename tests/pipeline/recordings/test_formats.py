@@ -280,7 +280,7 @@ def test_stream_file_names_may_lack_the_extension(tmp_path, ending):
 
 
 @pytest.mark.parametrize("per_meter", [1000, 5000, 10_000])
-def test_poses_distinguish_millimetres_from_dataset_units(tmp_path, per_meter):
+def test_poses_distinguish_millimeters_from_dataset_units(tmp_path, per_meter):
     made = walk(18, rate_hz=RATE_HZ)
     recording = open_recording(made_formats.tum(tmp_path / "a", made, per_meter=per_meter))
     np.testing.assert_allclose(recording.read_depth(3), made.depth(3), atol=1e-3)
@@ -376,7 +376,7 @@ def _hdr(srgb, curve):
 
 @pytest.mark.slow  # color look-up tables, once per video
 @pytest.mark.parametrize("curve", ["arib-std-b67", "smpte2084"])
-def test_hdr_is_converted_to_standard_colours(tmp_path, curve):
+def test_hdr_is_converted_to_standard_colors(tmp_path, curve):
     """iPhones write HLG, Samsung phones PQ, which look washed out without conversion. Tolerance: 8 levels,
     since 8-bit HDR is coarse.
     """
@@ -481,7 +481,7 @@ def _no_intrinsics(path, made):
     return path
 
 
-def _millimetres_as_metres(path, made):
+def _millimeters_as_meters(path, made):
     made_formats.video_and_depth(path, made)
     for number in range(6):
         (path / f"depth/{number:06d}.png").unlink(missing_ok=True)
@@ -569,7 +569,7 @@ FAULTS = {
     "CAP-007 ": _no_depth_anywhere,
     "CAP-008": _other_depth_size,
     "CAP-004  ": _intrinsics_of_another_size,
-    "CAP-008 ": _millimetres_as_metres,
+    "CAP-008 ": _millimeters_as_meters,
     "CAP-008  ": _video_of_another_shape,
     "CAP-009": _constant_rows,
     "CAP-010": lambda path, made: made_formats.nerfcapture_zip(path.with_suffix(".zip"), made),

@@ -110,7 +110,7 @@ def test_animal_that_turns_during_the_turnaround_is_rejected(turnaround, templat
     assert np.nanquantile(seen, 0.1) < 0.6
 
 
-def test_skin_and_features_are_normalised(template):
+def test_skin_and_features_are_normalized(template):
     assert template.weights.shape == (len(template.mesh.vertices), 25)
     assert np.allclose(template.weights.sum(1), 1, atol=1e-5)
     assert np.allclose(np.linalg.norm(template.features, axis=1), 1, atol=1e-3)

@@ -172,7 +172,7 @@ def test_floor_direction_is_found_from_normals():
     assert np.rad2deg(np.arccos(up @ turn[:, 1])) < 1.0, "degrees"
 
 
-def test_cleaning_removes_islands_and_keeps_colours(tmp_path):
+def test_cleaning_removes_islands_and_keeps_colors(tmp_path):
     volume = tsdf.Volume(np.zeros(3), (40, 40, 40), 0.05, 0.15)
     grid = np.stack(np.meshgrid(*[np.arange(40) * 0.05] * 3, indexing="ij"), -1)
     big, small = np.linalg.norm(grid - 0.9, axis=-1) - 0.5, np.linalg.norm(grid - 1.7, axis=-1) - 0.1

@@ -44,7 +44,7 @@ def both_ways(estimator, pair):
 
 @pytest.mark.parametrize("size", [(160, 120), (120, 160), (400, 300), (162, 121)])
 @pytest.mark.parametrize("matrix", [[[1, 0, 5.0], [0, 1, -3.0]], [[0.999, -0.04, 4.0], [0.04, 0.999, -2.0]]])
-def test_known_motion_is_estimated_in_colour_pixels(size, matrix):
+def test_known_motion_is_estimated_in_color_pixels(size, matrix):
     matrix = np.array(matrix)
     estimator = Estimator(size, WORKING_SIDE_PX)
     pair = [estimator.reduce(picture) for picture in (texture(*size), moved(texture(*size), matrix))]

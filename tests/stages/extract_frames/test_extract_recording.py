@@ -47,7 +47,7 @@ def test_frames_are_upright_and_agree_with_the_truth(tmp_path, monkeypatch, turn
     )
 
 
-def test_colour_bytes_are_copied_untouched_when_upright(tmp_path, monkeypatch):
+def test_color_bytes_are_copied_untouched_when_upright(tmp_path, monkeypatch):
     made = walk(12)
     clip = _extract(made.write(tmp_path / "a.r3d"), tmp_path / "out", monkeypatch)
     assert (clip.folder / "color" / "000000.jpg").read_bytes() == images.encode_jpeg(made.color(0))

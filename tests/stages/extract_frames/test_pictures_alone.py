@@ -67,11 +67,11 @@ def test_walkthrough_is_mapped_and_scaled_by_a_session_with_depth(room, tmp_path
     assert plan.scale == "v002"
     assert len(plan.chosen) >= 10
     assert abs(plan.intrinsics[0, 0, 0] / INTRINSICS[0, 0] - 1) < 0.04, "the focal length was not told"
-    centres = truth[plan.chosen, :3, 3]
+    centers = truth[plan.chosen, :3, 3]
     moved = rigid.apply(
-        align.kabsch(plan.odometry_from_camera[:, :3, 3], centres), plan.odometry_from_camera[:, :3, 3]
+        align.kabsch(plan.odometry_from_camera[:, :3, 3], centers), plan.odometry_from_camera[:, :3, 3]
     )
-    assert np.linalg.norm(moved - centres, axis=1).max() < 0.08, "meters, without any scale"
+    assert np.linalg.norm(moved - centers, axis=1).max() < 0.08, "meters, without any scale"
     off, known = [], []
     for frame, row in zip(mapped.frames, plan.chosen, strict=True):
         true = _seen(room, truth[row])[1][::2, ::2]
@@ -117,11 +117,11 @@ def test_consistent_multi_view_depth_is_accurate(room):
 
 def test_keyframes_are_selected_by_motion():
     config = PhotogrammetryConfig(keyframe_share=0.1, max_keyframes=20)
-    travelled = np.concatenate([np.zeros(50), np.linspace(0, 1, 50)])
+    traveled = np.concatenate([np.zeros(50), np.linspace(0, 1, 50)])
     sharpness = np.ones(100)
     sharpness[::7] = 2.0
-    keys = structure.choose_keyframes(travelled, sharpness, config)
+    keys = structure.choose_keyframes(traveled, sharpness, config)
     assert 10 <= len(keys) <= 12
     assert (keys < 50).sum() == 1, "a phone that rests shows one place"
     assert (keys % 7 == 0).mean() > 0.6, "the sharpest of each step"
-    assert len(structure.choose_keyframes(100 * travelled, sharpness, config)) <= 20
+    assert len(structure.choose_keyframes(100 * traveled, sharpness, config)) <= 20

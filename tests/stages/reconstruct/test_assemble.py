@@ -9,7 +9,7 @@ from pipeline.data.motion import MotionTable
 from pipeline.geometry import rigid
 from stages.reconstruct import assemble, rays
 from stages.reconstruct.problem import MAX_PRECISE, prior_precision
-from tests.stages.reconstruct.test_optimise import WIDE, film, problem
+from tests.stages.reconstruct.test_optimize import WIDE, film, problem
 
 
 def doubted(confidence: np.ndarray, leap_m: float = 2.0) -> assemble.RegisteredVideo:

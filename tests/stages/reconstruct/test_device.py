@@ -7,11 +7,11 @@ import torch
 from pipeline.fields import fields, marching_cubes
 from pipeline.fields.fields import Reconstruction
 from pipeline.fields.render import Renderer, render_depth
-from stages.reconstruct import assemble, optimise, results
+from stages.reconstruct import assemble, optimize, results
 from stages.reconstruct.config import LearningRates, LossWeights, PhaseSteps, RayBatches
 from tests.simulated_device import DEVICE, is_on_device, simulated_device
 from tests.stages.reconstruct.test_fuse import fused_scene
-from tests.stages.reconstruct.test_optimise import RADIUS_M, SHAPES, UPRIGHT, film, template
+from tests.stages.reconstruct.test_optimize import RADIUS_M, SHAPES, UPRIGHT, film, template
 
 STEPS = PhaseSteps(template=40, scene=2, stance=1, body=2, joint=2, save_every=2)
 BATCHES = RayBatches(scene_rays=32, joint_scene_rays=16, rendered_rays=8, rendered_samples=8, runs=1)
@@ -27,10 +27,10 @@ def test_all_phases_run_on_another_device(form, tmp_path):
         problem = assemble.build(
             videos, template(RADIUS_M), SHAPES, 0, DEVICE, fused, tmp_path, rendered=rendered
         )
-        plan = optimise.OptimizationPlan(
+        plan = optimize.OptimizationPlan(
             STEPS, LossWeights(), BATCHES, LearningRates(), 0, tmp_path, rendered=rendered
         )
-        records = optimise.optimise(problem, plan)
+        records = optimize.optimize(problem, plan)
         assert all(np.isfinite(record.total()).all() for record in records.values())
         tables = (problem.store.scene, problem.store.agent, problem.store.views)
         for module in (*problem.modules().values(), problem.scene.grid):

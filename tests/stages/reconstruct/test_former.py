@@ -12,9 +12,9 @@ from pipeline.core.errors import InputError
 from pipeline.data import motion
 from pipeline.fields import fields
 from pipeline.fields.fields import Reconstruction
-from stages.reconstruct import assemble, former, optimise, results
+from stages.reconstruct import assemble, former, optimize, results
 from stages.reconstruct.config import PhaseSteps
-from tests.stages.reconstruct.test_optimise import SHAPES, UPRIGHT, WIDE, film, plan, problem
+from tests.stages.reconstruct.test_optimize import SHAPES, UPRIGHT, WIDE, film, plan, problem
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def made(tmp_path_factory):
     """A reconstruction of a session and the turnaround as files, the problem and its motion."""
     torch.set_num_threads(1)
     found, videos = problem(videos=films())
-    optimise.optimise(found, plan(template=20, scene=20, body=6, joint=3))
+    optimize.optimize(found, plan(template=20, scene=20, body=6, joint=3))
     folder = tmp_path_factory.mktemp("former")
     fields.save(folder, Reconstruction(found.scene, found.agent, found.body, assemble.scene_ids(videos)))
     motions = results.motions(found, videos, 0.75)
@@ -73,7 +73,7 @@ def test_only_added_recordings_are_posed(made, tmp_path):
     known = former.begin(found, videos, folder)
     steps = former.shorter(PhaseSteps(template=20, scene=20, body=4, joint=10))
     assert (steps.template, steps.scene, steps.joint) == (0, 6, 3)
-    optimise.optimise(found, replace(plan(resume=tmp_path), steps=steps, known=known))
+    optimize.optimize(found, replace(plan(resume=tmp_path), steps=steps, known=known))
     posed = [path.name for path in tmp_path.glob("body_*")]
     assert len(posed) == 1, "the segment of the recording that was added"
     assert np.isfinite(results.motions(found, videos, 0.75)["v003"].world_from_agent).all()

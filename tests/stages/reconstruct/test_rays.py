@@ -17,14 +17,14 @@ from stages.reconstruct.rays import (
 
 @pytest.mark.parametrize(("radius_px", "label"), [(9.0, AGENT), (25.0, AGENT), (25.0, UNKNOWN)])
 def test_mask_distance_is_measured_at_pixel_centers(radius_px, label):
-    height, width, centre = 80, 120, np.array([53.0, 37.0])
+    height, width, center = 80, 120, np.array([53.0, 37.0])
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    mask = np.where(np.hypot(x - centre[0], y - centre[1]) < radius_px, label, NOT_AGENT).astype(np.uint8)
+    mask = np.where(np.hypot(x - center[0], y - center[1]) < radius_px, label, NOT_AGENT).astype(np.uint8)
     found = mask_distance_px(mask, (height // THUMBNAIL, width // THUMBNAIL)).astype(float)
     middle = np.stack(
         np.meshgrid(*((np.arange(size // THUMBNAIL) + 0.5) * THUMBNAIL for size in (width, height))), axis=-1
     )
-    true = np.linalg.norm(middle - centre, axis=-1) - radius_px
+    true = np.linalg.norm(middle - center, axis=-1) - radius_px
     assert np.abs(found - true)[true > -0.5 * radius_px].max() < 1.0, (
         "pixels are counted as in or out whole: below one pixel"
     )

@@ -8,11 +8,11 @@ import torch
 
 from pipeline.fields.fields import Reconstruction, density
 from pipeline.fields.render import importance_depths, ray_weights, render_depth
-from stages.reconstruct import assemble, optimise
+from stages.reconstruct import assemble, optimize
 from stages.reconstruct.config import LearningRates, LossWeights, RayBatches
 from stages.reconstruct.problem import Problem
 from stages.reconstruct.scene import SceneLoss
-from tests.stages.reconstruct.test_optimise import RADIUS_M, SHAPES, UPRIGHT, WIDE, film, template
+from tests.stages.reconstruct.test_optimize import RADIUS_M, SHAPES, UPRIGHT, WIDE, film, template
 
 STEPS = 80
 WEIGHTS = replace(LossWeights(), rendered_depth=1.0)
@@ -26,11 +26,11 @@ def learned(batches: RayBatches, weights: LossWeights = WEIGHTS) -> tuple[Proble
     sizes = replace(SHAPES, encoding="mlp", scene_voxel_m=(0.4, 0.1))
     problem = assemble.build(videos, template(RADIUS_M), sizes, 0, "cpu", rendered=True)
     loss = SceneLoss(problem, weights, batches, STEPS, rendered=True)
-    optimizer = torch.optim.AdamW(optimise.field_groups(problem.scene, LearningRates()), lr=1.0)
+    optimizer = torch.optim.AdamW(optimize.field_groups(problem.scene, LearningRates()), lr=1.0)
     for step in range(STEPS):
         optimizer.zero_grad()
         sum(loss(step, torch.Generator().manual_seed(step)).values()).backward()
-        torch.nn.utils.clip_grad_norm_(problem.scene.parameters(), optimise.CLIP_NORM)
+        torch.nn.utils.clip_grad_norm_(problem.scene.parameters(), optimize.CLIP_NORM)
         optimizer.step()
     return problem, videos
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from stages.reconstruct import assemble, optimise, posing
-from tests.stages.reconstruct.test_optimise import SHAPES, film_animal, plan, problem, template
+from stages.reconstruct import assemble, optimize, posing
+from tests.stages.reconstruct.test_optimize import SHAPES, film_animal, plan, problem, template
 
 FRAMES, SITS = 40, slice(20, 40)
 HALF_M = np.array([0.1, 0.1, 0.3])
@@ -33,7 +33,7 @@ def test_process_without_new_videos_chooses_none():
     found, _ = problem()
     without = replace(found, agent_frames=found.agent_frames[:0])
     before = found.motion.initial_agent.clone()
-    optimise._choose_stances(without, plan(stance=1), list(optimise.split_segments(found, 100)))
+    optimize._choose_stances(without, plan(stance=1), list(optimize.split_segments(found, 100)))
     assert torch.equal(found.motion.initial_agent, before)
 
 
@@ -50,7 +50,7 @@ def test_sitting_is_detected():
     root[SITS, :3, 1:3] = [[0, 0], [0.75**0.5, 0.5], [-0.5, 0.75**0.5]]
     video = film_animal("v002", root, level, HALF_M, True, np.random.default_rng(0))
     found = assemble.build([video], template(HALF_M), SHAPES, 0, "cpu")
-    optimise.optimise(found, plan(template=100, scene=2, stance=20, body=2, joint=1))
+    optimize.optimize(found, plan(template=100, scene=2, stance=20, body=2, joint=1))
     raised = found.motion.initial_agent[:, 1, 2]
     assert torch.allclose(raised[SITS], torch.tensor(0.5)) and torch.equal(
         raised[: SITS.start], torch.zeros(SITS.start)

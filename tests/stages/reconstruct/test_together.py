@@ -9,12 +9,12 @@ import torch
 
 from pipeline.core import distributed, training
 from pipeline.core.errors import InputError
-from stages.reconstruct import losses, optimise
+from stages.reconstruct import losses, optimize
 from stages.reconstruct.config import LossWeights
 from stages.reconstruct.joint import JointLoss
 from stages.reconstruct.problem import Problem
 from tests import two_processes
-from tests.stages.reconstruct.test_optimise import UPRIGHT, WIDE, film, plan, problem
+from tests.stages.reconstruct.test_optimize import UPRIGHT, WIDE, film, plan, problem
 
 STEPS = 3
 
@@ -54,7 +54,7 @@ def side(rank: int, port: str, folder: Path) -> tuple[torch.Tensor, torch.Tensor
     two_processes.join(rank, port)
     found, whole = three_videos(), three_videos()
     weights, total = fitted(found, loss_of(found, rank), shared=True)
-    optimise.optimise(whole, plan(folder / "resume", template=2, scene=3, body=2, joint=3, save_every=2))
+    optimize.optimize(whole, plan(folder / "resume", template=2, scene=3, body=2, joint=3, save_every=2))
     torch.save(learned(whole), folder / f"rank{rank}.pt")
     distributed.wait()
     assert distributed.leave() == (rank == 0)

@@ -71,7 +71,7 @@ def wall() -> gaussians.SurfaceSamples:
     )
 
 
-def test_colour_and_light_are_recovered(wall):
+def test_color_and_light_are_recovered(wall):
     seen = cover.observe(wall, EVERYWHERE, [film(0), film(1)], FRAMES)
     shown = seen.weight > 0
     assert not shown[wall.points[:, 2] > WALL_M + 0.01].any(), "what faces away is not seen"
@@ -99,7 +99,7 @@ def test_surfaces_in_observed_free_space_are_removed(wall):
     )
 
 
-def test_gaussians_concentrate_at_colour_edges(wall, monkeypatch):
+def test_gaussians_concentrate_at_color_edges(wall, monkeypatch):
     monkeypatch.setattr(cover, "BASE_GRADIENT", 0.01)
     monkeypatch.setattr(cover, "UNIFORM_SHARE", 0.1)
     seen = cover.observe(wall, EVERYWHERE, [film(0), film(1)], FRAMES)

@@ -22,7 +22,7 @@ def test_slopes_and_unknown_depth_are_unchanged():
     np.testing.assert_array_equal(snap_depth_steps(slope), slope)
 
 
-def test_colours_of_adjacent_pixels_are_tolerated():
+def test_colors_of_adjacent_pixels_are_tolerated():
     rng = np.random.default_rng(0)
     stripes = np.where(np.arange(60) // 6 % 2 == 0, 60, 200)[None, :, None].repeat(60, 0).repeat(3, 2)
     before = stripes + rng.normal(0, 2, stripes.shape)

@@ -45,7 +45,7 @@ def test_prompt_is_propagated_in_both_directions(options):
             order, tracker.track(clip.color, order, np.array(prompt.box_px)), strict=True
         ):
             np.testing.assert_array_equal(
-                masks[frame].labels, foundation.labelled(log_odds, presence, foundation.UNSURE).labels
+                masks[frame].labels, foundation.labeled(log_odds, presence, foundation.UNSURE).labels
             )
 
 
@@ -57,10 +57,10 @@ def test_detector_replaces_the_prompt_or_reports_no_detection(options):
 
 
 def test_log_odds_are_converted_to_labels():
-    mask = foundation.labelled(np.array([[5.0, 0.5, -5]]), 2.0, 1.0)
+    mask = foundation.labeled(np.array([[5.0, 0.5, -5]]), 2.0, 1.0)
     assert mask.labels.tolist() == [[255, 128, 0]]
     assert mask.visible
-    gone = foundation.labelled(np.array([[5.0, 0.5, -5]]), -2.0, 1.0)
+    gone = foundation.labeled(np.array([[5.0, 0.5, -5]]), -2.0, 1.0)
     assert not gone.visible
     assert not gone.labels.any()
     assert gone.confidence > 0.8

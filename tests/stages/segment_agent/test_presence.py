@@ -120,7 +120,7 @@ def test_appearance_decides_without_geometry():
     assert not (labels == 255).any()
 
 
-def test_specular_surfaces_are_labelled_by_appearance():
+def test_specular_surfaces_are_labeled_by_appearance():
     """A surface whose color changes beside the animal is labeled animal only if it looks like one."""
     shape, no = (60, 80), np.zeros((60, 80), bool)
     animal, gloss = no.copy(), no.copy()

@@ -58,7 +58,7 @@ def test_masks_are_empty_without_animal(walk):
     assert not any(mask.labels.any() for mask in found[-3:])
 
 
-def test_masks_have_three_labels_at_colour_resolution(walk):
+def test_masks_have_three_labels_at_color_resolution(walk):
     for mask in walk[0]:
         assert mask.labels.shape == scenery.COLOR_SIZE
         assert mask.labels.dtype == np.uint8

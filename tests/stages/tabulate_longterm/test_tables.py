@@ -55,7 +55,7 @@ def test_errors_of_true_and_shifted_motion(source):
     assert all(metrics[name] == pytest.approx(0, abs=1e-6) for name in scores.METRICS[:6])
     assert metrics["contact"] == 1 and metrics["slide_m_s"] < 0.01 and metrics["planted"] > 0.5
     step = np.linalg.norm(np.diff(part.world_from_agent[:, :3, 3], axis=0)[[0, -1]], axis=1).mean()
-    assert metrics["neighbour_v2v_mm"] == pytest.approx(1000 * step, rel=0.5)
+    assert metrics["neighbor_v2v_mm"] == pytest.approx(1000 * step, rel=0.5)
     root = part.world_from_agent.copy()
     root[:, :3, 3] += [0.03, 0.0, 0.04]
     metrics = dict(
@@ -127,12 +127,12 @@ def test_tables_hold_every_method_with_intervals(source):
 
 def test_clips_are_paired_and_the_gap_at_the_joint_is_measured(source):
     dataset, model = source.split.held_out, source.models.ours
-    travelled = select_clips(dataset, np.random.default_rng(0), stride=10, resting=0.0)
-    cuts = comparison.select_runs(travelled, 2, 6)
+    traveled = select_clips(dataset, np.random.default_rng(0), stride=10, resting=0.0)
+    cuts = comparison.select_runs(traveled, 2, 6)
     assert len(cuts.start) == 6 and set(cuts.start[1::2] - cuts.start[::2]) == {60}
     assert (cuts.stretch[1::2] == cuts.stretch[::2]).all()
     assert comparison.even_runs(7, 2, 4).tolist() == [0, 1, 4, 5] and not len(comparison.even_runs(0, 2, 4))
-    threes = comparison.select_runs(travelled, 3, 6).start
+    threes = comparison.select_runs(traveled, 3, 6).start
     assert len(threes) == 6 and set(np.diff(threes.reshape(-1, 3)).reshape(-1)) == {60}
     parts = cuts.parts(dataset)
     known = scores.references(parts, np.zeros(6, int), dataset, model)

@@ -55,7 +55,7 @@ def test_windows_have_the_configured_length(data, tmp_path):
         frames_from_seconds(0.6, RATE_HZ)
 
 
-def test_strides_are_metres_per_second_at_any_rate():
+def test_strides_are_meters_per_second_at_any_rate():
     way = torch.tensor([[[0.3, 0.0, 0.4]]]) * torch.arange(1, 9)[None, :, None] / RATE_HZ
     strides = velocity_channels_from_path(way, torch.zeros(1, 3), RATE_HZ)
     torch.testing.assert_close(strides[..., :3].norm(dim=-1).square(), torch.full((1, 8), 0.5))

@@ -12,7 +12,7 @@ from pipeline.fields.fields import Field, FieldShape, Reconstruction
 from pipeline.fields.fused_depth import FusedGeometry
 from pipeline.geometry import cameras, rigid, rigid_torch
 from pipeline.geometry.meshes import Mesh
-from stages.reconstruct import assemble, body, joint, optimise, results
+from stages.reconstruct import assemble, body, joint, optimize, results
 from stages.reconstruct.assemble import AgentTemplate, FieldSizes, RegisteredVideo
 from stages.reconstruct.body import Pose
 from stages.reconstruct.config import LearningRates, LossWeights, PhaseSteps, RayBatches
@@ -128,27 +128,27 @@ def template(half_m: float | np.ndarray) -> AgentTemplate:
     return AgentTemplate(mesh, feature, rest, np.full((6, 3), 0.1))
 
 
-def plan(resume=None, **steps) -> optimise.OptimizationPlan:
+def plan(resume=None, **steps) -> optimize.OptimizationPlan:
     batches = RayBatches(scene_rays=256, joint_scene_rays=128, rendered_rays=16, runs=2)
-    return optimise.OptimizationPlan(PhaseSteps(**steps), LossWeights(), batches, LearningRates(), 0, resume)
+    return optimize.OptimizationPlan(PhaseSteps(**steps), LossWeights(), batches, LearningRates(), 0, resume)
 
 
 @pytest.fixture(scope="module")
 def solved():
     torch.set_num_threads(1)
     found, videos = problem()
-    optimise.optimise(found, plan(template=80, scene=90, body=40, joint=4))
+    optimize.optimize(found, plan(template=80, scene=90, body=40, joint=4))
     return found, videos
 
 
 @pytest.mark.slow
 def test_room_and_ball_are_reconstructed(solved):
     found, _ = solved
-    centre = torch.tensor([[0.0, 0.0, -0.8], [0.5, 0.5, 0.5]])
+    center = torch.tensor([[0.0, 0.0, -0.8], [0.5, 0.5, 0.5]])
     wall = torch.tensor([[ROOM_M, 0.1, 0.1], [0.1, -0.2, ROOM_M]])
     code = torch.full((2,), -1)
     with torch.no_grad():
-        assert (found.scene(centre, code).signed_distance > 0.05).all(), "the middle of the room is free"
+        assert (found.scene(center, code).signed_distance > 0.05).all(), "the middle of the room is free"
         assert (found.scene(wall, code).signed_distance.abs() < 0.05).all(), "meters; cells are 0.2 m"
     ball = marching_cubes.extract_agent(found.agent, 0.04)
     assert np.abs(np.linalg.norm(ball.vertices, axis=-1) - RADIUS_M).mean() < 0.02
@@ -162,10 +162,10 @@ def test_posed_surface_comes_nearer_to_the_truth(solved):
         posed = found.body.pose(
             found.surface.points, torch.from_numpy(motion.agent_from_bone).float()
         ).numpy()
-    centre = rigid.apply(motion.world_from_agent, posed).mean(1)
+    center = rigid.apply(motion.world_from_agent, posed).mean(1)
     truth = np.stack([0.03 * np.arange(12), np.zeros(12), np.zeros(12)], axis=-1)
     before = np.linalg.norm(videos[0].world_from_agent[:, :3, 3] - truth, axis=-1).mean()
-    assert np.linalg.norm(centre - truth, axis=-1).mean() < 0.6 * before
+    assert np.linalg.norm(center - truth, axis=-1).mean() < 0.6 * before
 
 
 def test_true_distance_field_has_no_loss():
@@ -200,7 +200,7 @@ def test_long_gaps_are_interpolated_with_low_confidence(solved):
 def test_posing_is_independent_of_the_batch_size():
     def posed(workers: int) -> torch.Tensor:
         found, _ = problem()
-        optimise._pose(found, replace(plan(body=3), workers=workers), list(optimise.split_segments(found, 5)))
+        optimize._pose(found, replace(plan(body=3), workers=workers), list(optimize.split_segments(found, 5)))
         return torch.cat([found.motion.root.flatten(), found.motion.bone.flatten()]).detach()
 
     one = posed(1)
@@ -234,12 +234,12 @@ def test_uncovered_mask_pixels_attract_the_surface():
     assert torch.nn.functional.cosine_similarity(-shift.grad, home, dim=0) > 0.7
 
 
-def beside(found, metres: float) -> dict:
+def beside(found, meters: float) -> dict:
     """Return `surface_terms` of the session with the ball shifted to the right in all pictures."""
     pose = Pose.of(found, torch.arange(4))
     right = (
         pose.world_from_camera
-        @ rigid_torch.make(torch.eye(3), torch.tensor([metres, 0, 0]))
+        @ rigid_torch.make(torch.eye(3), torch.tensor([meters, 0, 0]))
         @ rigid_torch.inverse(pose.world_from_camera)
     )
     pose = replace(pose, world_from_agent=right @ pose.world_from_agent)
@@ -360,14 +360,14 @@ def test_bones_are_connected_along_limbs():
     """Two legs are closer to each other than their own bones; each is connected to its own hip."""
     heights = torch.tensor([0.0, -0.1, -0.2])
     side = torch.tensor([-0.02, 0.02])
-    centre = torch.stack([side[:, None].expand(2, 3), heights.expand(2, 3), torch.zeros(2, 3)], dim=-1).view(
+    center = torch.stack([side[:, None].expand(2, 3), heights.expand(2, 3), torch.zeros(2, 3)], dim=-1).view(
         6, 3
     )
     points = torch.cat(
         [torch.stack([x.expand(60), torch.linspace(0, -0.25, 60), torch.zeros(60)], dim=-1) for x in side]
     )
-    across = (points[:, None, 0] * centre[:, 0] < 0) & (points[:, None, 1] < -0.05)
-    weights = (-torch.cdist(points, centre).square() / 0.05**2 - 1e3 * across).softmax(-1)
+    across = (points[:, None, 0] * center[:, 0] < 0) & (points[:, None, 1] < -0.05)
+    weights = (-torch.cdist(points, center).square() / 0.05**2 - 1e3 * across).softmax(-1)
     joints = Joints.of(points, weights)
     pairs = set(zip(joints.first.tolist(), joints.second.tolist(), strict=True))
     assert {(0, 1), (1, 2), (3, 4), (4, 5), (0, 3)} <= pairs and not pairs & {(1, 4), (1, 5), (2, 4), (2, 5)}
@@ -391,7 +391,7 @@ def test_fields_survive_saving(solved, tmp_path):
 def test_positional_networks_without_codes_train_and_survive_saving(tmp_path):
     """Baselines of Table 3: positional encoding instead of grids, one scene for all videos."""
     found, videos = problem(replace(SHAPES, encoding="mlp", code_channels=0))
-    records = optimise.optimise(found, plan(template=30, scene=30, body=2, joint=2))
+    records = optimize.optimize(found, plan(template=30, scene=30, body=2, joint=2))
     total = records["scene"].total()
     assert np.isfinite(records["joint"].total()).all() and total[-5:].mean() < 0.6 * total[:3].mean()
     assert found.scene.codes is None and not hasattr(found.scene.grid, "levels")
@@ -430,14 +430,14 @@ def test_frames_with_uncertain_cameras_carve_no_free_space(solved):
 def test_resumed_run_is_bit_identical(tmp_path):
     settings = dict(template=6, scene=8, body=2, joint=6, save_every=3)
     whole, _ = problem()
-    optimise.optimise(whole, plan(**settings))
+    optimize.optimize(whole, plan(**settings))
 
     class KilledError(Exception):
         pass
 
     broken, _ = problem()
     calls = 0
-    original = optimise.JointLoss.__call__
+    original = optimize.JointLoss.__call__
 
     def dies(self, step, generator):
         nonlocal calls
@@ -447,10 +447,10 @@ def test_resumed_run_is_bit_identical(tmp_path):
         return original(self, step, generator)
 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KilledError):
-        patch.setattr(optimise.JointLoss, "__call__", dies)
-        optimise.optimise(broken, plan(tmp_path, **settings))
+        patch.setattr(optimize.JointLoss, "__call__", dies)
+        optimize.optimize(broken, plan(tmp_path, **settings))
     again, _ = problem()
-    optimise.optimise(again, plan(tmp_path, **settings))
+    optimize.optimize(again, plan(tmp_path, **settings))
     for name, module in whole.modules().items():
         for key, value in module.state_dict().items():
             assert torch.equal(value, again.modules()[name].state_dict()[key]), f"{name}.{key}"

@@ -69,7 +69,7 @@ def cosine(progress: float) -> float:
 
 
 @threads.single_threaded()
-def optimise(problem: Problem, plan: OptimizationPlan) -> dict[str, FitRecord]:
+def optimize(problem: Problem, plan: OptimizationPlan) -> dict[str, FitRecord]:
     """Run all phases; the modules of the problem change in place. Returns the losses of each phase.
 
     Several processes (`pipeline.core.distributed`) share the videos: each takes rays of its own videos and
