@@ -1,6 +1,5 @@
 """Read the inputs of the stage: recordings with their poses, and the agent template."""
 
-import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,8 +132,3 @@ def read_template(folder: Path) -> AgentTemplate:
     skin, feature = SkinTable.open(folder), templates.read_vertex_features(folder)
     mesh = ply.read_ply(folder / "agent.ply")
     return AgentTemplate(mesh, feature, skin.agent_from_bone_rest, skin.bone_scale_m)
-
-
-def read_floor(folder: Path) -> float:
-    """Read the floor's height in the world, meters."""
-    return float(json.loads((folder / "world.json").read_text())["floor"])

@@ -1,5 +1,6 @@
 """The stage: registered recordings and templates -> fields, motion, surfaces, feature volume."""
 
+import json
 from pathlib import Path
 
 from pipeline.core import devices, distributed, progress
@@ -30,10 +31,8 @@ def run(
     if config.scene_geometry == "fused":
         fused = fuse.fuse_depth(registered, config.fusion, resume, workers)
     rendered = config.supervision == "rendered"
-    template, floor_m = (
-        reading.read_template(inputs.agent_template),
-        reading.read_floor(inputs.scene_template),
-    )
+    template = reading.read_template(inputs.agent_template)
+    floor_m = float(json.loads((inputs.scene_template / "world.json").read_text())["floor"])
     problem = assemble.build(
         registered, template, config.fields, config.seed, device, fused, resume, floor_m, rendered
     )
