@@ -95,3 +95,13 @@ def opened(
         shown(browser, file.resolve().as_uri() + query, size=size, timeout_s=timeout_s) as page_and_wrong,
     ):
         yield page_and_wrong
+
+
+def states(page: Page, ticks: int) -> Iterator[dict[str, Any]]:
+    """Yield the page's state once per tick, however busy the machine is, for a number of ticks."""
+    state = page.evaluate("ats.state()")
+    end = state["tick"] + ticks
+    while state["tick"] < end:
+        yield state
+        page.wait_for_function("tick => ats.state().tick > tick", arg=state["tick"])
+        state = page.evaluate("ats.state()")

@@ -159,14 +159,14 @@ def _entered(path: np.ndarray, columns: np.ndarray) -> bool:
 
 def _check_it_walks_around(page: Page, stands: np.ndarray, goal: np.ndarray) -> None:
     page.evaluate("goal => { ats.visit([goal]); ats.play(); }", goal.tolist())
-    state, way = page.evaluate("ats.state()"), []
-    begin = state["tick"]
-    while state["aim"] and state["tick"] < begin + 300:
-        page.wait_for_timeout(50)
-        state = page.evaluate("ats.state()")
+    way = []
+    for state in browser.states(page, 300):
         way.append(np.array(state["animal"])[[0, 2]])
+        if state["aim"] is None:
+            break
+    else:
+        pytest.fail(f"half a minute, and it stands at {way[-1]}")
     page.evaluate("ats.pause()")
-    assert state["aim"] is None, f"half a minute, and it stands at {way[-1]}"
     assert not any(_entered(np.stack([place, place]), stands) for place in way)
 
 
@@ -181,11 +181,7 @@ def _check_the_person_does(page: Page, by: list[int]) -> None:
     page.mouse.move(*page.evaluate("([x, z]) => ats.screen([x, 0.8, z])", from_here.tolist()))
     page.mouse.down()
     page.mouse.move(*page.evaluate("([x, z]) => ats.screen([x + 0.8, 0, z])", middle.tolist()), steps=3)
-    state = page.evaluate("ats.state()")
-    begin = state["tick"]
-    while state["tick"] < begin + 10:
-        page.wait_for_timeout(50)
-        state = page.evaluate("ats.state()")
+    for state in browser.states(page, 11):
         place = np.array(state["observer"])
         assert not _entered(np.stack([place, place]), _columns(by))
     page.mouse.up()

@@ -121,12 +121,12 @@ def test_animal_walks_around_a_standing_person(simulator: Path, chromium: Browse
         gaps = []
         for goal in goals:
             page.evaluate("goal => ats.visit([goal])", goal)
-            begin = state = page.evaluate("ats.state()")
-            while state["aim"] and state["tick"] < begin["tick"] + 300:  # ticks: slow machines show fewer
-                page.wait_for_timeout(100)
-                state = page.evaluate("ats.state()")
+            for state in browser.states(page, 300):
                 gaps.append(np.hypot(state["animal"][0] - person[0], state["animal"][2] - person[1]))
-            assert state["aim"] is None, f"half a minute, and it stands at {state['animal'][:3]}"
+                if state["aim"] is None:
+                    break
+            else:
+                pytest.fail(f"half a minute, and it stands at {state['animal'][:3]}")
         min_m = clearance_of(small_world.rest()) - 0.04
         assert min(gaps[4:]) > min_m, "meters: two plans that fade into each other cut corners"
         assert wrong == []
@@ -138,12 +138,8 @@ def test_animal_stops_for_a_person_who_steps_in_its_way(simulator: Path, chromiu
         page.evaluate("ats.moveObserver([1.7, 1.7]); ats.visit([[-0.6, 0.5], [0.6, -0.5], [-0.6, 0.5]])")
         for _ in range(3):
             person = np.array(page.evaluate(STEPS_IN_ITS_WAY))
-            begin = state = page.evaluate("ats.state()")
-            gaps = []
-            while state["tick"] < begin["tick"] + 12:
-                gaps.append(np.linalg.norm(np.array(state["animal"])[[0, 2]] - person))
-                page.wait_for_timeout(30)
-                state = page.evaluate("ats.state()")
+            places = [state["animal"] for state in browser.states(page, 12)]
+            gaps = np.linalg.norm(np.array(places)[:, [0, 2]] - person, axis=1)
             assert gaps[0] < 0.35, "meters: nearer than the clearance"
             assert min(gaps) > gaps[0] - 0.03, "meters"
             page.evaluate("ats.moveObserver([1.7, 1.7])")
@@ -295,15 +291,15 @@ def _check_a_drawn_path(page: Page) -> None:
     page.wait_for_function(
         "tick => ats.state().tick >= tick + 5", arg=drawn_at
     )  # the last plan has faded out
-    aside, ends, ticks = [], [], set()  # one sample per tick, however busy the machine is
-    while (state := page.evaluate("ats.state()"))["route"] is not None:
-        if state["tick"] not in ticks:
-            place = np.array(state["animal"])[[0, 2]]
-            aside.append(np.linalg.norm(route - place, axis=1).min())
-            ends.append(np.linalg.norm(route[-1] - place))
-            ticks.add(state["tick"])
-        page.wait_for_timeout(20)
-        assert len(aside) < 300, "half a minute"
+    aside, ends = [], []
+    for state in browser.states(page, 300):
+        if state["route"] is None:
+            break
+        place = np.array(state["animal"])[[0, 2]]
+        aside.append(np.linalg.norm(route - place, axis=1).min())
+        ends.append(np.linalg.norm(route[-1] - place))
+    else:
+        pytest.fail("half a minute")
     assert np.median(aside) < 0.1 and min(ends) < 0.2, "meters"
 
 
