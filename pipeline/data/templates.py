@@ -1,5 +1,6 @@
 """Templates of scene and animal as files: cameras of walk-through and turnaround, vertex features, skin."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -87,6 +88,11 @@ class SkinTable(Stored):
 def bones_at_rest(folder: Path) -> Float32[np.ndarray, "bone 4 4"]:
     """Read `agent_from_bone_rest` of any `skin.npz`, a table of motion's too. Raises InputError ART-010."""
     return SKIN.load(folder / "skin.npz", "agent_from_bone_rest")["agent_from_bone_rest"]
+
+
+def read_floor(scene_template: Path) -> float:
+    """Read the height of the floor from `world.json`, meters."""
+    return float(json.loads((scene_template / "world.json").read_text())["floor"])
 
 
 def read_vertex_features(template: Path) -> Float[np.ndarray, "vertex 16"]:

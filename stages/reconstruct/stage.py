@@ -1,10 +1,10 @@
 """The stage: registered recordings and templates -> fields, motion, surfaces, feature volume."""
 
-import json
 from pathlib import Path
 
 from pipeline.core import devices, distributed, progress
 from pipeline.core.videos import Video
+from pipeline.data.templates import read_floor
 from pipeline.fields.fields import Reconstruction
 from stages.reconstruct import assemble, former, fuse, optimize, pictures, reading, results
 from stages.reconstruct.config import Config
@@ -32,7 +32,7 @@ def run(
         fused = fuse.fuse_depth(registered, config.fusion, resume, workers)
     rendered = config.supervision == "rendered"
     template = reading.read_template(inputs.agent_template)
-    floor_m = float(json.loads((inputs.scene_template / "world.json").read_text())["floor"])
+    floor_m = read_floor(inputs.scene_template)
     problem = assemble.build(
         registered, template, config.fields, config.seed, device, fused, resume, floor_m, rendered
     )

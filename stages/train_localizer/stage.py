@@ -1,6 +1,5 @@
 """Train a template's localizer and write its files."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ from pipeline.core.devices import Device
 from pipeline.core.errors import InputError
 from pipeline.data import ply, qa
 from pipeline.data.clips import Clip
-from pipeline.data.templates import SceneCameras
+from pipeline.data.templates import SceneCameras, read_floor
 from pipeline.localization import localizer as localizers
 from stages.train_localizer import pictures, training
 from stages.train_localizer.config import Config
@@ -71,7 +70,7 @@ def _scene_views(inputs: Inputs, config: Config, rng: np.random.Generator) -> tr
     template = _required(inputs.scene_template, "scene_template")
     clip = Clip.open(next(iter(_required(inputs.frames, "frames").values())))
     walk = SceneCameras.open(template).world_from_camera
-    floor_m = json.loads((template / "world.json").read_text())["floor"]
+    floor_m = read_floor(template)
     return training.scene_views(ply.read_ply(template / "mesh.ply"), walk, floor_m, clip, config.scene, rng)
 
 

@@ -33,22 +33,20 @@ def rendered(backend: str, device: str = "cpu"):
     return image.detach(), coverage.detach(), [parameter.grad for parameter in parameters]
 
 
-@pytest.mark.parametrize(("backend", "tolerance"), [("tiles", 1e-4), ("gsplat", 2e-2)])
-def test_rasterizers_agree_with_the_reference(backend, tolerance):
-    """Gsplat cuts Gaussians off at other distances and opacities."""
+@pytest.mark.parametrize("backend", ["tiles", "gsplat"])
+def test_rasterizers_agree_with_the_reference(backend):
     if backend == "gsplat":
         pytest.importorskip("gsplat")
     image, coverage, grads = rendered(backend, "cuda" if backend == "gsplat" else "cpu")
     reference_image, reference_coverage, reference_grads = rendered("dense")
     assert 0.3 < reference_coverage.mean() < 0.99, "the scene must neither be empty nor closed"
-    torch.testing.assert_close(image, reference_image, rtol=tolerance, atol=2 * tolerance)
-    torch.testing.assert_close(coverage, reference_coverage, rtol=tolerance, atol=2 * tolerance)
+    torch.testing.assert_close(image, reference_image, rtol=1e-4, atol=2e-4)
+    torch.testing.assert_close(coverage, reference_coverage, rtol=1e-4, atol=2e-4)
     for name, found, expected in zip(
         ("means", "rotation", "scale", "opacity", "values"), grads, reference_grads, strict=True
     ):
         error = (found - expected).abs().max() / expected.abs().max()
-        print(f"{backend} {name}: relative error {error:.1e}")
-        assert error < tolerance, f"{name}: relative error {error:.1e}"
+        assert error < 1e-4, f"{name}: relative error {error:.1e}"
 
 
 def test_rendering_is_deterministic():
