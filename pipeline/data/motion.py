@@ -127,14 +127,6 @@ class MotionTable(nn.Module):
         self.root = nn.Parameter(torch.zeros(len(world_from_camera), 6))
         self.bone = nn.Parameter(torch.zeros(len(world_from_camera), len(agent_from_bone_rest), 6))
 
-    @torch.no_grad()
-    def start(
-        self, initial_from_leaning: Float[Tensor, "frame 4 4"], bone: Float[Tensor, "frame bone 6"]
-    ) -> None:
-        """Set a lean of the agent's initial roots and initial corrections of its bones."""
-        self.initial_agent.copy_(self.initial_agent @ initial_from_leaning)
-        self.bone.copy_(bone)
-
     def camera_correction(self, frame: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch 6"]:
         """Return the corrections of cameras as twists (rotation vector, translation)."""
         share = self.knot_share[frame][..., None]

@@ -84,8 +84,6 @@ class PhaseSteps:
     """steps of the first phase: scene and cameras"""
     body: int = 60
     """steps per segment that pose the template to the masked depth"""
-    stance: int = 20
-    """steps per segment and stance that decide before posing if the agent sits; 0 = all start level"""
     joint: int = 1000
     """steps of the second phase: everything"""
     save_every: int = 200

@@ -19,8 +19,6 @@ MIN_SKIN = 0.02
 """shared skin from which two bones are neighbors"""
 DETOUR = 1.5
 """cost of a path from the middle to a bone with none between, relative to its squared length"""
-LOW, GROUND = 0.45, 0.15
-"""legs lie below the first share of the animal's height and reach below the second"""
 
 
 def shared_skin(weights: Float[Tensor, "point bone"]) -> Float[Tensor, "bone bone"]:
@@ -85,20 +83,6 @@ class KinematicTree:
         for place, parent in enumerate(self.parent.tolist()[1:], start=1):
             moved.append(moved[parent] @ local[:, place])
         return torch.stack(moved, dim=1)[:, self.order.argsort()]
-
-
-def legs(
-    limbs: KinematicTree, points: Float[Tensor, "point 3"], weights: Float[Tensor, "point bone"]
-) -> Bool[Tensor, "bone"]:
-    """Return the top bone of each leg: it and its descendants are low, and one of them reaches the ground."""
-    height = (points[:, 1] - points[:, 1].min()) / (points[:, 1].max() - points[:, 1].min())
-    low, bones = weights.T @ height < LOW * weights.sum(0), range(weights.shape[1])
-    stands = torch.stack([(height[weights.argmax(1) == bone] < GROUND).any() for bone in bones])
-    low, stands, parent = low[limbs.order], stands[limbs.order], limbs.parent.tolist()
-    for place in range(len(parent) - 1, 0, -1):
-        low[parent[place]] &= low[place]
-        stands[parent[place]] |= stands[place]
-    return (low & stands & ~low[limbs.parent])[limbs.order.argsort()]
 
 
 class MultiscaleRotations(nn.Module):

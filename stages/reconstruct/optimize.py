@@ -4,10 +4,9 @@ Each phase is one call of `pipeline.core.training.fit` with its own checkpoints,
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -15,8 +14,7 @@ from jaxtyping import Int
 from torch import Tensor, nn
 
 from pipeline.core import distributed, progress, threads
-from pipeline.core.training import FitRecord, fit, generator_for, termination
-from stages.reconstruct import posing
+from pipeline.core.training import FitRecord, fit, termination
 from stages.reconstruct.config import LearningRates, LossWeights, PhaseSteps, RayBatches
 from stages.reconstruct.former import KnownMotion
 from stages.reconstruct.joint import JointLoss, TemplateLoss
@@ -38,10 +36,6 @@ MOTION_RATE, SKIN_RATE = 5e-4, 2e-3
 """learning rates of the second phase: of root and bones, meters and radians, and of the skin"""
 JOINT_SCENE, JOINT_AGENT, JOINT_CAMERA = 0.25, 0.2, 0.3
 """shares of the first phase's learning rates in the second: fields and cameras are nearly right"""
-STANCE_SHARE = 0.5
-"""share of the rays and points of posing that is used to decide the stance"""
-
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -91,8 +85,6 @@ def optimize(problem: Problem, plan: OptimizationPlan) -> dict[str, FitRecord]:
         if plan.known:
             known = plan.known.frame.to(problem.device)
             segments = [frame for frame in segments if not torch.isin(frame, known).any()]
-        if steps.stance and segments:
-            _choose_stances(problem, plan, segments)
         if steps.body:
             _pose(problem, plan, segments)
         for corrections in (problem.motion.root, problem.motion.bone):
@@ -132,79 +124,36 @@ def _run(
 
 
 def _pose(problem: Problem, plan: OptimizationPlan, segments: Sequence[torch.Tensor]) -> None:
-    """Pose the template in all segments with usable frames; write roots and bones into the motion table."""
+    """Pose the template in all segments with usable frames; write roots and bones into the motion table.
 
-    def pose(index: int, frame: torch.Tensor, asked_to_stop: Callable[[], bool]) -> PosedSegment:
-        posed = PosedSegment(problem, frame)
-        _fit_segment(problem, plan, f"body_{index:04d}", posed, plan.steps.body, asked_to_stop)
+    Fields and body are frozen.
+    """
+    held = nn.ModuleList([problem.agent, problem.body, problem.scene]).requires_grad_(False)
+    numbered, steps = enumerate(segments), plan.steps.body
+    own = [(index, frame) for index, frame in numbered if torch.isin(frame, problem.agent_frames).any()]
+
+    def pose(segment: tuple[int, torch.Tensor]) -> PosedSegment:
+        name, posed = f"body_{segment[0]:04d}", PosedSegment(problem, segment[1])
+        loss = SegmentLoss(problem, posed, plan.weights)
+        fit(
+            modules={"segment": posed},
+            optimizer=torch.optim.AdamW(posed.groups()),
+            loss=lambda step, generator: loss(step / steps, generator),
+            steps=steps,
+            seed=_seed(plan.seed, name),
+            resume=plan.resume / name if plan.resume else None,
+            save_every=steps,
+            schedule=cosine,
+            label=name,
+            asked_to_stop=asked_to_stop,
+        )
         return posed
 
-    for posed in _for_segments(problem, plan, segments, pose, "posing"):
-        posed.write(problem)
-
-
-def _choose_stances(problem: Problem, plan: OptimizationPlan, segments: Sequence[torch.Tensor]) -> None:
-    """Choose the stances of all segments with usable frames and initialize roots and bones with them."""
-    stances, chosen = posing.candidate_stances(problem), torch.zeros_like(problem.video)
-
-    def losses_of(index: int, frame: Tensor, asked_to_stop: Callable[[], bool]) -> tuple[Tensor, np.ndarray]:
-        losses = []
-        for number, stance in enumerate(stances):
-            posed, name = PosedSegment(problem, frame, stance), f"stance_{index:04d}_{number}"
-            loss = _fit_segment(problem, plan, name, posed, plan.steps.stance, asked_to_stop, STANCE_SHARE)
-            losses.append(loss.of_parts(posing.STANCE_FRAMES, generator_for(plan.seed, index)))
-        return frame, torch.stack(losses, dim=-1).cpu().numpy()
-
-    losses = list(_for_segments(problem, plan, segments, losses_of, "stances"))
-    level = [loss[:, 0] for _, loss in losses]  # none where other processes have all new recordings
-    typical = float(np.nanmedian(np.concatenate(level))) if level else np.nan
-    for frame, loss in losses:
-        chosen[frame] = posing.by_frame(posing.decode_stances(loss, typical), len(frame)).to(chosen)
-    lean, bone = (torch.stack([getattr(stance, name) for stance in stances]) for name in ("lean", "bone"))
-    problem.motion.start(lean[distributed.total(chosen)], bone[chosen])
-
-
-def _for_segments(
-    problem: Problem,
-    plan: OptimizationPlan,
-    segments: Sequence[torch.Tensor],
-    work: Callable[..., Result],
-    label: str,
-) -> Iterator[Result]:
-    """Yield the result of ``work`` for each segment with usable frames; fields and body are frozen."""
-    held = nn.ModuleList([problem.agent, problem.body, problem.scene]).requires_grad_(False)
-    numbered = enumerate(segments)
-    own = [(index, frame) for index, frame in numbered if torch.isin(frame, problem.agent_frames).any()]
     with termination() as asked_to_stop:
-        results = threads.ordered(lambda segment: work(*segment, asked_to_stop), own, plan.workers)
-        yield from progress.track(results, label, total=len(own))
+        results = threads.ordered(pose, own, plan.workers)
+        for posed in progress.track(results, "posing", total=len(own)):
+            posed.write(problem)
     held.requires_grad_(True)
-
-
-def _fit_segment(
-    problem: Problem,
-    plan: OptimizationPlan,
-    name: str,
-    posed: PosedSegment,
-    steps: int,
-    asked_to_stop: Callable[[], bool],
-    share: float = 1.0,
-) -> SegmentLoss:
-    """Pose the template in one segment of frames, with a ``share`` of the usual rays; returns the loss."""
-    loss = SegmentLoss(problem, posed, plan.weights, share)
-    fit(
-        modules={"segment": posed},
-        optimizer=torch.optim.AdamW(posed.groups()),
-        loss=lambda step, generator: loss(step / steps, generator),
-        steps=steps,
-        seed=_seed(plan.seed, name),
-        resume=plan.resume / name if plan.resume else None,
-        save_every=steps,
-        schedule=cosine,
-        label=name,
-        asked_to_stop=asked_to_stop,
-    )
-    return loss
 
 
 def field_groups(field: nn.Module, rates: LearningRates) -> list[dict]:

@@ -13,7 +13,7 @@ from tests.simulated_device import DEVICE, is_on_device, simulated_device
 from tests.stages.reconstruct.test_fuse import fused_scene
 from tests.stages.reconstruct.test_optimize import RADIUS_M, SHAPES, UPRIGHT, film, template
 
-STEPS = PhaseSteps(template=40, scene=2, stance=1, body=2, joint=2, save_every=2)
+STEPS = PhaseSteps(template=40, scene=2, body=2, joint=2, save_every=2)
 BATCHES = RayBatches(scene_rays=32, joint_scene_rays=16, rendered_rays=8, rendered_samples=8, runs=1)
 
 

@@ -3,7 +3,7 @@
 import torch
 
 from pipeline.geometry import rigid_torch
-from stages.reconstruct.limbs import KinematicTree, MultiscaleRotations, legs
+from stages.reconstruct.limbs import KinematicTree, MultiscaleRotations
 
 LENGTH_M = 0.1
 """between bones"""
@@ -79,28 +79,3 @@ def test_temporal_basis_adds_knots_of_each_scale():
     expected = (1 - (torch.arange(20.0) - 8).abs() / 8).clamp_min(0)
     expected[3] += 0.5
     torch.testing.assert_close(waves()[:, 0, 0].detach(), expected)
-
-
-def test_legs_are_limbs_in_contact_with_the_ground():
-    """A body of two bones with fore and hind legs of two each, and a tail that never hangs as low."""
-    place = torch.tensor(
-        [
-            [0, 0, 0.05],
-            [0, 0, -0.15],
-            [0, -0.25, 0.2],
-            [0, -0.38, 0.2],
-            [0, -0.25, -0.2],
-            [0, -0.38, -0.2],
-            [0, -0.27, -0.4],
-        ]
-    )
-    bones = torch.eye(4).repeat(7, 1, 1)
-    bones[:, :3, 3] = place
-    points = (place[:, None] + 0.02 * torch.randn(7, 30, 3, generator=torch.Generator().manual_seed(0))).view(
-        -1, 3
-    )
-    points[:, 1].clamp_(-0.4, 0.02)
-    points[-30:, 1] = points[-30:, 1].clamp_min(-0.3)
-    weights = (-torch.cdist(points, place).square() / 0.1**2).softmax(-1)
-    found = legs(KinematicTree.of(points, weights, bones), points, weights)
-    assert torch.nonzero(found)[:, 0].tolist() == [2, 4]
