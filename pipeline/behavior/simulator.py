@@ -51,6 +51,8 @@ class PoseFrames:
 
 GOAL_CHANGE_M = 0.3
 """Distance between commanded and planned goal from which a steered animal replans."""
+BESIDE_M = 1.5
+"""Distance from another animal within which a goal moves with it: at rest they are up to 1.1 m apart."""
 
 
 class AnimalBatch:
@@ -58,7 +60,9 @@ class AnimalBatch:
 
     Animals of the same ``life``, and companions from outside of the batch, are perceived and avoided. All
     animals that need a plan share one batch of sampling. A plan is followed until it ends, a perceived being
-    moves, or the commanded goal changes. ``plans_drawn`` counts the plans.
+    moves, or the commanded goal changes. Beside companions, which move all the time, an animal keeps its
+    intent until the horizon has passed: of several candidates it takes the one nearest to what is left of its
+    plan. ``plans_drawn`` counts the plans.
     """
 
     def __init__(
@@ -98,6 +102,7 @@ class AnimalBatch:
         self.goal_command = np.full((len(root), 3), np.nan)
         self.plan, self.goal, self.blocked = self._draw_plans(np.arange(len(root)))
         self.played, self.planned_others = np.zeros(len(root), int), self._others_now()
+        self.intent_end = np.full(len(root), self.plan_frames)
 
     def restart(self, some: Int[np.ndarray, "some"], context: Context) -> None:
         """Restart some of the animals, each from a window of its own."""
@@ -112,6 +117,7 @@ class AnimalBatch:
         plan, self.goal[some], self.blocked[some] = self._draw_plans(some)
         self.plan.root[some], self.plan.bones[some] = plan.root, plan.bones
         self.played[some], self.planned_others[some] = 0, self._others_now()[some]
+        self.intent_end[some] = self.plan_frames
 
     def command(self, goal_world: Float[np.ndarray, "animal 3"]) -> None:
         """Set commanded goals (meters, world); NaN lets an animal choose its own."""
@@ -170,23 +176,27 @@ class AnimalBatch:
             return observer
         return np.concatenate([observer, companions[:, :, -1, :3]], axis=1)
 
-    def _must_replan(self) -> Bool[np.ndarray, "animal"]:
-        """Return which animals must replan: their plan ends, another moved, or their command changed."""
+    def _moved_noticeably(self) -> Bool[np.ndarray, "animal other"]:
+        """Return which of the others, the observer first, have moved noticeably since plans were made."""
         others = self._others_now()
         moved = np.linalg.norm(others - self.planned_others, axis=-1)
         away = np.linalg.norm(others - self.past[-1].root[:, :1, :3, 3], axis=-1)
-        outdated = (
-            self.sampling.observer
-            & (self.played >= self.chaining.reaction_frames)
-            & (moved > self.chaining.observer_motion_ratio * away).any(1)
-        )
+        return moved > self.chaining.observer_motion_ratio * away
+
+    def _must_replan(self) -> Bool[np.ndarray, "animal"]:
+        """Return which animals must replan: their plan ends, another moved, or their command changed."""
+        seen = self._moved_noticeably().any(1) & self.sampling.observer
+        outdated = seen & (self.played >= self.chaining.reaction_frames)
         changed = np.linalg.norm(np.nan_to_num(self.goal_command - self.goal), axis=-1) > GOAL_CHANGE_M
         redirected = changed & (self.played >= self.chaining.reaction_frames)
         return outdated | redirected | (self.played >= self.plan_frames - self.chaining.blend_frames)
 
     def _replan(self, some: Int[np.ndarray, "some"]) -> None:
         """Replan for some of the animals and blend their new plans in."""
-        plan, self.goal[some], self.blocked[some] = self._draw_plans(some)
+        intent = self._intent(some)
+        plan, self.goal[some], self.blocked[some] = self._draw_plans(some, intent)
+        left = np.isfinite(intent[..., 0]).sum(1)
+        self.intent_end[some] = np.where(left, left, self.plan_frames)
         for mine, animal in enumerate(some):
             remaining = animal, slice(self.played[animal], None)
             old = PoseFrames(self.plan.root[remaining], self.plan.bones[remaining])
@@ -195,10 +205,31 @@ class AnimalBatch:
             self.plan.root[animal], self.plan.bones[animal] = new.root, new.bones
         self.played[some], self.planned_others[some] = 0, self._others_now()[some]
 
+    def _intent(self, some: Int[np.ndarray, "some"]) -> Float[np.ndarray, "some frame 3"]:
+        """Return where animals with companions intend to be: what is left of their plans, moved with the
+        companion that the goal is beside. NaN after the horizon, without companions, when commanded, and
+        where the observer has moved, to whom animals react anew.
+        """
+        others, then = self._others_now()[some, 1:], self.planned_others[some, 1:]
+        intent = np.full((len(some), self.plan_frames, 3), np.nan)
+        remaining = self.intent_end - self.played
+        free = np.isnan(self.goal_command).any(1) & ~self._moved_noticeably()[:, 0]
+        intending = free & (remaining > self.chaining.blend_frames) & (others.size > 0)
+        for row in np.flatnonzero(intending[some]):
+            animal, left = some[row], int(remaining[some[row]])
+            path = self.plan.root[animal, self.played[animal] :, :3, 3]
+            path = np.concatenate([path, np.repeat(path[-1:], self.played[animal], axis=0)])[:left]
+            away = np.nan_to_num(np.linalg.norm(then[row] - self.goal[animal], axis=-1), nan=np.inf)
+            moved = (others - then)[row, away.argmin()] if away.min() < BESIDE_M else np.zeros(3)
+            intent[row, :left] = path + moved * (np.arange(left) / left)[:, None]
+        return intent
+
     def _draw_plans(
-        self, some: Int[np.ndarray, "some"]
+        self, some: Int[np.ndarray, "some"], intent: Float[np.ndarray, "some frame 3"] | None = None
     ) -> tuple[PoseFrames, Float[np.ndarray, "some 3"], Float[np.ndarray, "some"]]:
-        """Draw plans for some of the animals; of blocked ones, the least blocked of several candidates."""
+        """Draw plans for some of the animals: of several candidates the least blocked, and of those the
+        nearest to the ``intent``; without one, the first unless it is blocked.
+        """
         root, channels = (
             np.concatenate([getattr(frame, name) for frame in self.past], axis=1)[some]
             for name in ("root", "bones")
@@ -211,11 +242,14 @@ class AnimalBatch:
         boneless = observation.boneless(self.sampler.scaling.body_mean)
         self.plans_drawn += len(some)
         commanded = rigid.apply(rigid.inverse(frame), self.goal_command[some][:, None])[:, 0]
-        goal, path, blocked = self._least_blocked(boneless, frame, video, 1, commanded)
+        intent = np.full((len(some), 1, 3), np.nan) if intent is None else intent
+        count = self.chaining.candidates if np.isfinite(intent).any() else 1
+        goal, path, blocked = self._least_blocked(boneless, frame, video, count, commanded, intent)
         again = np.flatnonzero(blocked)
         if len(again) and self.chaining.candidates > 1:
             count, where = self.chaining.candidates - 1, None if video is None else video[again]
-            others = self._least_blocked(boneless[again], frame[again], where, count, commanded[again])
+            seen, wanted = boneless[again], intent[again]
+            others = self._least_blocked(seen, frame[again], where, count, commanded[again], wanted)
             better = others[2] < blocked[again]
             for mine, other in zip((goal, path, blocked), others, strict=True):
                 mine[again[better]] = other[better]
@@ -257,8 +291,9 @@ class AnimalBatch:
         video: Int[np.ndarray, "some"] | None,
         count: int,
         commanded: Float[np.ndarray, "some 3"],
+        intent: Float[np.ndarray, "some intended 3"],
     ) -> tuple[Float[np.ndarray, "some 3"], Float[np.ndarray, "some frame 3"], Float[np.ndarray, "some"]]:
-        """Return goal, path and blocked share of the least blocked of ``count`` candidates per observation.
+        """Return goal, path and blocked share of the best of ``count`` candidates per observation.
 
         ``commanded`` goals (meters, ego frame) replace sampled ones where they are not NaN.
         """
@@ -269,7 +304,10 @@ class AnimalBatch:
         paths = self.sampler.paths(codes, goals, self.sampling, self.rng)
         world = rigid.apply(np.repeat(frame, count, axis=0), paths).reshape(len(frame), count, -1, 3)
         blocked = self.scenes.inside_solid(world, video).mean(-1)
-        best = np.arange(len(frame)) * count + blocked.argmin(1)
+        off = np.linalg.norm(world[:, :, : intent.shape[1]] - intent[:, None], axis=-1)
+        off = np.nan_to_num(off).mean(-1)
+        nearest = np.where(blocked == blocked.min(1, keepdims=True), off, np.inf).argmin(1)
+        best = np.arange(len(frame)) * count + nearest
         return goals[best], paths[best], blocked.min(1)
 
 

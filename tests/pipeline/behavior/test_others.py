@@ -221,3 +221,75 @@ def test_external_companions_are_perceived_and_avoided(sampler):
             animals.step(far, standing(obstacle + np.array([moved_m, 0.0, 0.0])))
         drawn.append(animals.plans_drawn)
     assert drawn == [1, 2], "who has moved is planned for anew"
+
+
+def beside_a_companion(sampler):
+    """One animal and a companion at its goal in an empty room; the function moves the companion."""
+    volume = room()
+    scenes = Scenes((volume,), (np.ones_like(volume.occupancy, bool),), np.zeros(1, int))
+    sampling = PlanSamplingConfig(goal_steps=4, sequence_steps=2)
+    animals = AnimalBatch(sampler, scenes, REST, "yaw", sampling=sampling, chaining=ReplanningConfig())
+    context, _ = wandering().windows(np.array([0]))
+    context = replace(context, video=None, observer_world=np.full((1, PAST, 3), ABSENT_M))
+    goal = context.world_from_agent[0, -1, :3, 3] + np.array([1.0, 0.0, 0.0])
+
+    def at(offset):
+        return as_companions(np.repeat((goal + offset)[None, None], PAST, 1))[None]
+
+    animals.begin(context, np.random.default_rng(0), companions=at(0.0))
+    animals.goal[0] = goal
+    return animals, at
+
+
+def test_intent_moves_with_the_companion_at_the_goal_and_ends_with_the_horizon(sampler):
+    animals, at = beside_a_companion(sampler)
+    first, far, moved = np.array([0]), np.full((1, 3), ABSENT_M), np.array([0.1, 0.0, 0.2])
+    for _ in range(5):
+        animals.step(far, at(moved))
+    left = animals.plan_frames - 5
+    intent, rest = animals._intent(first)[0], animals.plan.root[0, 5:, :3, 3]
+    assert np.isnan(intent[left:]).all()
+    np.testing.assert_allclose(intent[:left], rest + moved * (np.arange(left) / left)[:, None])
+    animals.goal[0] += 2.0
+    np.testing.assert_allclose(animals._intent(first)[0, :left], rest)
+    animals.observer[-1][0] += ABSENT_M
+    assert np.isnan(animals._intent(first)).all(), "the observer has moved"
+    animals.observer[-1][0] = ABSENT_M
+    animals.command(np.ones((1, 3)))
+    assert np.isnan(animals._intent(first)).all(), "commanded"
+    animals.command(np.full((1, 3), np.nan))
+    animals.played[0] = animals.plan_frames - animals.chaining.blend_frames
+    assert np.isnan(animals._intent(first)).all(), "its horizon has passed"
+    animals.played[0], animals.companions = 5, None
+    assert np.isnan(animals._intent(first)).all(), "alone"
+
+
+def test_replanning_keeps_the_intent_until_the_horizon_of_the_first_plan(sampler):
+    animals, at = beside_a_companion(sampler)
+    far, ends = np.full((1, 3), ABSENT_M), []
+    for frame in range(animals.plan_frames + 10):
+        animals.step(far, at(np.array([0.05 * frame, 0.0, 0.0])))
+        if animals.played[0] == 1:
+            ends.append((frame, animals.intent_end[0]))
+    horizon = animals.plan_frames
+    kept = [frame + end for frame, end in ends if frame < horizon - animals.chaining.blend_frames]
+    assert len(kept) > 2 and set(kept) == {horizon}
+    assert ends[-1][0] + ends[-1][1] > horizon
+
+
+def test_candidate_nearest_to_the_intent_is_followed(sampler):
+    animals, _ = beside_a_companion(sampler)
+    context, _ = wandering().windows(np.array([0]))
+    seen, frame = observe(context, animals.scenes, REST, "yaw"), np.eye(4)[None]
+    none, free = np.full((1, 1, 3), np.nan), np.full((1, 3), np.nan)
+
+    def drawn(intent):
+        animals.rng = np.random.default_rng(1)
+        return animals._least_blocked(seen, frame, None, 8, free, intent)[1]
+
+    codes, rng = sampler.codes(seen, animals.sampling, 8), np.random.default_rng(1)
+    each = sampler.paths(codes, sampler.goals(codes, animals.sampling, rng), animals.sampling, rng)
+    assert np.ptp(each[:, -1], axis=0).max() > 1e-2, "meters"
+    np.testing.assert_array_equal(drawn(none)[0], each[0])
+    for path in each:
+        np.testing.assert_array_equal(drawn(path[None].astype(float))[0], path)

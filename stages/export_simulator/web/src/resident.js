@@ -19,6 +19,7 @@ const NOTICE_TICKS = 20; // how long is shown that it noticed the person
 // a click on furniture counts where a recorded root was this near, level and upright
 const BEEN_M = [0.45, 0.12];
 const AVOID_TICKS = 12; // so far ahead a plan is checked for the bodies of others
+const BESIDE_M = 1.5; // of another: a goal that near moves with it
 const APPROACH_M = 0.002; // per tick, towards a body that is too near already: paths are not smoother
 const SEEN_TICKS = 16; // of the person, remembered
 export const COLORS = [0xc8722b, 0x8a5aa8, 0x3f8f8a, 0xb04a5a]; // of animals on the map and in outlines
@@ -89,6 +90,7 @@ export class Resident {
     this.place = moment.frames.at(-1).slice(0, 3);
     this.stops = new Stops();
     this.route = null;
+    this.intentEnd = 0;
     this.epoch = (this.epoch ?? 0) + 1;
     if (this.clip) this.replay(this.clip.name === moment.clip.name ? moment.last : this.count - 1);
   }
@@ -229,13 +231,14 @@ export class Resident {
     this.urgent = false;
     const epoch = this.epoch;
     const start = Math.floor(home.now);
+    const intent = this.intent(start);
     this.planStart = home.now;
     this.noticed = this.pose;
     this.company = new Map(this.others.map((other) => [other, [...other.place]]));
     const stop = this.stops.next;
     let plan;
     try {
-      plan = await planner.plan(this.question({ seed: home.state.seed * 1009 + this.turnNumber++ }));
+      plan = await planner.plan(this.question({ intent, seed: home.state.seed * 1009 + this.turnNumber++ }));
     } catch (error) {
       if (epoch === this.epoch) throw error;
       return null;
@@ -243,11 +246,32 @@ export class Resident {
     if (epoch !== this.epoch) return null;
     this.waiting = false;
     this.timeline.follow(start, plan.frames, home.now);
+    this.goal = plan.goals[plan.chosen];
+    if (!intent) this.intentEnd = start + plan.frames.length;
     if (plan.cleared) this.stops.clear(stop, plan.cleared);
     this.overlays.show(plan);
     this.ghost.pose(plan.frames.at(-1), this.contract.scene.floor_m);
     this.milliseconds = plan.milliseconds;
     return plan;
+  }
+
+  // Where an animal beside others intends to be from a tick on: what is left of its plan, moved with the one that
+  // its goal is beside. Others move all the time; without it, every plan would have a goal of its own. null
+  // after the plan's horizon, for a visitor's command, where the visitor has moved, and for an animal that is alone.
+  intent(start) {
+    const left = this.intentEnd - start;
+    const { blend_frames: fade } = this.contract.replanning;
+    if (!this.others.length || !this.timeline.plans.length || !(left > fade)) return null;
+    if (this.stops.next || this.route || !this.goal || this.personMoved) return null;
+    const [nearest] = [...(this.company ?? [])].sort(
+      ([, a], [, b]) => distance(a, this.goal) - distance(b, this.goal),
+    );
+    const beside = nearest && distance(nearest[1], this.goal) < BESIDE_M;
+    const moved = [0, 1, 2].map((axis) => (beside ? nearest[0].place[axis] - nearest[1][axis] : 0));
+    return Array.from({ length: left }, (_, i) => {
+      const place = rootOf(this.timeline.at(start + i + 1)).slice(0, 3);
+      return place.map((value, axis) => value + (moved[axis] * i) / left);
+    });
   }
 
   notice() {

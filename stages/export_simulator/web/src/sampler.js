@@ -15,7 +15,8 @@ import {
   scaledGoal,
 } from './path_encoding.js';
 
-const CANDIDATES = 4; // paths drawn at most, of which the first that stays in the room is taken
+// paths drawn at most; of those that stay in the room, the one nearest to what the animal intends is taken
+const CANDIDATES = 4;
 const SOONEST = 6; // frames that a visitor's goal leaves at least
 // a clicked goal further away than this, in deviations of learned goals, is approached in legs
 const FURTHEST = 2;
@@ -277,7 +278,7 @@ export class Sampler {
     const goals = this.goalsInWorld(frame, scaled);
     const tried = commanded
       ? Array(Math.min(CANDIDATES, question.samples)).fill(0)
-      : this.insideFirst(goals).slice(0, CANDIDATES);
+      : this.insideFirst(goals, question.intent?.at(-1)).slice(0, CANDIDATES);
     const targets = Float32Array.from(
       tried.flatMap((index) => Array.from(scaled.subarray(3 * index, 3 * index + 3))),
     );
@@ -295,7 +296,7 @@ export class Sampler {
           scaled,
           question.raised,
         );
-    const best = this.firstInside(frame, paths);
+    const best = this.bestInside(frame, paths, question.intent ?? []);
     const path = this.constrained(
       frame,
       codes.start,
@@ -308,10 +309,12 @@ export class Sampler {
     return { goals, chosen: tried[best], ...lived, cleared: arrives ? lived.path.at(-1) : null };
   }
 
-  // The numbers of goals, those that lie in the allowed space first, otherwise as sampled.
-  insideFirst(goals) {
+  // The numbers of goals, those that lie in the allowed space first, then those nearest to where the animal
+  // intends to end, otherwise as sampled.
+  insideFirst(goals, end) {
     const inside = goals.map((goal) => this.senses.allows(goal));
-    return goals.map((_, i) => i).sort((a, b) => inside[b] - inside[a] || a - b);
+    const off = goals.map((goal) => (end ? distance(goal, end) : 0));
+    return goals.map((_, i) => i).sort((a, b) => inside[b] - inside[a] || off[a] - off[b] || a - b);
   }
 
   // A visitor's goal binds: bend a scaled path so that it is there (on the floor plan) when a walk at the
@@ -380,14 +383,18 @@ export class Sampler {
     };
   }
 
-  // The first path of those that leave the allowed space least.
-  firstInside(frame, paths) {
+  // Of the paths that leave the allowed space least, the one nearest to the intended places, world, or the first.
+  bestInside(frame, paths, intent) {
     const length = 3 * this.frames;
     const scores = Array.from({ length: paths.length / length }, (_, i) => {
-      const places = this.positions(paths.subarray(i * length, (i + 1) * length));
-      return places.filter((place) => !this.senses.allows(apply(frame, place))).length;
+      const places = this.positions(paths.subarray(i * length, (i + 1) * length)).map((place) =>
+        apply(frame, place),
+      );
+      const outside = places.filter((place) => !this.senses.allows(place)).length;
+      const off = intent.reduce((sum, place, frames) => sum + distance(places[frames], place), 0);
+      return { i, outside, off };
     });
-    return scores.indexOf(Math.min(...scores));
+    return scores.sort((a, b) => a.outside - b.outside || a.off - b.off || a.i - b.i)[0].i;
   }
 
   // Over many plans small errors of height add up: keep the root between the heights that recordings know.
