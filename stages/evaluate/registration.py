@@ -56,8 +56,8 @@ def root_metrics(
     metrics.put(f"{name}/agent_root_deg_median", median(all_errors.degrees), REFUSED)
     metrics.put(f"{name}/agent_root_m_p90", percentile(all_errors.meters, 90), REFUSED_TENTH)
     given = np.isfinite(all_errors.degrees)
-    known = np.concatenate(placed) if placed else given
-    metrics.put(f"{name}/agent_flips_share", mean(all_errors.degrees[given] > FLIPPED_DEG))
+    known = np.concatenate(placed) & given if placed else given
+    metrics.put(f"{name}/agent_flips_share", mean(all_errors.degrees[known] > FLIPPED_DEG))
     metrics.put(f"{name}/agent_placed_share", mean(known))
     return metrics
 

@@ -288,3 +288,14 @@ def test_one_episode_alone_has_no_interval():
     found.put_mean("goal", bootstrapped(np.arange(5.0), np.zeros(5, int), np.random.default_rng(0)))
     assert found.values == {"goal": 2.0, "goal_ci95_low": None, "goal_ci95_high": None}
     assert "one episode" in found.reasons["goal_ci95_low"]
+
+
+def test_only_placed_roots_count_as_flipped():
+    truth = np.tile(np.eye(4), (6, 1, 1))
+    ours = truth.copy()
+    ours[:2, :3, :3] = np.diag([-1.0, 1.0, -1.0])
+    ours[5] = np.nan
+    placed = np.array([False, True, True, True, True, True])
+    found = registration.root_metrics("here", [pose_errors(ours, truth)], [placed]).values
+    assert found["here/agent_flips_share"] == 1 / 4
+    assert found["here/agent_placed_share"] == 4 / 6
