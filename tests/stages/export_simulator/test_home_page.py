@@ -62,6 +62,27 @@ def test_animals_perceive_each_other_as_in_python(home: Path, animals: Path, chr
         assert wrong == []
 
 
+def test_plan_nearest_to_the_intent_is_taken(home: Path, chromium: Browser) -> None:
+    with browser.shown(chromium, (home / "index.html").as_uri()) as (page, wrong):
+        page.wait_for_function(ALL_PLAN, timeout=60_000)
+        page.evaluate("ats.pause()")
+        goals = np.array(page.evaluate("ats.plan().then((plan) => plan.goals)"))
+        assert np.ptp(goals, axis=0).max() > 0.2, "meters"
+        ends = []
+        for goal in goals[:4]:
+            plan = page.evaluate(
+                "(goal) => ats.plan({ intent: Array(56).fill(goal) }).then(({ goals, chosen, path }) =>"
+                " ({ goals, chosen, end: path.at(-1) }))",
+                goal.tolist(),
+            )
+            np.testing.assert_allclose(plan["goals"], goals, atol=1e-6)
+            off = np.linalg.norm(goals - goal, axis=1)
+            assert off[plan["chosen"]] <= np.sort(off)[3] + 1e-6, "one of the four nearest goals"
+            ends.append(plan["end"])
+        assert np.ptp(np.array(ends), axis=0).max() > 0.1, "meters"
+        assert wrong == []
+
+
 def _check_goals(page: Page, home: Path, cat: Path) -> None:
     """Goals beside a companion with the same noise equal those of Python, and shift away from it."""
     met = twins.approaches(BehaviorData.load(cat / "behavior_data"), 20, np.random.default_rng(0))
