@@ -88,5 +88,7 @@ class ReplanningConfig:
     agent; infinite: never."""
     blend_frames: int = 4
     """Frames over which the next plan is blended in."""
+    companion_radius_m: float = 1.5
+    """Distance from another animal within which a goal moves with it: at rest they are up to 1.1 m apart."""
     candidates: int = 8
     """Maximum number of plans drawn, of which the least blocked is taken."""

@@ -51,8 +51,6 @@ class PoseFrames:
 
 GOAL_CHANGE_M = 0.3
 """Distance between commanded and planned goal from which a steered animal replans."""
-BESIDE_M = 1.5
-"""Distance from another animal within which a goal moves with it: at rest they are up to 1.1 m apart."""
 
 
 class AnimalBatch:
@@ -212,15 +210,17 @@ class AnimalBatch:
         """
         others, then = self._others_now()[some, 1:], self.planned_others[some, 1:]
         intent = np.full((len(some), self.plan_frames, 3), np.nan)
+        if not others.size:
+            return intent
         remaining = self.intent_end - self.played
         free = np.isnan(self.goal_command).any(1) & ~self._moved_noticeably()[:, 0]
-        intending = free & (remaining > self.chaining.blend_frames) & (others.size > 0)
-        for row in np.flatnonzero(intending[some]):
+        for row in np.flatnonzero((free & (remaining > self.chaining.blend_frames))[some]):
             animal, left = some[row], int(remaining[some[row]])
-            path = self.plan.root[animal, self.played[animal] :, :3, 3]
-            path = np.concatenate([path, np.repeat(path[-1:], self.played[animal], axis=0)])[:left]
             away = np.nan_to_num(np.linalg.norm(then[row] - self.goal[animal], axis=-1), nan=np.inf)
-            moved = (others - then)[row, away.argmin()] if away.min() < BESIDE_M else np.zeros(3)
+            attached = away.min() < self.chaining.companion_radius_m
+            moved = (others - then)[row, away.argmin()] if attached else np.zeros(3)
+            frame = (self.played[animal] + np.arange(left)).clip(max=self.plan_frames - 1)
+            path = self.plan.root[animal, frame, :3, 3]
             intent[row, :left] = path + moved * (np.arange(left) / left)[:, None]
         return intent
 

@@ -19,7 +19,6 @@ const NOTICE_TICKS = 20; // how long is shown that it noticed the person
 // a click on furniture counts where a recorded root was this near, level and upright
 const BEEN_M = [0.45, 0.12];
 const AVOID_TICKS = 12; // so far ahead a plan is checked for the bodies of others
-const BESIDE_M = 1.5; // of another: a goal that near moves with it
 const APPROACH_M = 0.002; // per tick, towards a body that is too near already: paths are not smoother
 const SEEN_TICKS = 16; // of the person, remembered
 export const COLORS = [0xc8722b, 0x8a5aa8, 0x3f8f8a, 0xb04a5a]; // of animals on the map and in outlines
@@ -260,13 +259,13 @@ export class Resident {
   // after the plan's horizon, for a visitor's command, where the visitor has moved, and for an animal that is alone.
   intent(start) {
     const left = this.intentEnd - start;
-    const { blend_frames: fade } = this.contract.replanning;
+    const { blend_frames: fade, companion_radius_m: radius } = this.contract.replanning;
     if (!this.others.length || !this.timeline.plans.length || !(left > fade)) return null;
     if (this.stops.next || this.route || !this.goal || this.personMoved) return null;
     const [nearest] = [...(this.company ?? [])].sort(
       ([, a], [, b]) => distance(a, this.goal) - distance(b, this.goal),
     );
-    const beside = nearest && distance(nearest[1], this.goal) < BESIDE_M;
+    const beside = nearest && distance(nearest[1], this.goal) < radius;
     const moved = [0, 1, 2].map((axis) => (beside ? nearest[0].place[axis] - nearest[1][axis] : 0));
     return Array.from({ length: left }, (_, i) => {
       const place = rootOf(this.timeline.at(start + i + 1)).slice(0, 3);
