@@ -79,14 +79,11 @@ class PoseCheck:
 
     verdict: Verdict
     convention: Convention
-    pairs: int
-    """pairs of frames with enough motion between them"""
-    residual_m: float
-    """median over pairs of the median depth difference; NaN when nothing could be compared"""
-    overlap: float
-    tolerance_m: float
-    """allowed residual, which grows with depth"""
     reason: str
+    residual_m: float = np.nan
+    """median over pairs of the median depth difference; NaN when nothing could be compared"""
+    tolerance_m: float = TOLERANCE_M
+    """allowed residual, which grows with depth"""
 
 
 def odometry_from_pose(
@@ -112,18 +109,17 @@ def check_poses(
     """Find the convention, ``among`` the given ones, that poses follow; ``depth_view`` reads a depth map."""
     broken = "the recording has no device poses" if pose is None else _invalid_reason(pose)
     if pose is None or broken:
-        return PoseCheck("unusable", documented, 0, np.nan, np.nan, TOLERANCE_M, broken)
+        return PoseCheck("unusable", documented, broken)
     chosen = moving_pairs(odometry_from_pose(pose, documented), timestamp_s, POSE_PAIRS)
     if len(chosen) == 0:
-        reason = "the phone moved too little to test its poses"
-        return PoseCheck("untested", documented, 0, np.nan, np.nan, TOLERANCE_M, reason)
+        return PoseCheck("untested", documented, "the phone moved too little to test its poses")
     frames, position = np.unique(chosen, return_inverse=True)
     pairs_of_views, views = position.reshape(chosen.shape), [depth_view(frame) for frame in frames.tolist()]
     scores = {
         convention: _score(odometry_from_pose(pose[frames], convention), pairs_of_views, views)
         for convention in among
     }
-    check = _judge(scores, documented, len(chosen))
+    check = _judge(scores, documented)
     odometry = odometry_from_pose(pose[frames], check.convention)
     return replace(check, reason=check.reason + _unit_hint(odometry, pairs_of_views, views, check))
 
@@ -174,13 +170,12 @@ def moving_pairs(
     """Pick up to ``pairs`` frame pairs with time and motion between them, spread over the recording."""
     second = np.searchsorted(timestamp_s, timestamp_s + gap_s)
     first = np.flatnonzero(second < len(timestamp_s))
-    second = second[first]
-    relative = rigid.inverse(odometry_from_camera[first]) @ odometry_from_camera[second]
-    moved = (rigid.rotation_angle(np.eye(3), relative[:, :3, :3]) > MIN_TURN_RAD) | (
-        np.linalg.norm(relative[:, :3, 3], axis=1) > MIN_SHIFT_M
-    )
     if len(first) == 0:
         return np.zeros((0, 2), int)
+    second = second[first]
+    relative = rigid.inverse(odometry_from_camera[first]) @ odometry_from_camera[second]
+    moved = rigid.rotation_angle(np.eye(3), relative[:, :3, :3]) > MIN_TURN_RAD
+    moved |= np.linalg.norm(relative[:, :3, 3], axis=1) > MIN_SHIFT_M
     longest_s = max(gap_s - GAP_S[0] + GAP_S[1], GAP_FRAMES * float(np.median(np.diff(timestamp_s))))
     close = timestamp_s[second] - timestamp_s[first] <= longest_s
     usable = np.stack([first, second], axis=1)[moved & close]
@@ -197,12 +192,7 @@ def _score(
         rows.append(compare(views[first], views[second], second_from_first))
     residual_m, overlap, tolerance_m = np.array(rows).T
     accepted = (residual_m < tolerance_m) & (overlap > MIN_OVERLAP)
-    return _Score(
-        float(np.median(residual_m)),
-        float(np.median(overlap)),
-        float(np.median(tolerance_m)),
-        bool(accepted.mean() >= 0.5),
-    )
+    return _Score(*np.median(rows, axis=0).tolist(), accepted=bool(accepted.mean() >= 0.5))
 
 
 def compare(
@@ -217,29 +207,21 @@ def compare(
     difference = np.abs(points_second[:, 2] - measured)[measured > 0]
     if len(difference) < MIN_COMPARED:
         return np.inf, 0.0, TOLERANCE_M
-    typical_m = float(np.median(measured[measured > 0]))
-    return (
-        float(np.median(difference)),
-        len(difference) / len(points_first),
-        max(TOLERANCE_M, TOLERANCE_SHARE * typical_m),
-    )
+    tolerance_m = max(TOLERANCE_M, TOLERANCE_SHARE * float(np.median(measured[measured > 0])))
+    return float(np.median(difference)), len(difference) / len(points_first), tolerance_m
 
 
-def _judge(scores: dict[Convention, _Score], documented: Convention, pairs: int) -> PoseCheck:
+def _judge(scores: dict[Convention, _Score], documented: Convention) -> PoseCheck:
     """Keep the documented convention unless it is refuted and another one clearly fits."""
     score, best = scores[documented], min(scores, key=lambda convention: scores[convention].cost)
     verdict: Verdict = "documented"
-    chosen = documented
     if score.accepted:
         reason = "the documented convention explains the depth"
     elif scores[best].accepted and scores[best].cost < 0.5 * score.cost:
-        verdict = "other"
-        chosen = best
+        verdict, documented, score = "other", best, scores[best]
         reason = f"the documented convention is refuted by the depth; {best} explains it"
     elif score.residual_m < UNUSABLE_FACTOR * score.tolerance_m and score.overlap > MIN_OVERLAP:
         reason = "device poses explain the depth only roughly: they drift"
     else:
-        verdict = "unusable"
-        reason = "device poses do not explain the depth under any convention"
-    score = scores[chosen]
-    return PoseCheck(verdict, chosen, pairs, score.residual_m, score.overlap, score.tolerance_m, reason)
+        verdict, reason = "unusable", "device poses do not explain the depth under any convention"
+    return PoseCheck(verdict, documented, reason, score.residual_m, score.tolerance_m)

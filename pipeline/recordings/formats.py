@@ -81,11 +81,6 @@ def open_recording(path: Path) -> Recording:
     found = format_of(path)
     if found is None:
         raise InputError("CAP-003", "not a recording of a known format", str(path), f"known: {UNDERSTOOD}")
-    return _reader(found.reader)(path)
-
-
-def _reader(name: str) -> Callable[[Path], Recording]:
-    """Import a format's reader, only when needed: the planner does not need it."""
     from pipeline.recordings import (
         nerfcapture,
         plain_video,
@@ -97,7 +92,7 @@ def _reader(name: str) -> Callable[[Path], Recording]:
     )
 
     modules = (nerfcapture, plain_video, polycam, record3d, seven_scenes, stray_scanner, tum)
-    return next(module.open_recording for module in modules if module.__name__.endswith(f".{name}"))
+    return next(each for each in modules if each.__name__.endswith(f".{found.reader}")).open_recording(path)
 
 
 def scale_sources(folder: Path, video: Video, videos: Iterable[Video]) -> list[Video]:

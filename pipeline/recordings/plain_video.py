@@ -14,7 +14,6 @@ from pipeline.core.videos import VIDEO_SUFFIXES
 from pipeline.data import images
 from pipeline.recordings import text_files
 from pipeline.recordings.containers import FolderContainer
-from pipeline.recordings.conventions import OPENCV
 from pipeline.recordings.movies import Movie
 from pipeline.recordings.recording import (
     Recording,
@@ -65,7 +64,6 @@ def open_recording(path: Path) -> Recording:
         depth_size=size,
         read_color=movie.read,
         read_depth=lambda i: _depth(container, depth[i], size),
-        convention=OPENCV,
         quarter_turns=movie.quarter_turns,
         depth_camera=camera,
         remarks=remarks + camera_remarks + movie.remarks,

@@ -11,7 +11,6 @@ from jaxtyping import Float
 
 from pipeline.recordings import text_files
 from pipeline.recordings.containers import FolderContainer
-from pipeline.recordings.conventions import OPENCV
 from pipeline.recordings.depth_camera import DepthCamera
 from pipeline.recordings.recording import (
     Recording,
@@ -68,7 +67,6 @@ def open_recording(path: Path) -> Recording:
         depth_size=sizes[1],
         read_color=lambda i: container.read(files["color"][i]),
         read_depth=lambda i: container.meters(files["depth"][i], sizes[1]),
-        convention=OPENCV,
         depth_camera=camera,
         remarks=remarks + camera_remarks,
         listed=len(files["color"].keys() | files["depth"].keys()),

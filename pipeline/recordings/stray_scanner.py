@@ -14,7 +14,6 @@ from jaxtyping import Float, Int, UInt8
 from pipeline.core.errors import InputError
 from pipeline.recordings import text_files
 from pipeline.recordings.containers import FolderContainer
-from pipeline.recordings.conventions import OPENCV
 from pipeline.recordings.movies import Movie
 from pipeline.recordings.recording import (
     Y_UP,
@@ -85,7 +84,6 @@ def open_recording(path: Path) -> Recording:
         read_color=movie.read,
         read_depth=lambda i: _depth(container, depth[i], size),
         read_confidence=confident if confidence else None,
-        convention=OPENCV,
         up=Y_UP,
         remarks=movie.remarks,
         listed=max(len(movie), len(rows.frame)),

@@ -75,7 +75,6 @@ def open_recording(path: Path) -> Recording:
         depth_size=depth_size,
         read_color=lambda i: container.read(pairs[i][0]),
         read_depth=lambda i: container.meters(pairs[i][1], depth_size, per_meter),
-        convention=OPENCV,
         depth_camera=camera,
         remarks=remarks + scale_remarks + camera_remarks,
         listed=len(present),

@@ -20,7 +20,7 @@ from pipeline.mapping import plane_sweep, sift
 from pipeline.mapping.colmap import SparseModel
 from pipeline.mapping.plane_sweep import SweepView
 from pipeline.recordings import extraction, upright
-from pipeline.recordings.conventions import OPENCV, TOLERANCE_M, PoseCheck
+from pipeline.recordings.conventions import OPENCV, PoseCheck
 from pipeline.recordings.extraction import ExtractedFrame, ExtractionPlan, choose_frames
 from pipeline.recordings.recording import Recording
 from stages.extract_frames import scaling, structure
@@ -193,7 +193,6 @@ def _plan(
     rows = solved.sparse.frame
     intrinsics = cameras.turn_intrinsics(solved.intrinsics, size, turns)
     depth_intrinsics = [cameras.turn_intrinsics(view.intrinsics, view.gray.shape, turns) for view in views]
-    reason = "poses and depth from the pictures alone"
     return ExtractionPlan(
         chosen=rows,
         timestamp_s=recording.timestamp_s[rows],
@@ -203,7 +202,7 @@ def _plan(
         odometry_from_camera=cameras.turn_camera(world_from_camera, turns),
         gravity_known=False,
         quarter_turns=turns,
-        pose_check=PoseCheck("untested", OPENCV, 0, np.nan, np.nan, TOLERANCE_M, reason),
+        pose_check=PoseCheck("untested", OPENCV, "poses and depth from the pictures alone"),
         scale=scale,
         incomplete=recording.incomplete,
     )
