@@ -21,8 +21,9 @@ MARGIN_M = 0.03
 """a surface this far plus four standard deviations of depth noise behind a point proves free space"""
 LATERAL_ERROR_M = 0.015
 """tolerated pose error across the line of sight"""
-VIEW_MARGIN = 0.6
-"""a reference votes if a probe projects within this share of the picture from its middle"""
+VIEW_MARGIN, VIEW_PROBES, NOISE_PROBES = 0.6, 96, 800
+"""a reference votes if a probe projects within this share of the picture from its middle; number of probes;
+number of pixels per picture from which noise is measured"""
 SIGMAS = 4.0
 """standard deviations of depth noise that are significant"""
 NEAREST_M = 0.1
@@ -142,17 +143,18 @@ def measure_noise(
     depth: Float[np.ndarray, "reference height width"],
     camera_from_world: Float[np.ndarray, "reference 4 4"],
     intrinsics: Float[np.ndarray, "reference 3 3"],
-    probes: int = 800,
 ) -> DepthNoise:
-    """Fit the depth noise to differences between overlapping depth pictures.
+    """Fit the depth noise to differences of each other picture from the next and from one a fifth later.
 
     A robust deviation (1.48 times the median) per half meter of range, then non-negative least squares. The
     default if too little overlaps.
     """
     ranges, errors = [], []
-    for first, second in _pairs(len(depth)):
+    count, later = len(depth), max(2, len(depth) // 5)
+    pairs = [(a, a + gap) for a in range(0, count - 1, 2) for gap in (1, later) if a + gap < count]
+    for first, second in pairs:
         inner = cv2.erode((depth[first] > 0).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-        chosen = np.flatnonzero(inner)[:: max(1, int(inner.sum()) // probes)]
+        chosen = np.flatnonzero(inner)[:: max(1, int(inner.sum()) // NOISE_PROBES)]
         rows, columns = np.unravel_index(chosen, inner.shape)
         rays = cameras.unproject(cameras.pixel_centers(rows, columns), intrinsics[first])
         points = rays * depth[first][rows, columns][:, None]
@@ -171,12 +173,6 @@ def measure_noise(
     sigma = np.array([MAD_TO_SIGMA * float(np.median(error[own])) for own in bins])
     (constant, quadratic), _ = scipy.optimize.nnls(np.stack([np.ones_like(middle), middle**2], axis=1), sigma)
     return DepthNoise(max(float(constant), MIN_NOISE_M), float(quadratic))
-
-
-def _pairs(count: int) -> list[tuple[int, int]]:
-    """Pair pictures with the next one and with one a fifth of the recording later."""
-    later = max(2, count // 5)
-    return [(a, a + gap) for a in range(0, count - 1, 2) for gap in (1, later) if a + gap < count]
 
 
 def masked(references: References, hidden: Callable[[int], Bool[np.ndarray, "height width"]]) -> References:
@@ -209,10 +205,10 @@ def vote(
 
 
 def _in_view(
-    references: References, points_world: Float[np.ndarray, "point 3"], probes: int = 96
+    references: References, points_world: Float[np.ndarray, "point 3"]
 ) -> Bool[np.ndarray, "reference"]:
     """Return which references have some of the points in view, or nearly so."""
-    chosen = points_world[:: max(1, len(points_world) // probes)].astype(float)
+    chosen = points_world[:: max(1, len(points_world) // VIEW_PROBES)].astype(float)
     points_camera = rigid.apply(references.camera_from_world, chosen[None])
     pixel, depth = cameras.project(points_camera, references.intrinsics[:, None])
     share = pixel / references.depth.shape[:0:-1]

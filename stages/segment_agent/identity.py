@@ -44,8 +44,6 @@ COHERENT = 0.85
 """mean probability above which a connected component is one animal"""
 PLACEMENT = (0.15, 0.85)
 """range of the animal pixel's position in a crop, shares of its side"""
-MAX_SEED = 2**31
-"""upper bound of the seeds for initial weights"""
 MARGIN_PX = 80
 """margin kept around the animal of a portrait"""
 BLUR_PX = 0.4
@@ -61,11 +59,6 @@ class Portrait:
     animal: int
     color: UInt8[np.ndarray, "height width 3"]
     labels: UInt8[np.ndarray, "height width"]
-
-    def classes(self) -> Int[np.ndarray, "height width"]:
-        """Return the class of each pixel."""
-        found = np.where(self.labels == 255, self.animal + 1, BACKGROUND)
-        return np.where(self.labels == 128, IGNORED, found)
 
 
 def save_portraits(folder: Path, portraits: Sequence[Portrait]) -> None:
@@ -168,7 +161,7 @@ def learn_identities(
 ) -> Identities:
     """Train the network on portraits of every animal."""
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(rng.integers(MAX_SEED)))
+        torch.manual_seed(int(rng.integers(2**31)))
         network = Identities(names)
     optimizer = torch.optim.AdamW(network.parameters(), RATE, weight_decay=WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=config.steps)
@@ -233,16 +226,17 @@ def _random_crop(
     portrait: Portrait, side: int, rng: np.random.Generator
 ) -> tuple[UInt8[np.ndarray, "side side 3"], Int[np.ndarray, "side side"]]:
     """Return a randomly scaled square crop of a portrait that contains a pixel of the animal."""
-    classes = portrait.classes()
+    classes = np.where(portrait.labels == 255, portrait.animal + 1, BACKGROUND)
+    classes = np.where(portrait.labels == 128, IGNORED, classes).astype(np.int16)
     inside = np.argwhere(classes > BACKGROUND)
     row, column = inside[rng.integers(len(inside))] if len(inside) else np.array(classes.shape) // 2
     scale = float(np.exp(rng.uniform(*np.log(SCALE_RANGE))))
     shift = rng.uniform(*PLACEMENT, 2) * side
     map_to = np.array([[1 / scale, 0, column - shift[0] / scale], [0, 1 / scale, row - shift[1] / scale]])
     linear, nearest = (how | cv2.WARP_INVERSE_MAP for how in (cv2.INTER_LINEAR, cv2.INTER_NEAREST))
-    source, target, size = portrait.color, classes.astype(np.int16), (side, side)
+    source, size = portrait.color, (side, side)
     if scale < 1:
         source = cv2.GaussianBlur(source, (0, 0), BLUR_PX / scale)
     color = cv2.warpAffine(source, map_to, size, flags=linear, borderMode=cv2.BORDER_REPLICATE)
-    labels = cv2.warpAffine(target, map_to, size, flags=nearest, borderValue=(IGNORED,))
+    labels = cv2.warpAffine(classes, map_to, size, flags=nearest, borderValue=(IGNORED,))
     return color, labels.astype(np.int64)

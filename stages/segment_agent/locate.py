@@ -44,8 +44,7 @@ def find_mover(
             _candidates(clip, frame, pose, references, animal, (appearance, margin_of), share)
             for frame, pose in enumerate(world_from_camera)
         ]
-        choice = movers.track(found, clip.timestamp_s, animal, prompt)
-        chosen = [group[index] if index >= 0 else None for group, index in zip(found, choice, strict=True)]
+        chosen = movers.track(found, clip.timestamp_s, animal, prompt)
         seen = np.array([candidate is not None for candidate in chosen])
         if appearance is not None:
             reliable = seen
@@ -73,8 +72,7 @@ def fill_gaps(spheres: list[Sphere | None], timestamp_s: Float[np.ndarray, "fram
         return spheres
     centers = np.stack([spheres[frame].center_world for frame in seen])
     guess = np.stack([np.interp(timestamp_s, timestamp_s[seen], axis) for axis in centers.T], axis=1)
-    after = np.minimum(np.searchsorted(seen, np.arange(len(spheres))), len(seen) - 1)
-    wait = np.abs(timestamp_s - timestamp_s[seen[[np.maximum(after - 1, 0), after]]]).min(0)
+    wait = np.abs(timestamp_s[:, None] - timestamp_s[seen]).min(1)
     radius = spheres[seen[0]].radius_m
     return [
         sphere or (Sphere(guess[frame], radius, presumed=True) if wait[frame] < movers.PRESUMED_S else None)

@@ -24,12 +24,11 @@ from stages.segment_agent.movers import PlacedPrompt
 from stages.segment_agent.overlap import Subject
 from stages.segment_agent.people import People
 from stages.segment_agent.prompts import Prompt
-from stages.segment_agent.refine import ColorHistogram
 from stages.segment_agent.resting import find_resting, is_resting
-from stages.segment_agent.segmenter import Mask, Segmenter, learn_color_histogram
+from stages.segment_agent.segmenter import Mask, Segmenter, with_color_histogram
 from stages.segment_agent.trajectory import CameraPath, estimate_trajectory
 from stages.segment_agent.turnaround import EDGES, axes_focus, find_standing
-from stages.segment_agent.windows import Sphere, project_sphere, working_size
+from stages.segment_agent.windows import Sphere, project_sphere, tracked, working_size
 
 POSITIVES_PER_NEGATIVE = 3
 """ratio of training pictures with the animal to those without it"""
@@ -114,8 +113,7 @@ def _standing_segmenter(
     """Prepare the masks of a turnaround: what stands on the ground where the optical axes meet."""
     focus = axes_focus(poses) if placed is None else placed.center_world
     spheres, evidence_of = find_standing(clip, poses, focus)
-    segmenter = Segmenter(clip, poses, spheres, evidence_of, config.height_px, ColorHistogram(), EDGES)
-    return replace(segmenter, appearance=learn_color_histogram(segmenter))
+    return with_color_histogram(Segmenter(clip, poses, spheres, evidence_of, config.height_px, edges=EDGES))
 
 
 def _session_segmenter(
@@ -129,12 +127,11 @@ def _session_segmenter(
     """Prepare the masks of a session: by motion, from which appearance is learned, then by both."""
     spheres = find_mover(clip, poses, references, config.animal, placed)
     evidence_of, resting = motion_evidence(references), None
-    held = any(_certain(sphere) for sphere in spheres)
+    held = tracked(spheres).any()
     if placed is not None and (not held or is_resting(clip, poses, references, placed)):
         spheres, resting = find_resting(clip, poses, placed, config.height_px, rng)
         evidence_of = resting
-    segmenter = Segmenter(clip, poses, spheres, evidence_of, config.height_px, ColorHistogram())
-    segmenter = replace(segmenter, appearance=learn_color_histogram(segmenter))
+    segmenter = with_color_histogram(Segmenter(clip, poses, spheres, evidence_of, config.height_px))
     network = learn_appearance(segmenter, references, config, rng)
     if network is None:
         return segmenter
@@ -177,7 +174,8 @@ def learn_appearance(
 
     None if the animal is never seen, or recall is too low.
     """
-    seen = np.array([frame for frame, sphere in enumerate(segmenter.spheres) if _certain(sphere)])
+    certain = tracked(segmenter.spheres)
+    seen, empty = np.flatnonzero(certain), np.flatnonzero(~certain).tolist()
     if not len(seen):
         return None
     chosen = seen[subsampling.evenly(len(seen), config.learning.examples, rounded=True)]
@@ -189,7 +187,6 @@ def learn_appearance(
             unsure = (labels == 0) & sought & (known.recognized(frame) > 0)
             labels = np.where(unsure, np.uint8(128), labels)
         shown.append(Example(segmenter.working_picture(frame), labels))
-    empty = [frame for frame, sphere in enumerate(segmenter.spheres) if not _certain(sphere)]
     room = [
         Example(segmenter.working_picture(frame), _label_room(segmenter, references, frame))
         for frame in empty[:: max(1, -(-len(empty) * POSITIVES_PER_NEGATIVE // len(shown)))]
@@ -215,10 +212,6 @@ def _label_room(
     return cv2.resize(near, size[::-1], interpolation=cv2.INTER_NEAREST) * np.uint8(128)
 
 
-def _certain(sphere: Sphere | None) -> bool:
-    return sphere is not None and not sphere.presumed
-
-
 def _finds_animal(network: Appearance, examples: list[Example]) -> bool:
     """Return whether the network's recall on its training examples is high enough."""
     shown = [
@@ -233,7 +226,7 @@ def occlusion_mask(segmenter: Segmenter, frame: int, network: Appearance) -> Boo
     """Mark where the animal, by its appearance, occludes the room; near its track, if it was seen to move."""
     color = segmenter.working_picture(frame)
     shown = network.log_odds(color) > 0
-    if _certain(segmenter.spheres[frame]):
+    if tracked(segmenter.spheres)[frame]:
         shown &= _window(segmenter, frame, color.shape[:2])
     return cv2.dilate(shown.astype(np.uint8), DILATION) > 0
 

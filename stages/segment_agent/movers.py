@@ -6,6 +6,7 @@ Viterbi algorithm over size, evidence and speed, globally over the recording.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -50,7 +51,7 @@ APPEAR_COST = 2.0
 """cost of leaving or entering the view, in full candidate scores"""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Candidate:
     """A connected group of points seen through by other frames."""
 
@@ -60,6 +61,9 @@ class Candidate:
     """95th percentile of the points' distances from the center"""
     probability: float = 1.0
     """mean probability of its points"""
+
+
+AnyCandidate = TypeVar("AnyCandidate", bound=Candidate)
 
 
 @dataclass(frozen=True)
@@ -124,12 +128,12 @@ def candidates(
 
 
 def track(
-    found: Sequence[Sequence[Candidate]],
+    found: Sequence[Sequence[AnyCandidate]],
     timestamp_s: Float[np.ndarray, "frame"],
     animal: AnimalConfig,
     prompt: PlacedPrompt | None = None,
-) -> Int[np.ndarray, "frame"]:
-    """Choose one candidate per frame (-1: none in view) by the Viterbi algorithm over scores and speeds.
+) -> list[AnyCandidate | None]:
+    """Choose one candidate per frame (None: out of view) by the Viterbi algorithm over scores and speeds.
 
     In its frame, a prompt outweighs everything else.
     """
@@ -144,7 +148,8 @@ def track(
         seconds = timestamp_s[index] - timestamp_s[index - 1]
         return -_transition(found[index - 1], found[index], seconds, animal)
 
-    return viterbi.viterbi_decode([-score for score in scores], change) - 1
+    states = viterbi.viterbi_decode([-score for score in scores], change)
+    return [group[state - 1] if state else None for group, state in zip(found, states, strict=True)]
 
 
 def connected_to_prompt(
@@ -154,28 +159,26 @@ def connected_to_prompt(
     prompt: PlacedPrompt,
 ) -> Bool[np.ndarray, "frame"]:
     """Return the frames of the track segment that contains the prompt; none if the track misses it."""
-    seen = np.array([frame for frame, candidate in enumerate(chosen) if candidate is not None], int)
     reliable = np.zeros(len(chosen), bool)
-    wait_s = np.abs(timestamp_s[seen] - timestamp_s[prompt.frame])
-    nearest = chosen[int(seen[wait_s.argmin()])] if len(seen) else None
-    if nearest is None or wait_s.min() > ABSENT_S or not _at_prompt(nearest, prompt):
-        return reliable
-    segment = split_track(chosen, seen, timestamp_s, animal)
-    reliable[seen[segment == segment[wait_s.argmin()]]] = True
+    wait_s = np.abs(timestamp_s - timestamp_s[prompt.frame])
+    own = min(segments(chosen, timestamp_s, animal), key=lambda frames: wait_s[frames].min(), default=None)
+    if own is not None and wait_s[own].min() <= ABSENT_S:
+        nearest = chosen[int(own[wait_s[own].argmin()])]
+        reliable[own] = nearest is not None and _at_prompt(nearest, prompt)
     return reliable
 
 
-def split_track(
-    chosen: Sequence[Candidate | None],
-    seen: Int[np.ndarray, "seen"],
-    timestamp_s: Float[np.ndarray, "frame"],
-    animal: AnimalConfig,
-) -> Int[np.ndarray, "seen"]:
-    """Number the segments of a track between absences and jumps."""
+def segments(
+    chosen: Sequence[Candidate | None], timestamp_s: Float[np.ndarray, "frame"], animal: AnimalConfig
+) -> list[Int[np.ndarray, "seen"]]:
+    """Return the frames of each segment of a track between absences and jumps."""
+    seen = np.array([frame for frame, candidate in enumerate(chosen) if candidate is not None], int)
+    if not len(seen):
+        return []
     gap_s = np.diff(timestamp_s[seen])
     apart_m = np.linalg.norm(np.diff([chosen[frame].center_world for frame in seen], axis=0), axis=1)
     jump = (gap_s > ABSENT_S) | (apart_m > JUMP_M + animal.speed_m_s * gap_s)
-    return np.cumsum(np.r_[False, jump])
+    return np.split(seen, np.flatnonzero(jump) + 1)
 
 
 def self_moving(
@@ -185,27 +188,20 @@ def self_moving(
 
     Things moved by people stay in place; edges that seem to move by misalignment are brief.
     """
-    seen = np.array([frame for frame, candidate in enumerate(chosen) if candidate is not None], int)
     reliable = np.zeros(len(chosen), bool)
-    if not len(seen):
-        return reliable
-    segment = split_track(chosen, seen, timestamp_s, animal)
-    for number in range(segment[-1] + 1):
-        own = seen[segment == number]
+    for own in segments(chosen, timestamp_s, animal):
         if timestamp_s[own[-1]] - timestamp_s[own[0]] < ABSENT_S:
             continue
         center = np.array([chosen[frame].center_world for frame in own])
         center = scipy.ndimage.median_filter(center, (5, 1), mode="nearest")
-        if np.linalg.norm(np.ptp(center, axis=0)) > TRAVEL_M:
-            reliable[own] = True
+        reliable[own] = np.linalg.norm(np.ptp(center, axis=0)) > TRAVEL_M
     return reliable
 
 
 def _at_prompt(candidate: Candidate, prompt: PlacedPrompt) -> bool:
     """Return whether a prompt lies at a candidate."""
-    return bool(
-        np.linalg.norm(candidate.center_world - prompt.center_world) < candidate.radius_m + PROMPT_SLACK_M
-    )
+    off_m = np.linalg.norm(candidate.center_world - prompt.center_world)
+    return bool(off_m < candidate.radius_m + PROMPT_SLACK_M)
 
 
 def _score(candidate: Candidate, animal: AnimalConfig) -> float:

@@ -46,8 +46,7 @@ def estimate(
         outside = locate.opened_motion(votes, movers.SURE_SHARES[0]) & (labels == 0) & (shown == "moving")
         missing.append(movers.candidates(outside, right, points, area_m2, animal))
     time_s = clip.timestamp_s[::EVERY]
-    choice = movers.track(missing, time_s, animal)
-    chosen = [group[index] if index >= 0 else None for group, index in zip(missing, choice, strict=True)]
+    chosen = movers.track(missing, time_s, animal)
     self_moving = movers.self_moving(chosen, time_s, animal)
     false_negative_m2 = [
         each.area_m2 if each and own else 0 for each, own in zip(chosen, self_moving, strict=True)

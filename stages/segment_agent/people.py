@@ -79,12 +79,10 @@ def find_people(
     scanned = [_upright(clip, frame, world_from_camera[frame], references) for frame in range(len(clip))]
     lowest = np.concatenate([low for _, low in scanned])
     floor_m = float(np.median(lowest)) if len(lowest) else 0.0
-    found = [list(group) for group, _ in scanned]
+    found = [group for group, _ in scanned]
     axes, heights = [], []
     for _ in range(MAX_PEOPLE):
-        candidates = [[each.candidate for each in group] for group in found]
-        chosen = movers.track(candidates, clip.timestamp_s, WALKER)
-        picked = [group[index] if index >= 0 else None for group, index in zip(found, chosen, strict=True)]
+        picked = movers.track(found, clip.timestamp_s, WALKER)
         person = _persistent(picked, clip.timestamp_s)
         if not person.any():
             break
@@ -92,7 +90,7 @@ def find_people(
         for frame in np.flatnonzero(person):
             mover = picked[frame]
             assert mover is not None, "a person's frames have a mover"
-            axis[frame] = mover.candidate.center_world[[0, 2]]
+            axis[frame] = mover.center_world[[0, 2]]
             tops += [mover.top_m] if mover.whole else []
             found[frame].remove(mover)
         axes.append(_fill_gaps(axis, clip.timestamp_s))
@@ -113,15 +111,14 @@ def gather_without_people(
 
 
 @dataclass(frozen=True, eq=False)
-class UprightMover:
+class UprightMover(Candidate):
     """A group of moving points that is higher than wide."""
 
-    candidate: Candidate
-    extent_m: float
+    extent_m: float = 0.0
     """vertical"""
-    top_m: float
+    top_m: float = 0.0
     """height of its highest points in the recording's world"""
-    whole: bool
+    whole: bool = False
     """whether its top is within the picture"""
 
 
@@ -146,8 +143,8 @@ def _upright(
         center += BODY_RADIUS_M * away / max(float(np.linalg.norm(away)), BODY_RADIUS_M)
         radius = float(np.quantile(np.linalg.norm(group - center, axis=1), 0.95))
         whole = bool(np.nonzero(own)[0].min() > 1)
-        candidate = Candidate(center, float(area[own].sum()), radius)
-        found.append(UprightMover(candidate, float(top - bottom), float(top), whole))
+        area_m2, extent_m = float(area[own].sum()), float(top - bottom)
+        found.append(UprightMover(center, area_m2, radius, 1.0, extent_m, float(top), whole))
     return found, low
 
 
@@ -156,15 +153,11 @@ def _persistent(
 ) -> Bool[np.ndarray, "frame"]:
     """Return the frames of a track that certainly show a person: segments that are often tall enough, and
     neighboring segments that the same person can have reached."""
-    seen = np.array([frame for frame, mover in enumerate(picked) if mover is not None], int)
     person = np.zeros(len(picked), bool)
-    if not len(seen):
-        return person
-    segment = movers.split_track([mover and mover.candidate for mover in picked], seen, timestamp_s, WALKER)
-    own = [seen[segment == number] for number in range(segment[-1] + 1)]
+    own = movers.segments(picked, timestamp_s, WALKER)
     tall = np.array([mover is not None and mover.extent_m > UPRIGHT_M for mover in picked])
     is_person = [int(tall[frames].sum()) >= MIN_UPRIGHT_FRAMES for frames in own]
-    place = np.array([[np.nan] * 3 if mover is None else mover.candidate.center_world for mover in picked])
+    place = np.array([[np.nan] * 3 if mover is None else mover.center_world for mover in picked])
     for step in (1, -1):
         for number, following in pairwise(range(len(own))[::step]):
             ends = [own[number][-1 if step > 0 else 0], own[following][0 if step > 0 else -1]]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy.ndimage
 from jaxtyping import Bool, Float, Int, UInt8
 
 
@@ -26,8 +27,8 @@ EDGE = 0.1
 """standard deviation of color (0..1) below which the guided filter smooths"""
 BINS, AB_RANGE = 12, 96
 """histogram bins along each axis of Lab, and the range of a and b that they cover"""
-MIN_COLORS, PRIOR, PRIOR_BINS = 50, 0.02, 200
-"""minimum pixels for a histogram; weight of its uniform prior, and the bins that share it"""
+MIN_COLORS, PRIOR, PRIOR_BINS, SMOOTHING = 50, 0.02, 200, (0.25, 0.5, 0.25)
+"""minimum pixels of a histogram; weight of its uniform prior, and bins that share it; smoothing kernel"""
 MIN_CERTAINTY = 0.05
 """filtered certainty below which evidence fades"""
 SURE_SHARE, HOLE_SHARE = 0.05, 0.05
@@ -80,7 +81,10 @@ def label(
     held = np.bincount(component[sure], minlength=len(area)) > np.maximum(3, SURE_SHARE * area)
     held[0] = False
     inside = held[component].astype(np.uint8)
-    inside = _fill_holes(inside, limit=HOLE_SHARE)
+    hole, area = _components(1 - inside, 4)
+    small = area < HOLE_SHARE * max(int(inside.sum()), 1)
+    small[0] = False
+    inside[small[hole]] = 1
     cross = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
     rim = cv2.dilate(inside, cross) != cv2.erode(inside, cross)
     mask = np.where(inside > 0, 255, 0).astype(np.uint8)
@@ -108,14 +112,6 @@ def _components(
     return np.asarray(component, np.int32), stats[:, cv2.CC_STAT_AREA]
 
 
-def _fill_holes(inside: UInt8[np.ndarray, "height width"], limit: float) -> UInt8[np.ndarray, "height width"]:
-    """Fill holes smaller than a share of the foreground."""
-    component, area = _components(1 - inside, 4)
-    small = area < limit * max(int(inside.sum()), 1)
-    small[0] = False
-    return np.where(small[component], 1, inside).astype(np.uint8)
-
-
 def _bin(color: UInt8[np.ndarray, "pixel 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Lab bins; lightness is coarser than color to tolerate shading."""
     lab = cv2.cvtColor(np.ascontiguousarray(color.reshape(1, -1, 3)), cv2.COLOR_RGB2LAB)[0].astype(np.int32)
@@ -127,9 +123,6 @@ def _bin(color: UInt8[np.ndarray, "pixel 3"]) -> tuple[np.ndarray, np.ndarray, n
 def _density(counts: Float[np.ndarray, "light a b"]) -> Float[np.ndarray, "light a b"]:
     smooth = counts
     for axis in range(3):
-        padded = np.pad(smooth, [(1, 1) if a == axis else (0, 0) for a in range(3)], mode="edge")
-        lower, upper = np.delete(padded, [-1, -2], axis), np.delete(padded, [0, 1], axis)
-        smooth = 0.5 * smooth + 0.25 * (lower + upper)
-    return (smooth + PRIOR * max(smooth.sum(), 1) / PRIOR_BINS) / (
-        smooth.sum() * (1 + PRIOR * smooth.size / PRIOR_BINS)
-    )
+        smooth = scipy.ndimage.convolve1d(smooth, SMOOTHING, axis, mode="nearest")
+    total = smooth.sum()
+    return (smooth + PRIOR * max(total, 1) / PRIOR_BINS) / (total * (1 + PRIOR * smooth.size / PRIOR_BINS))

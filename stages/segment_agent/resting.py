@@ -80,14 +80,11 @@ def _segment_prompted_points(clip, world_from_camera, prompt, ground, height_px,
     if not sure.any() or min(possible.sum(), (~possible).sum()) < MIN_PX:
         return None
     trimap = np.where(sure, cv2.GC_FGD, np.where(possible, cv2.GC_PR_FGD, cv2.GC_BGD)).astype(np.uint8)
-    _, part = cv2.connectedComponents(_upsampled_grabcut(window.color, trimap, rng).astype(np.uint8))
+    scale = math.ceil(MIN_SIDE_PX / min(trimap.shape))
+    large = cv2.resize(window.color, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    seeds = cv2.resize(trimap, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
+    found = grabcut(large, seeds, rng).astype(np.float32)
+    inside = cv2.resize(found, trimap.shape[::-1], interpolation=cv2.INTER_AREA) > 0.5
+    _, part = cv2.connectedComponents(inside.astype(np.uint8))
     shown = (part > 0) & np.isin(part, part[sure]) & possible & window.trusted
     return window.points_world[shown] if shown.sum() >= MIN_PX else None
-
-
-def _upsampled_grabcut(color, trimap, rng):
-    """Run GrabCut, on an upsampled picture if it is small."""
-    scale = math.ceil(MIN_SIDE_PX / min(trimap.shape))
-    large = cv2.resize(color, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-    found = grabcut(large, cv2.resize(trimap, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST), rng)
-    return cv2.resize(found.astype(np.float32), trimap.shape[::-1], interpolation=cv2.INTER_AREA) > 0.5

@@ -14,8 +14,8 @@ from stages.segment_agent.evidence import Evidence, EvidenceOf
 from stages.segment_agent.refine import ColorHistogram, Edges
 from stages.segment_agent.windows import Sphere, Window, crop_window, working_picture, working_size
 
-COLOR_WEIGHT = 0.7
-"""weight of the colors' log-likelihood ratio"""
+COLOR_WEIGHT, COLOR_FRAMES = 0.7, 30
+"""weight of the colors' log-likelihood ratio; frames from which colors are learned"""
 APPEARANCE_WEIGHT, APPEARANCE_WEIGHT_BLIND = 0.3, 0.6
 """weight of the appearance's log-odds where geometry is known, and where it is not"""
 APPEARANCE_ALONE, APPEARANCE_AGAINST = 3.0, 4.0
@@ -68,7 +68,7 @@ class Segmenter:
     spheres: list[Sphere | None]
     evidence_of: EvidenceOf
     height_px: int
-    appearance: ColorHistogram | Appearance
+    appearance: ColorHistogram | Appearance = field(default_factory=ColorHistogram)
     edges: Edges = field(default_factory=Edges)
 
     def masks(self, frames: Iterable[int]) -> Iterator[Mask]:
@@ -126,12 +126,8 @@ class Segmenter:
         """Return the log-odds that a mask shows the animal: by appearance, motion and track."""
         similarity = float(np.clip(log_ratio[inside], -PRESENCE_LIMIT, PRESENCE_LIMIT).mean())
         moved = float(evidence.moving[inside].mean())
-        return (
-            PRESENCE_PRESUMED
-            + PRESENCE_TRACKED * (not presumed)
-            + PRESENCE_APPEARANCE * similarity
-            + PRESENCE_MOVED * moved
-        )
+        on_track = PRESENCE_PRESUMED + PRESENCE_TRACKED * (not presumed)
+        return on_track + PRESENCE_APPEARANCE * similarity + PRESENCE_MOVED * moved
 
     def _by_appearance(
         self, window: Window, evidence: Evidence, log_ratio: Float[np.ndarray, "height width"]
@@ -159,16 +155,14 @@ class Segmenter:
         return np.zeros_like(labels), sure
 
 
-def learn_color_histogram(segmenter: Segmenter, pictures: int = 30) -> ColorHistogram:
-    """Learn the animal's colors from frames spread over the recording."""
+def with_color_histogram(segmenter: Segmenter) -> Segmenter:
+    """Return the segmenter with the animal's colors, learned from frames spread over the recording."""
     histogram = ColorHistogram()
-    seen = [
-        (frame, sphere) for frame, sphere in enumerate(segmenter.spheres) if sphere and not sphere.presumed
-    ]
-    for frame, sphere in seen[:: max(1, len(seen) // pictures)]:
+    seen = [(frame, each) for frame, each in enumerate(segmenter.spheres) if each and not each.presumed]
+    for frame, sphere in seen[:: max(1, len(seen) // COLOR_FRAMES)]:
         color = segmenter.working_picture(frame)
         window = crop_window(segmenter.clip, frame, segmenter.world_from_camera[frame], sphere, color)
         if window is not None:
             sure = segmenter.evidence_of(frame, window, sphere).animal.astype(np.uint8)
             histogram.learn(window.color[cv2.erode(sure, np.ones((3, 3), np.uint8)) > 0])
-    return histogram
+    return replace(segmenter, appearance=histogram)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 
 from pipeline.core.errors import InputError
 from pipeline.core.progress import log
@@ -25,10 +25,9 @@ from stages.segment_agent.free_space import References
 from stages.segment_agent.identity import Identities, Portrait
 from stages.segment_agent.locate import AppearanceOf, find_mover
 from stages.segment_agent.masks import Segmentation
-from stages.segment_agent.refine import ColorHistogram
-from stages.segment_agent.segmenter import Mask, Segmenter, learn_color_histogram
+from stages.segment_agent.segmenter import Mask, Segmenter, with_color_histogram
 from stages.segment_agent.trajectory import estimate_trajectory
-from stages.segment_agent.windows import Sphere, Window, working_picture
+from stages.segment_agent.windows import Sphere, Window, tracked, working_picture
 
 QUANTIZATION = 127 / identity.MAX_LOG_ODDS
 """8-bit levels per unit of stored log-odds"""
@@ -95,7 +94,11 @@ def segment(
     known = [tracked(segmenter.spheres) for segmenter in segmenters]
     for name, seen in zip(network.names, known, strict=True):
         log(f"{name}: tracked in {seen.sum()} of {len(clip)} frames" if seen.any() else f"{name} is not here")
-    _refuse_unknown_animals(clip, unknown.sum() / max(np.any([unknown, *known], axis=0).sum(), MIN_FRAMES))
+    share = unknown.sum() / max(np.any([unknown, *known], axis=0).sum(), MIN_FRAMES)
+    if share > STRANGER_SHARE:
+        what = f"in {100 * share:.0f} % of the frames that show an animal it matches no turnaround"
+        remedy = "film a turnaround of each animal that lives here (turnaround_<name>), or leave this out"
+        raise InputError("MSK-007", what, str(clip.folder), remedy)
     own = network.names.index(followed)
     found = (resolve_overlaps(segmenters, scores, own, frame) for frame in range(len(clip)))
     found = people.hide(found, persons, clip, poses)
@@ -119,8 +122,7 @@ def find_all(
         margin_of = scores.of(animal)
         spheres = find_mover(clip, poses, references, config.animal, None, margin_of=margin_of)
         own = identity_evidence(evidence_of, scores.against_others(animal))
-        segmenter = Segmenter(clip, poses, spheres, own, config.height_px, ColorHistogram())
-        segmenter = replace(segmenter, appearance=learn_color_histogram(segmenter))
+        segmenter = with_color_histogram(Segmenter(clip, poses, spheres, own, config.height_px))
         if not _is_present(segmenter, margin_of):
             segmenter = replace(segmenter, spheres=[None] * len(clip))
         segmenters.append(segmenter)
@@ -210,15 +212,3 @@ def _joint_occlusion(
     ]
     size = segmenters[0].working_picture(frame).shape[:2]
     return np.any([np.zeros(size, bool), *found], axis=0)
-
-
-def tracked(spheres: Sequence[Sphere | None]) -> Bool[np.ndarray, "frame"]:
-    """Return the frames with a tracked, not presumed, sphere."""
-    return np.array([sphere is not None and not sphere.presumed for sphere in spheres])
-
-
-def _refuse_unknown_animals(clip: Clip, share: float) -> None:
-    if share > STRANGER_SHARE:
-        what = f"in {100 * share:.0f} % of the frames that show an animal it matches no turnaround"
-        remedy = "film a turnaround of each animal that lives here (turnaround_<name>), or leave this out"
-        raise InputError("MSK-007", what, str(clip.folder), remedy)

@@ -12,10 +12,10 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import log, track
 from pipeline.core.videos import Video, role_of_animal
 from pipeline.data.clips import Clip
-from stages.segment_agent import pictures, prompts, several, writing
+from stages.segment_agent import prompts, several, writing
 from stages.segment_agent.config import Config
 from stages.segment_agent.identity import Identities, load_portraits
-from stages.segment_agent.masks import segment
+from stages.segment_agent.masks import Segmentation, segment
 
 MM = 1000
 
@@ -48,39 +48,37 @@ def run(
     With several animals, the one whose turnaround is among `videos` is segmented. Raises InputError
     MSK-006 for a prompt or a backend that cannot distinguish them.
     """
-    if inputs.identities is not None and role_of_animal(video, config.role) == "session":
-        return _run_of_several(inputs, inputs.identities, config, out, videos)
-    clip = Clip.open(inputs.frames)
-    prompt = None if inputs.prompt is None else prompts.parse(inputs.prompt, clip)
-    found = None
-    match config.backend:
-        case "weightless":
-            if clip.odometry_from_camera is None:
-                log("no usable odometry: camera motion is estimated from depth and flow, which drifts more")
-            rng = np.random.default_rng(config.seed)
-            found = segment(clip, inputs.flow, role_of_animal(video, config.role), prompt, config, rng)
-            masks = found.masks
-            if found.path is not None:
-                millimeters = MM * found.path.residual_m
-                log(f"poses: {found.path.alignments} depth alignments agree within {millimeters:.0f} mm")
-            writing.write_people(out, clip, found)
-        case "foundation":
-            from stages.segment_agent.backends import foundation
+    clip, role = Clip.open(inputs.frames), role_of_animal(video, config.role)
+    if inputs.identities is not None and role == "session":
+        found = _segment_one_of_several(clip, inputs, inputs.identities, config, videos)
+    else:
+        prompt = None if inputs.prompt is None else prompts.parse(inputs.prompt, clip)
+        match config.backend:
+            case "weightless":
+                if clip.odometry_from_camera is None:
+                    log("no usable odometry: camera motion comes from depth and flow, which drifts more")
+                rng = np.random.default_rng(config.seed)
+                found = segment(clip, inputs.flow, role, prompt, config, rng)
+                if found.path is not None:
+                    millimeters = MM * found.path.residual_m
+                    log(f"poses: {found.path.alignments} depth alignments agree within {millimeters:.0f} mm")
+            case "foundation":
+                from stages.segment_agent.backends import foundation
 
-            masks = foundation.segment(clip, prompt, config.foundation, device)
-        case _:
-            assert_never(config.backend)
-    summary = writing.write(out, track(masks, "masks", len(clip)), len(clip))
-    pictures.report_quality(out, clip, summary, config.animal, found)
-    if not any(summary.visible):
+                found = Segmentation(foundation.segment(clip, prompt, config.foundation, device))
+            case _:
+                assert_never(config.backend)
+    writing.write_people(out, clip, found)
+    summary = writing.write(out, track(found.masks, "masks", len(clip)), len(clip))
+    writing.report_quality(out, clip, summary, config.animal, found)
+    if found.unknown_animals is None and not any(summary.visible):
         log("the animal was never seen: does it move here? A prompt (<recording>.prompt.toml) helps")
     return summary
 
 
-def _run_of_several(
-    inputs: Inputs, identities: Path, config: Config, out: Path, videos: Sequence[Video]
-) -> writing.Summary:
-    """Segment a session of several animals."""
+def _segment_one_of_several(
+    clip: Clip, inputs: Inputs, identities: Path, config: Config, videos: Sequence[Video]
+) -> Segmentation:
     if inputs.prompt is not None or config.backend != "weightless":
         what = "a prompt" if inputs.prompt is not None else f"the backend {config.backend!r}"
         raise InputError(
@@ -89,11 +87,7 @@ def _run_of_several(
             str(inputs.prompt or inputs.frames),
             "leave it out: sessions of several animals are segmented by motion and by their turnarounds",
         )
-    clip, followed = Clip.open(inputs.frames), next(video.animal for video in videos if video.animal)
+    followed = next(video.animal for video in videos if video.animal)
     assert followed is not None, "the planner lists one animal's turnaround"
     network, portraits = Identities.load(identities), load_portraits(identities)
-    found = several.segment(clip, inputs.flow, followed, network, portraits, config)
-    summary = writing.write(out, track(found.masks, "masks", len(clip)), len(clip))
-    writing.write_people(out, clip, found)
-    pictures.report_quality(out, clip, summary, config.animal, found)
-    return summary
+    return several.segment(clip, inputs.flow, followed, network, portraits, config)

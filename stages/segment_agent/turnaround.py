@@ -54,11 +54,10 @@ class Cluster:
 
     cells: Bool[np.ndarray, "x y z"]
     origin: Float[np.ndarray, "3"]
-    voxel_m: float
 
     def contains(self, points_world: Float[np.ndarray, "*shape 3"]) -> Bool[np.ndarray, "*shape"]:
         """Return which points lie in occupied voxels; NaN does not."""
-        at = np.floor(np.nan_to_num((points_world - self.origin) / self.voxel_m, nan=-1.0)).astype(int)
+        at = np.floor(np.nan_to_num((points_world - self.origin) / VOXEL_M, nan=-1.0)).astype(int)
         inside = ((at >= 0) & (at < self.cells.shape)).all(-1)
         at = np.clip(at, 0, np.array(self.cells.shape) - 1)
         return inside & self.cells[at[..., 0], at[..., 1], at[..., 2]]
@@ -66,7 +65,7 @@ class Cluster:
     @property
     def sphere(self) -> Sphere:
         """Return a bounding sphere of the voxels."""
-        centers = self.origin + (np.argwhere(self.cells) + 0.5) * self.voxel_m
+        centers = self.origin + (np.argwhere(self.cells) + 0.5) * VOXEL_M
         middle = (centers.min(0) + centers.max(0)) / 2
         return Sphere(middle, float(np.linalg.norm(centers - middle, axis=1).max() + MARGIN_M))
 
@@ -97,8 +96,18 @@ def find_standing(
 def surroundings(
     clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], focus: Float[np.ndarray, "3"]
 ) -> tuple[Float[np.ndarray, "point 3"], GroundPlane | None]:
-    """Return the points seen near a focus, and the ground plane beneath it, if one is seen."""
-    points, level = _points_near(clip, world_from_camera, focus)
+    """Return the points seen near a focus, tails and ears too, and the ground beneath it, if it is seen."""
+    near_points, upward = [], []
+    for frame in subsampling.evenly(len(clip), FRAMES):
+        depth = clip.depth(frame)
+        depth = np.where(supported(depth), depth, 0)
+        view = depth_image(depth, clip.depth_intrinsics[frame], depth > 0, 2)
+        world = rigid.apply(world_from_camera[frame], view.points.reshape(-1, 3).astype(float))
+        up = (view.normals.reshape(-1, 3) @ world_from_camera[frame, :3, :3].T)[:, 1]
+        near = (view.points.reshape(-1, 3)[:, 2] > 0) & (np.abs(world - focus).max(1) < REACH_M)
+        near_points.append(world[near])
+        upward.append(up[near] > MIN_UP)
+    points, level = np.concatenate(near_points), np.concatenate(upward)
     seen = (points[level, 1] < focus[1] + MARGIN_M).sum() >= MIN_GROUND_POINTS
     return points, fit_ground(points[level], focus) if seen else None
 
@@ -139,22 +148,7 @@ def find_cluster(
     nearness = np.exp(-((np.linalg.norm(center - focus, axis=1) / 0.25) ** 2))
     score = np.bincount(component[filled], nearness, minlength=components + 1)
     own = (component == score.argmax()) & filled
-    return Cluster(scipy.ndimage.binary_dilation(own, around, iterations=2), origin, VOXEL_M)
-
-
-def _points_near(clip: Clip, world_from_camera, focus) -> tuple[np.ndarray, np.ndarray]:
-    """Read points within reach of the focus, tails and ears too, and whether they face upward."""
-    points, level = [], []
-    for frame in subsampling.evenly(len(clip), FRAMES):
-        depth = clip.depth(frame)
-        depth = np.where(supported(depth), depth, 0)
-        view = depth_image(depth, clip.depth_intrinsics[frame], depth > 0, 2)
-        world = rigid.apply(world_from_camera[frame], view.points.reshape(-1, 3).astype(float))
-        up = (view.normals.reshape(-1, 3) @ world_from_camera[frame, :3, :3].T)[:, 1]
-        near = (view.points.reshape(-1, 3)[:, 2] > 0) & (np.abs(world - focus).max(1) < REACH_M)
-        points.append(world[near])
-        level.append(up[near] > MIN_UP)
-    return np.concatenate(points), np.concatenate(level)
+    return Cluster(scipy.ndimage.binary_dilation(own, around, iterations=2), origin)
 
 
 def cluster_evidence(cluster: Cluster, ground: GroundPlane, whole: bool = True) -> EvidenceOf:

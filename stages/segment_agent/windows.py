@@ -1,5 +1,6 @@
 """Crop the part of a frame that may show the animal, at working resolution, with world points."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -27,6 +28,11 @@ class Sphere:
     radius_m: float
     presumed: bool = False
     """interpolated or extrapolated in time, or not connected to the prompt"""
+
+
+def tracked(spheres: Sequence[Sphere | None]) -> Bool[np.ndarray, "frame"]:
+    """Return the frames with a tracked, not presumed, sphere."""
+    return np.array([sphere is not None and not sphere.presumed for sphere in spheres])
 
 
 @dataclass(frozen=True)

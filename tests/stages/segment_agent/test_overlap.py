@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.data.clips import Clip, Masks
-from stages.segment_agent import free_space, overlap, pictures
+from stages.segment_agent import free_space, overlap, writing
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.writing import Summary
 
@@ -39,7 +39,7 @@ def judged(session, shown_px, what: overlap.Subject = "moving"):
     found = overlap.estimate(clip, poses, references, cast(Masks, labels), AnimalConfig(), what)
     area = shown_px.mean((1, 2))
     summary = Summary((area > 0).tolist(), [0.95] * len(area), area.tolist())
-    status = {check.status for check in pictures.checks_of(summary, 0.01, found)}
+    status = {check.status for check in writing.checks_of(summary, 0.01, found)}
     union = (shown_px | true).sum((1, 2))
     iou = ((shown_px & true).sum((1, 2)) / np.maximum(union, 1))[union > 0].mean()
     return float(np.nanmean(found)), float(iou), status

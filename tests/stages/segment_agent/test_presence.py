@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.geometry import rigid
-from stages.segment_agent import free_space, movers, pictures, segmenter
+from stages.segment_agent import free_space, movers, segmenter, writing
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.evidence import Evidence
 from stages.segment_agent.free_space import DepthNoise, References
@@ -93,14 +93,14 @@ def test_presence_is_decided_by_appearance_and_motion(similarity, moved, presume
 def test_temporally_implausible_masks_are_reported():
     count, rng = 100, np.random.default_rng(0)
     good = Summary([True] * 60 + [False] * 40, [0.95] * count, [0.05] * 60 + [0.0] * 40)
-    assert {check.status for check in pictures.checks_of(good)} == {"ok"}
+    assert {check.status for check in writing.checks_of(good)} == {"ok"}
     unmeasured = replace(good, confidence=[np.nan] * count)
-    assert {check.status for check in pictures.checks_of(unmeasured)} == {"ok", "warn"}
+    assert {check.status for check in writing.checks_of(unmeasured)} == {"ok", "warn"}
     unsure = replace(good, confidence=[0.6] * count)
     jumping = replace(good, area=rng.choice([0.01, 0.05], count).tolist())
     flashing = replace(good, area=rng.choice([0.0, 0.05], count).tolist())
     for wrong in (unsure, jumping, flashing):
-        assert "fail" in {check.status for check in pictures.checks_of(wrong)}
+        assert "fail" in {check.status for check in writing.checks_of(wrong)}
 
 
 def test_appearance_decides_without_geometry():

@@ -123,14 +123,16 @@ def test_persistent_motion_is_preferred_to_larger_flashes():
     estimate_path = [[candidate(0.05 * i, 0.02)] for i in range(12)]
     for i in (3, 7):
         estimate_path[i].append(candidate(3.0 + i, 0.04))
-    assert movers.track(estimate_path, np.arange(12) * 0.1, AnimalConfig()).tolist() == [0] * 12
+    chosen = movers.track(estimate_path, np.arange(12) * 0.1, AnimalConfig())
+    assert all(each is group[0] for each, group in zip(chosen, estimate_path, strict=True))
 
 
 def test_prompt_selects_one_of_two_moving_objects():
     both = [[candidate(0.0, 0.05), candidate(2.0, 0.02)] for _ in range(10)]
     time = np.arange(10) * 0.1
-    assert set(movers.track(both, time, AnimalConfig())) == {0}
-    assert set(movers.track(both, time, AnimalConfig(), PlacedPrompt(4, np.array([2.0, 0.0, 0.0])))) == {1}
+    prompt = PlacedPrompt(4, np.array([2.0, 0.0, 0.0]))
+    assert {each.area_m2 for each in movers.track(both, time, AnimalConfig())} == {0.05}
+    assert {each.area_m2 for each in movers.track(both, time, AnimalConfig(), prompt)} == {0.02}
 
 
 def test_prompt_applies_to_connected_tracks():
