@@ -15,7 +15,6 @@ from pipeline.core.errors import InputError, printable
 from pipeline.core.videos import Role
 from pipeline.workflow import captures, recipes
 from stages.check_captures import stage
-from stages.check_captures.config import Config
 from stages.check_captures.stage import CaptureVerdict
 
 
@@ -34,7 +33,7 @@ def main(arguments: list[str]) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     unusable = 0
-    for verdict in itertools.chain(refused, stage.run(files, Config())):
+    for verdict in itertools.chain(refused, stage.run(files)):
         unusable += not verdict.usable
         print(f"{printable(verdict.text)}\n", flush=True)
     for name in captures.unknown_files(given.folder):

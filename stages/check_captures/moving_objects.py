@@ -23,6 +23,7 @@ parts agree stay below, and so does a cat"""
 TWO_APART_M = 0.6
 """clusters further apart than this are two animals, meters"""
 VOTES = 2
+AROUND = np.ones((3, 3), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -57,19 +58,14 @@ def _moved(shot: SampledFrame, others: Sequence[SampledFrame]) -> Bool[np.ndarra
     for other in (each for each in others if each is not shot):
         points_other = rigid.apply(other.camera_from_odometry, points)
         pixel, z = cameras.project(points_other, other.depth_intrinsics)
-        low, high = (cameras.sample_nearest(each, pixel) for each in _range_around(other.depth))
+        # 0 beside unknown pixels and the border
+        low = cv2.erode(other.depth, AROUND, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+        low, high = (cameras.sample_nearest(each, pixel) for each in (low, cv2.dilate(other.depth, AROUND)))
         known, margin = (low > 0) & (z > 0.1), MARGIN_M + MARGIN_SHARE * z
         free += known & (low > z + margin)
         occupied += known & (low < z + margin) & (high > z - margin)
     marked = ((free >= VOTES) & (free > occupied)).reshape(shot.depth.shape) & (shot.depth > 0)
-    return cv2.morphologyEx(marked.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
-
-
-def _range_around(depth: Float[np.ndarray, "height width"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the range of depth in 3 x 3 pixels; the minimum is 0 beside unknown pixels and the border."""
-    ones = np.ones((3, 3), np.uint8)
-    low = cv2.erode(depth, ones, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    return low, cv2.dilate(depth, ones)
+    return cv2.morphologyEx(marked.astype(np.uint8), cv2.MORPH_OPEN, AROUND) > 0
 
 
 def _clusters(

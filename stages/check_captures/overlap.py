@@ -1,4 +1,7 @@
-"""Check that a recording shows the walk-through's room: SIFT with depth, rigid fits, temporal consistency."""
+"""Check that a recording shows the walk-through's room: SIFT with depth, rigid fits, temporal consistency.
+
+Also the drift of device poses: depth compared between frames that revisit a place.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +12,7 @@ from jaxtyping import Float
 from pipeline.geometry import align, rigid
 from pipeline.mapping import sift
 from pipeline.mapping.sift import SiftPoints
+from pipeline.recordings.conventions import DepthPicture, compare
 from stages.check_captures.sampling import SampledFrame
 
 POINTS = 600
@@ -18,6 +22,11 @@ MIN_INLIERS = 10
 AGREE = (15.0, 0.6)
 """tolerances for consistent poses, degrees and meters"""
 TRIALS = 300
+LATER_S = 5.0
+MIN_OVERLAP = 0.3
+MAX_PAIRS = 60
+SAME_DIRECTION, NEAR_M = 0.8, 1.5
+"""minimum cosine between optical axes, and maximum distance, of cameras with overlapping views"""
 
 
 @dataclass(frozen=True)
@@ -79,3 +88,29 @@ def _in_odometry(
     if known.odometry_from_camera is None or frame.odometry_from_camera is None:
         return known_from_frame
     return known.odometry_from_camera @ known_from_frame @ rigid.inverse(frame.odometry_from_camera)
+
+
+def drift_m(shots: Sequence[SampledFrame]) -> float:
+    """Return the median disagreement of depth between frames at least 5 s apart, meters; NaN without any."""
+    if len(shots) < 2 or shots[0].odometry_from_camera is None:
+        return np.nan
+    pairs = [
+        (first, second)
+        for i, first in enumerate(shots)
+        for second in shots[i + 1 :]
+        if second.timestamp_s - first.timestamp_s >= LATER_S and _similar_views(first, second)
+    ]
+    found = []
+    for first, second in pairs[:: max(1, len(pairs) // MAX_PAIRS)]:
+        views = [DepthPicture(shot.depth, shot.depth_intrinsics) for shot in (first, second)]
+        second_from_first = second.camera_from_odometry @ first.odometry_from_camera
+        residual_m, overlap, _ = compare(*views, second_from_first=second_from_first)
+        if overlap > MIN_OVERLAP:
+            found.append(residual_m)
+    return float(np.median(found)) if found else np.nan
+
+
+def _similar_views(first: SampledFrame, second: SampledFrame) -> bool:
+    """Return whether two cameras have similar poses."""
+    relative = first.camera_from_odometry @ second.odometry_from_camera
+    return relative[2, 2] > SAME_DIRECTION and float(np.linalg.norm(relative[:3, 3])) < NEAR_M

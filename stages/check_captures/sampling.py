@@ -109,23 +109,14 @@ def sample(recording: Recording, count: int, *, max_depth_m: float) -> Recording
     if recording.depth_size is None:
         return _look_at_pictures(recording, count)
     plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=max_depth_m, max_side_px=SIDE_PX)
-    rows = evenly(len(plan.chosen), count, rounded=True)
-    odometry = None if plan.odometry_from_camera is None else plan.odometry_from_camera[rows]
-    sample = replace(
-        plan,
-        chosen=plan.chosen[rows],
-        timestamp_s=plan.timestamp_s[rows],
-        intrinsics=plan.intrinsics[rows],
-        depth_intrinsics=plan.depth_intrinsics[rows],
-        odometry_from_camera=odometry,
-    )
-    shots = []
+    rows, shots = evenly(len(plan.chosen), count, rounded=True), []
+    sample = replace(plan, chosen=plan.chosen[rows])
     frames = extraction.frames(recording, sample, max_depth_m=max_depth_m, jpeg_quality=JPEG_QUALITY)
-    for position, frame in enumerate(frames):
+    for row, frame in zip(rows, frames, strict=True):
         if frame is not None:
-            raw = recording.read_depth(int(recording.index[sample.chosen[position]]))
+            raw = recording.read_depth(int(recording.index[plan.chosen[row]]))
             beyond = float((np.isfinite(raw) & (raw >= max_depth_m)).mean())
-            shots.append(_shot(sample, position, frame, beyond))
+            shots.append(_shot(plan, row, frame, beyond))
     _refuse_empty(recording, shots)
     agreement = extraction.picture_agreement_of(recording, plan, max_depth_m=max_depth_m)
     return RecordingSample(recording, plan, shots, 1 - len(shots) / len(rows), agreement)

@@ -1,5 +1,6 @@
 """The stage: recordings with their roles -> a verdict each; the walk-through first, the others against it."""
 
+import math
 import traceback
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,38 +11,32 @@ import numpy as np
 from pipeline.core.errors import InputError
 from pipeline.core.videos import Role
 from pipeline.recordings.formats import open_recording
-from stages.check_captures import moving_objects, overlap, parallax, pose_drift, sampling, text
-from stages.check_captures.config import Config
+from stages.check_captures import moving_objects, overlap, parallax, sampling
 from stages.check_captures.overlap import DescribedFrame
-from stages.check_captures.problems import CaptureMeasurements, CaptureProblem, problems
+from stages.check_captures.problems import CaptureMeasurements, problems
 
 MAX_DEPTH_M = 6.0
+SAMPLES, SEED = 40, 0
+"""frames sampled per recording; seed of the robust fits"""
 
 
 @dataclass(frozen=True)
 class CaptureVerdict:
     """Verdict on one recording."""
 
-    name: str
-    role: Role
-    seen: CaptureMeasurements | None
-    """None if it is unusable"""
-    problems: tuple[CaptureProblem, ...]
+    usable: bool
+    """whether a build goes on with it: the held-out phone must have depth"""
     text: str
-
-    @property
-    def usable(self) -> bool:
-        """Return whether a build goes on with it: the held-out phone must have depth."""
-        return self.seen is not None and (self.seen.sample.plan is not None or self.role != "heldout")
+    """format, measurements, and problems with remedies"""
 
 
-def run(files: Sequence[tuple[Path, Role]], config: Config) -> Iterator[CaptureVerdict]:
+def run(files: Sequence[tuple[Path, Role]]) -> Iterator[CaptureVerdict]:
     """Yield a verdict per recording as soon as it is known; walk-throughs come first."""
     room: list[DescribedFrame] = []
-    rng = np.random.default_rng(config.seed)
+    rng = np.random.default_rng(SEED)
     for path, role in sorted(files, key=lambda file: (file[1] != "walkthrough", file[0].name)):
         try:
-            sample = sampling.sample(open_recording(path), config.samples, max_depth_m=MAX_DEPTH_M)
+            sample = sampling.sample(open_recording(path), SAMPLES, max_depth_m=MAX_DEPTH_M)
             seen = _seen(sample, role, room, rng)
         except InputError as error:
             yield refused(path, role, error)
@@ -51,15 +46,15 @@ def run(files: Sequence[tuple[Path, Role]], config: Config) -> Iterator[CaptureV
             remedy = "export it again; if that does not help, report the traceback above"
             yield refused(path, role, InputError("CAP-012", what, str(path), remedy))
         else:
-            found = tuple(problems(seen, role))
-            described = text.describe_capture(path.name, role, seen, found)
-            yield CaptureVerdict(path.name, role, seen, found, described)
+            usable = sample.plan is not None or role != "heldout"
+            yield CaptureVerdict(usable, _described(path.name, role, seen))
 
 
 def refused(path: Path, role: Role, error: InputError) -> CaptureVerdict:
-    """Return the verdict on a recording that cannot be used."""
-    found = (CaptureProblem(error.code, error.what, error.remedy),)
-    return CaptureVerdict(path.name, role, None, found, text.refused(path, role, error))
+    """Return the verdict on a recording that cannot be used, and because of which file."""
+    file = error.where.removeprefix(str(path)).lstrip("/:") if error.where.startswith(str(path)) else ""
+    what = f"{file}: {error.what}" if file else error.what
+    return CaptureVerdict(False, f"{path.name}  {role}\n  {error.code} {what}\n    -> {error.remedy}")
 
 
 def _seen(
@@ -69,7 +64,7 @@ def _seen(
     if sample.plan is None:
         shifted = parallax.parallax(sample.shots) if role == "walkthrough" else None
         return CaptureMeasurements(sample, parallax=shifted)
-    drift_m = pose_drift.drift_m(sample.shots)
+    drift_m = overlap.drift_m(sample.shots)
     moving = moving_objects.find_motion(sample.shots) if role in ("walkthrough", "session") else None
     if role == "walkthrough":
         room += overlap.describe(sample.shots)
@@ -78,3 +73,43 @@ def _seen(
     if room and role != "turnaround":  # may be filmed anywhere: only the animal's template is made from it
         placed = overlap.placed_share(room, overlap.describe(sample.shots), rng)
     return CaptureMeasurements(sample, drift_m, moving, placed)
+
+
+def _described(name: str, role: Role, seen: CaptureMeasurements) -> str:
+    """Return a recording's format, measurements, and problems with remedies."""
+    sample, recording, found = seen.sample, seen.sample.recording, problems(seen, role)
+    height, width = recording.color_size
+    lines = [
+        f"{name}  {role}, {recording.kind}",
+        f"  {sample.duration_s:.1f} s, {sample.rate_hz:.1f} fps, {width} x {height}, {_turn(seen)}",
+    ]
+    lines.append(f"  pictures: dark {sample.dark:.0%}, blurred {sample.blurred:.0%}")
+    if sample.plan is not None:
+        lines[-1] += f"; depth: typically {sample.depth_m:.1f} m, known {sample.depth_valid:.0%}"
+        lines[-1] += f", beyond range {sample.beyond:.0%}"
+        lines.append(f"  device poses: {_poses(seen)}")
+    if seen.placed is not None:
+        lines.append(f"  found in the walk-through: {seen.placed:.0%} of the frames")
+    if seen.moving is not None and role == "session":
+        lines.append(f"  an animal moves in {seen.moving.seen:.0%} of the frames")
+    lines += [f"  note: {remark}" for remark in recording.remarks]
+    lines += [f"  {each.code} {each.what}\n    -> {each.remedy}" for each in found]
+    return "\n".join(lines if found else [*lines, "  good"])
+
+
+def _turn(seen: CaptureMeasurements) -> str:
+    turns = seen.sample.plan.quarter_turns if seen.sample.plan else seen.sample.recording.quarter_turns
+    return f"turned {90 * turns} deg clockwise to be upright" if turns else "upright as stored"
+
+
+def _poses(seen: CaptureMeasurements) -> str:
+    plan = seen.sample.plan
+    assert plan is not None
+    if plan.odometry_from_camera is None:
+        return "none usable"
+    check = plan.pose_check
+    measured = math.isfinite(check.residual_m)
+    residual = f"{1000 * check.residual_m:.0f} mm against depth" if measured else check.reason
+    drift = f"{100 * seen.drift_m:.1f} cm between visits"
+    drift = "no place seen twice" if math.isnan(seen.drift_m) else drift
+    return f"{residual}, {drift}, gravity {'known' if plan.gravity_known else 'unknown'}"

@@ -12,7 +12,7 @@ from pipeline.geometry.meshes import RayCaster, render_view
 from pipeline.mapping import picture_agreement
 from pipeline.recordings.formats import open_recording
 from stages.check_captures import __main__ as front
-from stages.check_captures import moving_objects, overlap, parallax, pose_drift, problems, sampling
+from stages.check_captures import moving_objects, overlap, parallax, problems, sampling
 from stages.check_captures.sampling import SampledFrame
 from tests.pipeline.recordings import made_formats
 from tests.stages import textured_room
@@ -48,7 +48,7 @@ def _codes(path, role: Role = "heldout") -> set[str]:
     return {
         each.code
         for each in problems.problems(
-            problems.CaptureMeasurements(sample, pose_drift.drift_m(sample.shots)), role
+            problems.CaptureMeasurements(sample, overlap.drift_m(sample.shots)), role
         )
     }
 
@@ -257,7 +257,7 @@ def test_a_person_in_the_walk_through_is_reported():
 def test_no_statement_without_poses():
     shots = [dataclasses.replace(shot, odometry_from_camera=None) for shot in _shots(0, 4)]
     assert moving_objects.find_motion(shots) is None
-    assert np.isnan(pose_drift.drift_m(shots))
+    assert np.isnan(overlap.drift_m(shots))
 
 
 def test_subsampled_depth_keeps_its_geometry():
