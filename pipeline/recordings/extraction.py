@@ -69,8 +69,6 @@ class ExtractionPlan:
     pose_check: PoseCheck
     scale: str = MEASURED
     """`measured` by its own depth, `relative`, or the id of the recording that supplied it"""
-    incomplete: float = 0.0
-    """share (0..1) of listed frames that were left out since a file of them is missing"""
 
 
 @dataclass(frozen=True)
@@ -142,7 +140,6 @@ def understand(
         gravity_known=gravity_known,
         quarter_turns=turns,
         pose_check=check,
-        incomplete=recording.incomplete,
     )
 
 

@@ -5,7 +5,6 @@ with depth shows the same room. Keyframes that were not registered are left out 
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -41,19 +40,13 @@ KEYFRAME_JPEG_QUALITY = 98
 """JPEG quality of COLMAP's keyframes, visually lossless"""
 
 
-@dataclass(frozen=True)
-class PicturesMapped:
-    """Frames reconstructed from pictures, and a sentence about them."""
-
-    plan: ExtractionPlan
-    frames: Iterator[ExtractedFrame]
-    summary: str
-
-
 def map_pictures(
     recording: Recording, measured: Mapping[str, Recording], settings: Config, workspace: Path
-) -> PicturesMapped:
-    """Map a video without depth; ``measured`` recordings, by id, may supply metric scale. Raises MAP-004."""
+) -> tuple[ExtractionPlan, Iterator[ExtractedFrame], str]:
+    """Map a video without depth: plan, frames and a sentence about them. Raises MAP-004.
+
+    ``measured`` recordings, by id, may supply metric scale.
+    """
     config, max_depth_m = settings.without_depth, settings.max_depth_m
     size = extraction.reduced_size(recording.color_size, settings.max_side_px)
     rows = _write_keyframes(recording, size, settings.rate_hz, config, workspace / "pictures")
@@ -71,7 +64,7 @@ def map_pictures(
     plan = _plan(recording, solved, views, world_from_camera, turns, size, scale)
     upright_frames = zip(pictures, depth, confidence, strict=True)
     frames = (_frame(*each, turns, settings.jpeg_quality) for each in upright_frames)
-    return PicturesMapped(plan, frames, _summary(recording, rows, solved, scale))
+    return plan, frames, _summary(recording, rows, solved, scale)
 
 
 def _write_keyframes(
@@ -79,16 +72,17 @@ def _write_keyframes(
 ) -> Int[np.ndarray, "key"]:
     """Write the keyframes as ``<row in the recording>.jpg`` and return their rows."""
     folder.mkdir()
-    motion, rows, sharpness = structure.PictureMotion(), [], []
+    steps, last, rows, sharpness = [], None, [], []
     for row in track(choose_frames(recording.timestamp_s, rate_hz).tolist(), "looking at pictures"):
         color = extraction.picture(recording, row, size)
         if color is not None:
-            motion.add(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY))
+            before, last = last, structure.motion_picture(color)
+            steps.append(0.0 if before is None else structure.motion(before, last))
             rows.append(row)
             sharpness.append(extraction.picture_statistics(color)[0])
     if len(rows) < structure.MIN_KEYFRAMES:
         raise no_map(recording, f"only {len(rows)} pictures can be read")
-    keys = structure.choose_keyframes(np.array(motion.traveled), np.array(sharpness), config)
+    keys = structure.choose_keyframes(np.cumsum(steps), np.array(sharpness), config)
     chosen = np.array(rows)[keys]
     for row in chosen.tolist():
         color = extraction.picture(recording, row, size)
@@ -204,7 +198,6 @@ def _plan(
         quarter_turns=turns,
         pose_check=PoseCheck("untested", OPENCV, "poses and depth from the pictures alone"),
         scale=scale,
-        incomplete=recording.incomplete,
     )
 
 

@@ -8,7 +8,6 @@ from pipeline.core import progress
 from pipeline.core.videos import Video
 from pipeline.recordings import extraction
 from pipeline.recordings.formats import open_recording, scale_sources
-from pipeline.recordings.recording import Recording
 from stages.extract_frames import photogrammetry, pictures, writing
 from stages.extract_frames.config import Config
 
@@ -37,10 +36,12 @@ def run(
         pictures.write(out, recording, config)
         return
     if recording.depth_size is None and (video is None or video.role == "walkthrough"):
-        sources = _scale_sources(inputs.captures, video, videos)
+        sources, agreement = {}, None
+        if video is not None and inputs.captures is not None:  # their depth may supply metric scale
+            found = scale_sources(inputs.captures, video, videos)
+            sources = {other.id: open_recording(inputs.captures / other.file) for other in found}
         with tempfile.TemporaryDirectory() as workspace:
-            mapped = photogrammetry.map_pictures(recording, sources, config, Path(workspace))
-        plan, frames, summary, agreement = mapped.plan, mapped.frames, mapped.summary, None
+            plan, frames, summary = photogrammetry.map_pictures(recording, sources, config, Path(workspace))
     else:
         reach = {"max_depth_m": config.max_depth_m}
         plan = extraction.understand(
@@ -58,15 +59,4 @@ def run(
         out, tracked, total=total, min_depth_valid=config.min_depth_valid, where=recording.where
     )
     writing.write_table(out, recording, plan, written)
-    writing.write_mesh(out, recording, plan)
-    writing.report_quality(out, plan, written, agreement, rate_hz=config.rate_hz)
-
-
-def _scale_sources(
-    folder: Path | None, video: Video | None, videos: tuple[Video, ...]
-) -> dict[str, Recording]:
-    """Open the recordings whose depth may supply metric scale to one without, by id."""
-    if video is None or folder is None:
-        return {}
-    sources = scale_sources(folder, video, videos)
-    return {other.id: open_recording(folder / other.file) for other in sources}
+    writing.report_quality(out, recording, plan, written, agreement, rate_hz=config.rate_hz)

@@ -48,34 +48,25 @@ class Structure:
     models: int
 
 
-class PictureMotion:
-    """Accumulates the motion of a video's pictures, in shares of their width."""
+def motion_picture(color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "small_height 240"]:
+    """Reduce a picture for `motion`."""
+    size = MOTION_WIDTH_PX, round(MOTION_WIDTH_PX * color.shape[0] / color.shape[1])
+    return cv2.resize(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
 
-    def __init__(self) -> None:
-        self.traveled: list[float] = []
-        self._last: UInt8[np.ndarray, "height width"] | None = None
 
-    def add(self, gray: UInt8[np.ndarray, "height width"]) -> None:
-        """Track corners into the next picture; if too few are found it counts as moved by `LOST_STEP`."""
-        size = MOTION_WIDTH_PX, round(MOTION_WIDTH_PX * gray.shape[0] / gray.shape[1])
-        small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
-        step = 0.0 if self._last is None else self._step(self._last, small)
-        self.traveled.append(step + (self.traveled[-1] if self.traveled else 0.0))
-        self._last = small
-
-    @staticmethod
-    def _step(before: np.ndarray, after: np.ndarray) -> float:
-        corners = cv2.goodFeaturesToTrack(before, MAX_CORNERS, 0.01, 6)
-        if corners is None or len(corners) < MIN_CORNERS:
-            return LOST_STEP
-        no_guess = np.zeros(0, np.float32)
-        moved, found, _ = cv2.calcOpticalFlowPyrLK(
-            before, after, corners, no_guess, winSize=WINDOW_PX, maxLevel=3
-        )
-        good = found[:, 0] == 1
-        if good.sum() < MIN_TRACKED * len(corners):
-            return LOST_STEP
-        return float(np.median(np.linalg.norm((moved - corners)[good, 0], axis=1)) / before.shape[1])
+def motion(before: UInt8[np.ndarray, "height width"], after: UInt8[np.ndarray, "height width"]) -> float:
+    """Return the motion of corners between two pictures, share of the width; `LOST_STEP` with too few."""
+    corners = cv2.goodFeaturesToTrack(before, MAX_CORNERS, 0.01, 6)
+    if corners is None or len(corners) < MIN_CORNERS:
+        return LOST_STEP
+    no_guess = np.zeros(0, np.float32)
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        before, after, corners, no_guess, winSize=WINDOW_PX, maxLevel=3
+    )
+    good = found[:, 0] == 1
+    if good.sum() < MIN_TRACKED * len(corners):
+        return LOST_STEP
+    return float(np.median(np.linalg.norm((moved - corners)[good, 0], axis=1)) / before.shape[1])
 
 
 def choose_keyframes(

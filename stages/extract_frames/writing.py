@@ -79,7 +79,7 @@ def write_frames(
 
 
 def write_table(folder: Path, recording: Recording, plan: ExtractionPlan, written: WrittenFrames) -> None:
-    """Write ``frames.npz`` for the usable frames."""
+    """Write ``frames.npz`` for the usable frames and, with poses, ``mesh.ply``, the app's mesh."""
     usable = written.usable
     odometry = None if plan.odometry_from_camera is None else plan.odometry_from_camera[usable]
     FRAMES.save(
@@ -97,16 +97,13 @@ def write_table(folder: Path, recording: Recording, plan: ExtractionPlan, writte
         depth_valid=written.depth_valid,
         quality=extraction.quality_of(written.sharpness, written.brightness, written.depth_valid),
     )
-
-
-def write_mesh(folder: Path, recording: Recording, plan: ExtractionPlan) -> None:
-    """Write the app's own mesh of the room as ``mesh.ply`` if device poses are usable."""
-    if recording.read_mesh is not None and plan.odometry_from_camera is not None:
+    if recording.read_mesh is not None and odometry is not None:
         ply.write_ply(folder / "mesh.ply", recording.read_mesh())
 
 
 def report_quality(
     folder: Path,
+    recording: Recording,
     plan: ExtractionPlan,
     written: WrittenFrames,
     agreement: PictureAgreement | None,
@@ -130,7 +127,7 @@ def report_quality(
         qa.Check("known depth", 100 * float(written.depth_valid.mean()), "%", warn=50.0, better="higher"),
         qa.Check("frames dropped for lack of depth", 100 * dropped, "%", warn=10.0),
         qa.Check("damaged frames", 100 * written.lost, "%", warn=0.0),
-        qa.Check("incomplete frames left out", 100 * plan.incomplete, "%", warn=2.0),
+        qa.Check("incomplete frames left out", 100 * recording.incomplete, "%", warn=2.0),
         qa.Check("clockwise quarter turns applied", float(plan.quarter_turns)),
         qa.Check("device poses usable", with_poses, "", warn=0.5, better="higher"),
         _check_of_poses(plan),

@@ -42,13 +42,12 @@ def walk(tmp_path_factory) -> Walk:
     )
     recording = open_recording(folder / "walk.mp4")
     cv2.setNumThreads(1)
-    mapped = photogrammetry.map_pictures(recording, {}, Config(), tmp_path_factory.mktemp("workspace"))
+    workspace = tmp_path_factory.mktemp("workspace")
+    plan, frames, _ = photogrammetry.map_pictures(recording, {}, Config(), workspace)
     out = tmp_path_factory.mktemp("frames")
-    written = writing.write_frames(
-        out, mapped.frames, total=len(mapped.plan.chosen), min_depth_valid=0.2, where="walk"
-    )
-    writing.write_table(out, recording, mapped.plan, written)
-    clip, kept = Clip.open(out), mapped.plan.chosen[written.usable]
+    written = writing.write_frames(out, frames, total=len(plan.chosen), min_depth_valid=0.2, where="walk")
+    writing.write_table(out, recording, plan, written)
+    clip, kept = Clip.open(out), plan.chosen[written.usable]
     centers, true = clip.odometry_from_camera[:, :3, 3], truth.world_from_camera[kept][:, :3, 3]
     fitted = pycolmap.estimate_sim3d(centers, true)
     moved = fitted.scale * centers @ fitted.rotation.matrix().T + fitted.translation

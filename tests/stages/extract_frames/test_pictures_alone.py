@@ -62,8 +62,7 @@ def test_walkthrough_is_mapped_and_scaled_by_a_session_with_depth(room, tmp_path
     session = _recording(
         room, textured_room.walk(14)[2:12:3] @ rigid.make(np.eye(3), np.array([0.03, 0, 0])), with_depth=True
     )
-    mapped = _mapped(_recording(room, truth), {"v002": session}, tmp_path)
-    plan = mapped.plan
+    plan, frames, _ = _mapped(_recording(room, truth), {"v002": session}, tmp_path)
     assert plan.scale == "v002"
     assert len(plan.chosen) >= 10
     assert abs(plan.intrinsics[0, 0, 0] / INTRINSICS[0, 0] - 1) < 0.04, "the focal length was not told"
@@ -73,7 +72,7 @@ def test_walkthrough_is_mapped_and_scaled_by_a_session_with_depth(room, tmp_path
     )
     assert np.linalg.norm(moved - centers, axis=1).max() < 0.08, "meters, without any scale"
     off, known = [], []
-    for frame, row in zip(mapped.frames, plan.chosen, strict=True):
+    for frame, row in zip(frames, plan.chosen, strict=True):
         true = _seen(room, truth[row])[1][::2, ::2]
         seen = frame.depth > 0
         off.append(frame.depth[seen] / true[seen] - 1)
