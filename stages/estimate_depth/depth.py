@@ -35,6 +35,10 @@ NEAREST_M, FARTHEST_SHARE = 0.25, 1.3
 MIN_AGREEING = 2
 """Other frames that must agree on a depth; one more makes it certain."""
 
+ROUNDS, MIN_PIXELS, DEPTH_RANGE_M = 8, 50, (0.1, 20.0)
+"""Alignment of a network's depth: iterations of reweighted least squares, least map pixels, and range of valid
+depth, meters."""
+
 DepthNet = Callable[[int, Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]], np.ndarray]
 """Depth of one frame by a network, meters, given the map's depth and where it is valid."""
 
@@ -176,3 +180,29 @@ def _source_frames(number: int, shown: Sequence[ColorView]) -> list[int]:
     fit = np.flatnonzero((angle > ANGLES_DEG[0]) & (angle < ANGLES_DEG[1]))
     fit = fit[np.argsort(angle[fit], kind="stable")]
     return [int(other) for other in fit[subsampling.evenly(len(fit), SOURCES)]]
+
+
+def aligned(
+    inverse: Float[np.ndarray, "height width"],
+    mapped: Float[np.ndarray, "height width"],
+    counts: Bool[np.ndarray, "height width"],
+) -> Float[np.ndarray, "height width"]:
+    """Return metric depth from relative inverse depth: 1 / depth = scale * inverse + shift.
+
+    Scale and shift are fitted to the map's depth (meters) where ``counts``, with Cauchy weights scaled by the
+    median residual. Returns 0 where depth is invalid, and everywhere if too little counts or scale <= 0.
+    """
+    if counts.sum() < MIN_PIXELS:
+        return np.zeros(inverse.shape, np.float32)
+    known, target = inverse[counts].astype(float), 1 / mapped[counts].astype(float)
+    design, weight = np.stack([known, np.ones_like(known)], axis=1), np.ones(len(known))
+    for _ in range(ROUNDS):
+        root = np.sqrt(weight)[:, None]
+        (scale, shift), *_ = np.linalg.lstsq(root * design, root[:, 0] * target, rcond=None)
+        residual = np.abs(scale * known + shift - target)
+        weight = 1 / (1 + (residual / max(float(np.median(residual)), 1e-6)) ** 2)
+    if scale <= 0:
+        return np.zeros(inverse.shape, np.float32)
+    nearest, farthest = 1 / np.array(DEPTH_RANGE_M)
+    fitted = np.clip(scale * inverse + shift, farthest, nearest)
+    return np.where((fitted > farthest) & (fitted < nearest), 1 / fitted, 0).astype(np.float32)

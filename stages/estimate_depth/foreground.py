@@ -50,9 +50,8 @@ def difference(
     target: ColorView, source: ColorView
 ) -> tuple[Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
     """Return the color difference to a source, beyond the slack, and where the source sees the surface."""
-    warped = views.warp(target.view, source.view)
-    shown = cameras.sample_bilinear(source.lab, warped.there)
-    known = warped.known
+    there, known = views.warp(target.view, source.view)
+    shown = cameras.sample_bilinear(source.lab, there)
     if known.sum() < MIN_SEEN:
         return np.zeros(known.shape, np.float32), np.zeros(known.shape, bool)
     # exposure and white balance change between recordings
@@ -68,8 +67,8 @@ def foreground(
     target: ColorView, walk: Sequence[ColorView], times: Sequence[ColorView]
 ) -> Bool[np.ndarray, "height width"]:
     """Segment the foreground by hysteresis thresholding and morphology."""
-    by_walk, by_times = ([difference(target, source) for source in sources] for sources in (walk, times))
-    sure, weak = (_differing(by_walk, by_times, limit) for limit in (HIGH_THRESHOLD, LOW_THRESHOLD))
+    both = [[difference(target, source) for source in sources] for sources in (walk, times)]
+    sure, weak = (_differing(both, limit) for limit in (HIGH_THRESHOLD, LOW_THRESHOLD))
     sure = cv2.morphologyEx(sure.astype(np.uint8), cv2.MORPH_OPEN, OPENING)
     weak = cv2.morphologyEx((weak | (sure > 0)).astype(np.uint8), cv2.MORPH_OPEN, OPENING)
     _, part = cv2.connectedComponents(weak, connectivity=8)
@@ -77,17 +76,11 @@ def foreground(
     return cv2.morphologyEx(grown.astype(np.uint8), cv2.MORPH_CLOSE, CLOSING) > 0
 
 
-def _differing(by_walk, by_times, limit: float) -> Bool[np.ndarray, "height width"]:
+def _differing(both, limit: float) -> Bool[np.ndarray, "height width"]:
     """Return where enough pictures of the walk-through and of other times differ by more than a limit."""
-    walk_votes, seen_walk = _votes(by_walk, limit)
-    time_votes, seen = _votes(by_times, limit)
+    walk_votes, time_votes = (sum(known & (beyond > limit) for beyond, known in each) for each in both)
+    seen_walk, seen = (sum(known.astype(int) for _, known in each) for each in both)
     unlike_walk = (seen_walk == 0) | (walk_votes >= WALK_SHARE * seen_walk)
     enough = np.maximum(TIMES_SHARE * seen, np.minimum(MIN_TIMES, seen))
     unlike_times = (seen < MIN_SEEN) | (time_votes >= enough)
     return unlike_walk & unlike_times & ((seen_walk > 0) | (seen >= MIN_SEEN))
-
-
-def _votes(compared, limit: float):
-    """Count, per pixel, the pictures that differ and those that see its surface."""
-    differing = sum(known & (beyond > limit) for beyond, known in compared)
-    return differing, sum(known.astype(int) for _, known in compared)

@@ -54,13 +54,6 @@ class Lens:
         return np.array([[self.focal_px, 0, width / 2], [0, self.focal_px, height / 2], [0, 0, 1]])
 
     @property
-    def camera(self) -> pycolmap.Camera:
-        """Return it as COLMAP's camera."""
-        height, width = self.size
-        parameters = [self.focal_px, width / 2, height / 2, self.radial]
-        return pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=parameters)
-
-    @property
     def is_distorted(self) -> bool:
         """Return whether pictures must be undistorted."""
         corner = np.hypot(*self.size) / 2 / self.focal_px
@@ -106,7 +99,9 @@ def locate(
     estimation.ransac.random_seed = seed
     estimation.ransac.max_error = within_px or INLIER_SHARE * max(lens.size)
     estimation.estimate_focal_length = refinement.refine_focal_length = calibrate
-    camera = lens.camera
+    height, width = lens.size
+    parameters = [lens.focal_px, width / 2, height / 2, lens.radial]
+    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=parameters)
     found = pycolmap.estimate_and_refine_absolute_pose(
         matches.pixel, matches.points_world, camera, estimation, refinement
     )

@@ -19,7 +19,7 @@ from pipeline.data.templates import SceneCameras
 from pipeline.geometry import cameras
 from pipeline.geometry.meshes import RayCaster
 from pipeline.mapping.sift import Keypoints
-from stages.estimate_depth import depth, foreground, landmarks, lens, monocular, tracking, views, writing
+from stages.estimate_depth import depth, foreground, landmarks, lens, tracking, views, writing
 from stages.estimate_depth.config import Config
 from stages.estimate_depth.foreground import ColorView
 from stages.estimate_depth.lens import Lens
@@ -57,7 +57,7 @@ def run(
     walk_views = [_walk_view(walk, walk_cameras, frame, caster) for frame in keyframes]
     room = MapViews(caster, [each.view for each in walk_views])
     found, tracked = _placed(pictures, known, room, config)
-    placed = np.flatnonzero(tracked.placed)
+    placed = np.flatnonzero(np.isfinite(tracked.world_from_camera[:, 0, 0]))
     if len(placed) < max(MIN_FRAMES, MIN_PLACED * len(pictures)):
         raise _unrecognized(pictures, f"{len(placed)} of {len(pictures)} frames find a place in the map")
     log(f"focal length {found.focal_px:.1f} px; {len(placed)} of {len(pictures)} frames placed")
@@ -119,7 +119,7 @@ def _depth_net(
     def depth_net(number: int, mapped: np.ndarray, counts: np.ndarray) -> np.ndarray:
         color = found.undistorted(pictures.color(int(placed[number])))
         inverse = cv2.resize(network.inverse_depth(color), mapped.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        return monocular.aligned(inverse, mapped, counts & (mapped > 0))
+        return depth.aligned(inverse, mapped, counts & (mapped > 0))
 
     return depth_net
 

@@ -53,11 +53,6 @@ class Tracked:
     lens: Lens
     """Of the small pictures, refined with the cameras."""
 
-    @property
-    def placed(self) -> Bool[np.ndarray, "frame"]:
-        """Return which frames have a pose."""
-        return np.isfinite(self.world_from_camera[:, 0, 0])
-
 
 @dataclass(frozen=True)
 class TrackingInput:
@@ -88,8 +83,10 @@ def place(footage: TrackingInput, located: Sequence[PnPResult | None], room: Map
             poses[frame] = each.world_from_camera
     discard_stray_segments(footage.timestamp_s, poses, np.isfinite(poses[:, 0, 0]))
     sure = np.isfinite(poses[:, 0, 0])
-    for frame in track(_by_distance(sure), "tracking"):
-        _track_one(frame, footage, poses, room, seed)
+    if sure.any():  # the others by their distance from a localized one
+        distance = np.abs(np.arange(len(sure))[:, None] - np.flatnonzero(sure)).min(1)
+        for frame in track(np.argsort(distance, kind="stable")[sure.sum() :].tolist(), "tracking"):
+            _track_one(frame, footage, poses, room, seed)
     discard_stray_segments(footage.timestamp_s, poses, sure)
     placed = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     log(f"{int(sure.sum())} frames placed by landmarks, {len(placed)} of {len(poses)} in all")
@@ -98,14 +95,6 @@ def place(footage: TrackingInput, located: Sequence[PnPResult | None], room: Map
         if number == 0:
             footage = replace(footage, lens=lens)
     return Tracked(poses, sure, footage.lens)
-
-
-def _by_distance(sure: Bool[np.ndarray, "frame"]) -> list[int]:
-    """Order the other frames by their distance from a localized one."""
-    if not sure.any():
-        return []
-    distance = np.abs(np.arange(len(sure))[:, None] - np.flatnonzero(sure)).min(1)
-    return [int(frame) for frame in np.argsort(distance, kind="stable") if distance[frame] > 0]
 
 
 def discard_stray_segments(

@@ -40,16 +40,6 @@ class View:
     """Of the surface, meters; 0 where there is none."""
 
 
-@dataclass(frozen=True)
-class Warped:
-    """Mapping from one picture's pixels to another's."""
-
-    there: Float[np.ndarray, "height width 2"]
-    """Source pixel of each pixel."""
-    known: Bool[np.ndarray, "height width"]
-    """Where the source sees the same surface point."""
-
-
 def small_gray(color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "small_height small_width"]:
     """Reduce a picture and equalise its contrast."""
     scale = min(1.0, SHORTER_PX / min(color.shape[:2]))
@@ -69,15 +59,17 @@ def view_of(
     return View(gray, intrinsics, world_from_camera, depth)
 
 
-def warp(target: View, source: View) -> Warped:
-    """Map each pixel of a target to the source pixel of the same surface point."""
+def warp(
+    target: View, source: View
+) -> tuple[Float[np.ndarray, "height width 2"], Bool[np.ndarray, "height width"]]:
+    """Return the source pixel of each target pixel's surface point, and where the source sees that point."""
     points = cameras.back_project(target.depth, target.intrinsics).reshape(-1, 3)
     moved = rigid.apply(rigid.inverse(source.world_from_camera) @ target.world_from_camera, points)
     there, z = cameras.project(moved, source.intrinsics)
     there, z = there.astype(np.float32).reshape(*target.gray.shape, 2), z.reshape(target.gray.shape)
     seen = cv2.remap(source.depth, there[..., 0] - 0.5, there[..., 1] - 0.5, cv2.INTER_NEAREST, borderValue=0)
     near = np.abs(seen - z) < OCCLUDED_M + OCCLUDED_SHARE * z
-    return Warped(there, (target.depth > 0) & (z > 0.1) & (seen > 0) & near)
+    return there, (target.depth > 0) & (z > 0.1) & (seen > 0) & near
 
 
 def flow_matches(target: View, source: View) -> Matches:
@@ -85,16 +77,15 @@ def flow_matches(target: View, source: View) -> Matches:
 
     The source is warped to the target's approximate camera; flow measures the remaining displacement.
     """
-    warped = warp(target, source)
-    if warped.known.mean() < MIN_KNOWN:
+    there, known = warp(target, source)
+    if known.mean() < MIN_KNOWN:
         return Matches(np.zeros((0, 2)), np.zeros((0, 3)))
-    shown = cameras.sample_bilinear(source.gray, warped.there)
-    shown = np.where(warped.known, shown, target.gray)
+    shown = np.where(known, cameras.sample_bilinear(source.gray, there), target.gray)
     dense = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow = dense.calc(shown, target.gray, np.zeros(0, np.float32))
     inner = tuple(slice(MARGIN_PX, side - MARGIN_PX, STRIDE_PX) for side in shown.shape)
     rows, columns = np.mgrid[inner].reshape(2, -1)
     start, moved = cameras.pixel_centers(rows, columns), flow[rows, columns]
-    good = warped.known[rows, columns] & (np.abs(moved).max(1) < MAX_FLOW_PX)
+    good = known[rows, columns] & (np.abs(moved).max(1) < MAX_FLOW_PX)
     rays = cameras.unproject(start[good], target.intrinsics) * target.depth[rows, columns][good, None]
     return Matches(start[good] + moved[good], rigid.apply(target.world_from_camera, rays))

@@ -1,6 +1,6 @@
 import numpy as np
 
-from stages.estimate_depth import monocular
+from stages.estimate_depth import depth
 
 
 def test_scale_and_shift_are_robust_to_moved_objects():
@@ -10,7 +10,7 @@ def test_scale_and_shift_are_robust_to_moved_objects():
     mapped, counts = true.copy(), np.ones(true.shape, bool)
     mapped[:12] += 0.8  # a fifth of the room has changed
     counts[30:40, 30:50] = False
-    found = monocular.aligned(inverse, mapped, counts)
+    found = depth.aligned(inverse, mapped, counts)
     assert np.median(np.abs(found[30:40, 30:50] - true[30:40, 30:50])) < 0.02
 
 
@@ -18,5 +18,5 @@ def test_small_overlap_and_inverted_predictions_are_refused():
     true = np.linspace(1, 3, 400).reshape(20, 20)
     few = np.zeros(true.shape, bool)
     few[0] = True
-    assert not monocular.aligned(1 / true, true, few).any()
-    assert not monocular.aligned(true, true, np.ones(true.shape, bool)).any()
+    assert not depth.aligned(1 / true, true, few).any()
+    assert not depth.aligned(true, true, np.ones(true.shape, bool)).any()
