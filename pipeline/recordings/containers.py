@@ -21,7 +21,7 @@ from jaxtyping import Float32, UInt, UInt8
 
 from pipeline.core.errors import InputError
 from pipeline.data import images
-from pipeline.recordings.recording import broken_metadata, damaged, refuse_other_size, wrong_depth
+from pipeline.recordings import errors
 
 MAX_MEMBER_BYTES = 64 << 20
 UNKNOWN = 65535
@@ -78,9 +78,9 @@ class Container(ABC):
         try:
             table = json.loads(self.read(name))
         except (ValueError, RecursionError) as error:
-            raise broken_metadata(self.place(name), f"not JSON ({error})") from error
+            raise errors.broken_metadata(self.place(name), f"not JSON ({error})") from error
         if not isinstance(table, dict):
-            raise broken_metadata(self.place(name), "not a table")
+            raise errors.broken_metadata(self.place(name), "not a table")
         return table
 
     def color(self, name: str) -> UInt8[np.ndarray, "height width 3"]:
@@ -92,7 +92,7 @@ class Container(ABC):
         image = images.decoded(self.read(name), cv2.IMREAD_UNCHANGED)
         if image is None or image.ndim != 2 or image.dtype != dtype:
             bits = 8 * np.dtype(dtype).itemsize
-            raise wrong_depth(self.place(name), f"not a readable {bits}-bit single-channel PNG")
+            raise errors.wrong_depth(self.place(name), f"not a readable {bits}-bit single-channel PNG")
         return image
 
     def meters(
@@ -100,8 +100,14 @@ class Container(ABC):
     ) -> Float32[np.ndarray, "height width"]:
         """Read a 16-bit depth PNG of (height, width) ``size`` as meters, 0 = unknown. Raises CAP-008."""
         raw = self.gray(name, np.uint16)
-        refuse_other_size(raw.shape, size, self.place(name))
+        errors.refuse_other_size(raw.shape, size, self.place(name))
         return np.where(raw == UNKNOWN, 0, raw).astype(np.float32) / np.float32(per_meter)
+
+    def refuse_surplus_members(self, frames: int) -> None:
+        """Raise CAP-002 for too many members for the number of frames in the metadata."""
+        most = MEMBERS_PER_FRAME * frames + EXTRA_MEMBERS
+        if len(self.names) > most:
+            raise _unsafe(self.where, f"{len(self.names)} members for {frames} frames, at most {most}")
 
     def numbered(self, folder: str, *suffixes: str) -> dict[int, str]:
         """Return a folder's members named by frame number, by number; only with these suffixes, if any."""
@@ -125,7 +131,7 @@ class FolderContainer(Container):
     def path(self, name: str) -> Path:
         """Return the path of a regular file. Raises CAP-001 for links, pipes and missing names."""
         if name not in self.names:
-            raise damaged(self.place(name), "there is no such regular file")
+            raise errors.damaged(self.place(name), "there is no such regular file")
         return self._folder / name
 
     def read(self, name: str, max_bytes: int = MAX_MEMBER_BYTES) -> bytes:
@@ -134,7 +140,7 @@ class FolderContainer(Container):
             with open(self.path(name), "rb") as file:
                 return _within(file.read(max_bytes + 1), max_bytes, self.place(name))
         except OSError as error:
-            raise damaged(self.place(name), error.strerror or str(error)) from error
+            raise errors.damaged(self.place(name), error.strerror or str(error)) from error
 
 
 class ZipContainer(Container):
@@ -148,7 +154,7 @@ class ZipContainer(Container):
                 raise _unsafe(self.where, f"{declared} members, at most {MAX_MEMBERS} are read")
             self._archive = zipfile.ZipFile(path)
         except _UNREADABLE as error:
-            raise damaged(self.where, str(error)) from error
+            raise errors.damaged(self.where, str(error)) from error
         _refuse_unsafe(self._archive.infolist(), self.where)
         self.names = frozenset(info.filename for info in self._archive.infolist() if not info.is_dir())
 
@@ -158,14 +164,7 @@ class ZipContainer(Container):
             with self._archive.open(name) as member:
                 return _within(member.read(max_bytes + 1), max_bytes, self.place(name))
         except _UNREADABLE as error:
-            raise damaged(self.place(name), str(error)) from error
-
-
-def refuse_surplus_members(container: Container, frames: int) -> None:
-    """Raise CAP-002 if a container has too many members for the number of frames in its metadata."""
-    most = MEMBERS_PER_FRAME * frames + EXTRA_MEMBERS
-    if len(container.names) > most:
-        raise _unsafe(container.where, f"{len(container.names)} members for {frames} frames, at most {most}")
+            raise errors.damaged(self.place(name), str(error)) from error
 
 
 def frame_number(stem: str) -> int | None:

@@ -17,10 +17,9 @@ from pipeline.geometry import align, cameras, rigid
 from pipeline.geometry.subsampling import evenly
 from pipeline.mapping import picture_agreement
 from pipeline.mapping.picture_agreement import Clock, PictureAgreement, PosedPicture
-from pipeline.recordings import conventions
+from pipeline.recordings import conventions, errors
 from pipeline.recordings.conventions import PoseCheck
-from pipeline.recordings.depth_camera import grid_size, reproject
-from pipeline.recordings.recording import Picture, Recording, broken_metadata, no_depth
+from pipeline.recordings.recording import Picture, Recording, grid_size, reproject
 from pipeline.recordings.upright import (
     quarter_turns_from_gravity,
     quarter_turns_from_room,
@@ -99,7 +98,7 @@ def understand(
     """
     if recording.depth_size is None or recording.intrinsics is None:
         why = f"{recording.kind}; an animal moves, so its distance cannot be triangulated from pictures"
-        raise no_depth(recording.where, why)
+        raise errors.no_depth(recording.where, why)
     _refuse_other_pictures(recording.intrinsics, recording.color_size, recording.where)
     if recording.depth_camera is None:
         _refuse_other_shape(recording.color_size, recording.depth_size, recording.where)
@@ -182,7 +181,7 @@ def _refuse_other_pictures(
     (height, width), (x, y) = color_size, np.median(intrinsics[:, :2, 2], axis=0)
     if not (0 < x < width and 0 < y < height):
         why = f"the intrinsics' center, {x:.0f} {y:.0f}, lies outside of pictures of {width} x {height}"
-        raise broken_metadata(where, why)
+        raise errors.broken_metadata(where, why)
 
 
 def _refuse_other_shape(color_size: tuple[int, int], depth_size: tuple[int, int], where: str) -> None:
@@ -320,7 +319,7 @@ def _decoded(stored: Picture, size: tuple[int, int], where: str) -> UInt8[np.nda
     color = images.decode_color(stored, where) if isinstance(stored, bytes) else stored
     if color.shape[:2] != size:
         declared = f"the recording declares {size[1]} x {size[0]}"
-        raise broken_metadata(where, f"the picture is {color.shape[1]} x {color.shape[0]}, {declared}")
+        raise errors.broken_metadata(where, f"the picture is {color.shape[1]} x {color.shape[0]}, {declared}")
     return color
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Float, UInt8
 
 from pipeline.core.errors import InputError
 from pipeline.data.images import MAX_PIXELS
-from pipeline.recordings.recording import damaged, no_frames
+from pipeline.recordings import errors
 
 _GUARDS = {
     "format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm",
@@ -57,8 +57,11 @@ class Movie:
         with self._opened() as (container, stream):
             times, end_s = _packet_times(container, stream)
             if not times or stream.time_base is None:
-                raise no_frames(self.where, "the video is empty")
-            missing = _cut_off(stream, path.stat().st_size) | _undelivered(container, stream, times, end_s)
+                raise errors.no_frames(self.where, "the video is empty")
+            # listed beyond the end of a file that was not copied completely
+            size = path.stat().st_size
+            missing = {each.timestamp for each in stream.index_entries if each.pos + each.size > size}
+            missing |= _undelivered(container, stream, times, end_s)
             self._pts = np.array(sorted(times | missing))
             self.complete = np.flatnonzero(~np.isin(self._pts, sorted(missing)))
             self.remarks = self._cut_off_remarks(float(stream.time_base))
@@ -69,7 +72,9 @@ class Movie:
         self._decoder: Iterator[av.VideoFrame] | None = None
         self._position = 0
         self._tone_mapper = VideoReformatter()
-        first = self._first()
+        first = next(self._decoded_from(0), None)
+        if first is None:
+            raise errors.damaged(self.where, "no frame of the video can be decoded")
         stretch = aspect if 1 / MAX_ASPECT <= aspect <= MAX_ASPECT else 1.0
         self.size = (first.height, round(first.width * stretch))
         self.quarter_turns = _quarter_turns(first)
@@ -99,7 +104,7 @@ class Movie:
         end_s, declared_s = (unit_s * (each - self._pts[0]) for each in (last, self._pts[-1]))
         ends = f"the pictures end after {end_s:.1f} of {declared_s:.1f} s"
         if lost > len(self.complete):
-            raise damaged(self.where, ends)
+            raise errors.damaged(self.where, ends)
         return (f"{ends}: {lost} of {len(self)} are missing, copy it again",) if lost else ()
 
     def _rgb(self, frame: av.VideoFrame) -> UInt8[np.ndarray, "height width 3"]:
@@ -117,12 +122,6 @@ class Movie:
             target = {"dst_color_trc": ColorTrc.IEC61966_2_1, "dst_color_primaries": ColorPrimaries.BT709}
             rgb = self._tone_mapper.reformat(plain, format="rgb24", **target).to_ndarray()
         return cv2.resize(rgb[::2], (width, height)) if frame.interlaced_frame else rgb
-
-    def _first(self) -> av.VideoFrame:
-        frame = next((frame for frame in self._decoded_from(0)), None)
-        if frame is None:
-            raise damaged(self.where, "no frame of the video can be decoded")
-        return frame
 
     def _decoded_from(self, number: int) -> Iterator[av.VideoFrame]:
         """Yield decoded frames, starting at or before frame ``number``.
@@ -153,14 +152,14 @@ class Movie:
         try:
             container = av.open(str(self._path), options=_GUARDS, metadata_errors="replace")
         except (av.error.FFmpegError, OSError) as error:
-            raise damaged(self.where, f"not a readable video: {error.strerror or error}") from error
+            raise errors.damaged(self.where, f"not a readable video: {error.strerror or error}") from error
         with container:
             if not container.streams.video:
-                raise no_frames(self.where, "the file holds no pictures")
+                raise errors.no_frames(self.where, "the file holds no pictures")
             stream = max(container.streams.video, key=_rank)
             codec = stream.codec_context
             if codec is None:
-                raise damaged(self.where, "the video is of an unknown codec")
+                raise errors.damaged(self.where, "the video is of an unknown codec")
             if codec.width * codec.height > MAX_PIXELS:
                 what = f"pictures of {codec.width} x {codec.height}, larger than any phone's"
                 raise InputError("CAP-001", what, self.where, "export it in 4K")
@@ -178,12 +177,6 @@ def _quarter_turns(frame: av.VideoFrame) -> int:
     matrix = frame.side_data.get("DISPLAYMATRIX")
     down_x, down_y = (0, 1) if matrix is None else np.frombuffer(bytes(matrix), np.int32)[3:5].tolist()
     return round(np.arctan2(-down_x, down_y) / (np.pi / 2)) % 4
-
-
-def _cut_off(stream: av.VideoStream, size_bytes: int) -> set[int]:
-    """Return the times of frames that are listed beyond the end of a file which was not copied completely."""
-    listed = stream.index_entries
-    return {entry.timestamp for entry in listed if entry.pos + entry.size > size_bytes}
 
 
 def _undelivered(

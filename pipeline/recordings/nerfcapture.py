@@ -10,16 +10,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.core.errors import InputError
+from pipeline.recordings import errors
 from pipeline.recordings.containers import Container, FolderContainer, ZipContainer, frame_number
 from pipeline.recordings.conventions import OPENGL
-from pipeline.recordings.recording import (
-    Y_UP,
-    Recording,
-    broken_metadata,
-    intrinsics_from_coefficients,
-    no_frames,
-    pose_from_matrix,
-)
+from pipeline.recordings.recording import Y_UP, Recording, intrinsics_from_coefficients, pose_from_matrix
 
 COEFFICIENTS = ("fl_x", "fl_y", "cx", "cy")
 MIN_REACH_M = 4.0
@@ -38,7 +32,7 @@ def open_recording(path: Path) -> Recording:
     listed = _frames(table, container)
     frames = [frame for frame in listed if {frame["file_path"], frame["depth_path"]} <= container.names]
     if not frames:
-        raise no_frames(container.where, "no frame has color and depth")
+        raise errors.no_frames(container.where, "no frame has color and depth")
     timestamp_s, remarks = _times(frames, container.where)
     depth_size = container.meters(frames[0]["depth_path"]).shape
     coefficients = np.array([frame["coefficients"] for frame in frames])
@@ -68,7 +62,9 @@ def _meters_per_unit(table: dict[str, Any], container: Container) -> float:
         raise InputError("CAP-010", what, container.where, remedy)
     scale = table.get("integer_depth_scale")
     if not isinstance(scale, int | float) or not 0 < scale < 1:
-        raise broken_metadata(container.where, "'integer_depth_scale' (meters per unit of depth) is missing")
+        raise errors.broken_metadata(
+            container.where, "'integer_depth_scale' (meters per unit of depth) is missing"
+        )
     if LARGEST_UNIT * scale < MIN_REACH_M:
         what = f"depth beyond {LARGEST_UNIT * scale:.3g} m was written as if it were near"
         remedy = "stream again with a depth_scale of 10, if need be as the default of nerfcapture_dataset.py"
@@ -100,8 +96,10 @@ def _frames(table: dict[str, Any], container: Container) -> list[dict[str, Any]]
             found.append(entry | dict(time=None if time_s is None else float(time_s)))
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         why = f"a frame of transforms.json cannot be read ({error!r})"
-        raise broken_metadata(container.where, why) from error
-    return sorted(found, key=lambda entry: _order(entry["file_path"]))
+        raise errors.broken_metadata(container.where, why) from error
+    stems = (Path(entry["file_path"]).stem for entry in found)
+    order = sorted((frame_number(stem) or 0, stem, row) for row, stem in enumerate(stems))
+    return [found[row] for _, _, row in order]
 
 
 def _member(name: str, container: Container) -> str:
@@ -110,16 +108,11 @@ def _member(name: str, container: Container) -> str:
     return next((each for each in (name, f"{name}.png", f"{name}.jpg") if each in container.names), name)
 
 
-def _order(name: str) -> tuple[int, str]:
-    stem = Path(name).stem
-    return (frame_number(stem) or 0, stem)
-
-
 def _times(frames: list[dict[str, Any]], where: str) -> tuple[np.ndarray, tuple[str, ...]]:
     if any(frame["time"] is None for frame in frames):
         remark = f"the frames carry no times: {ASSUMED_HZ:g} per second are assumed"
         return np.arange(len(frames)) / ASSUMED_HZ, (remark,)
     timestamp_s = np.array([frame["time"] for frame in frames])
     if not (np.isfinite(timestamp_s).all() and (np.diff(timestamp_s) > 0).all()):
-        raise broken_metadata(where, "the frames' times must increase with their numbers")
+        raise errors.broken_metadata(where, "the frames' times must increase with their numbers")
     return timestamp_s - timestamp_s[0], ()

@@ -12,17 +12,10 @@ from jaxtyping import Float
 from pipeline.core.errors import InputError
 from pipeline.core.videos import VIDEO_SUFFIXES
 from pipeline.data import images
-from pipeline.recordings import text_files
+from pipeline.recordings import errors, text_files
 from pipeline.recordings.containers import FolderContainer
 from pipeline.recordings.movies import Movie
-from pipeline.recordings.recording import (
-    Recording,
-    broken_metadata,
-    intrinsics_from_coefficients,
-    no_depth,
-    no_frames,
-    refuse_other_size,
-)
+from pipeline.recordings.recording import Recording
 
 
 def open_recording(path: Path) -> Recording:
@@ -34,24 +27,23 @@ def open_recording(path: Path) -> Recording:
         name for name in container.names if Path(name).suffix.lower() in VIDEO_SUFFIXES and "/" not in name
     )
     if len(movies) != 1:
-        raise broken_metadata(container.where, f"{len(movies)} videos in the folder instead of one")
+        raise errors.broken_metadata(container.where, f"{len(movies)} videos in the folder instead of one")
     movie = Movie(path / movies[0])
     depth = container.numbered("depth", ".png", ".exr")
     if not depth:
-        raise no_depth(container.where, "depth/ holds no numbered PNG or EXR pictures")
+        raise errors.no_depth(container.where, "depth/ holds no numbered PNG or EXR pictures")
     index = np.array(sorted(depth.keys() & set(movie.complete.tolist())), int)
     if len(index) == 0:
         why = "no depth picture carries the number of a video frame, counted from 0"
-        raise no_frames(container.where, why)
+        raise errors.no_frames(container.where, why)
     if (min(depth), max(depth)) == (1, len(movie)):
         what = f"depth is numbered from 1 to {len(movie)}, the video's frames from 0"
         raise InputError("CAP-004", what, container.where, "number depth/ and poses.txt from 0")
     if max(depth) + 1 < 0.5 * len(movie):
         why = f"{len(movie)} video frames, but depth up to number {max(depth)}: name it by the frame"
-        raise broken_metadata(container.where, why)
+        raise errors.broken_metadata(container.where, why)
     size = _depth(container, depth[int(index[0])], None).shape
-    coefficients, remarks = text_files.coefficients(container, default=None)
-    intrinsics = intrinsics_from_coefficients(np.tile(coefficients, (len(index), 1)), container.where)
+    intrinsics, remarks = text_files.read_intrinsics(container, len(index), default=None)
     camera, camera_remarks = text_files.depth_camera(container, intrinsics[0], (movie.size, size))
     return Recording(
         where=container.where,
@@ -96,7 +88,7 @@ def _depth(
     if name.lower().endswith(".png"):
         return container.meters(name, size)
     depth = images.read_depth(container.path(name), channel=None)
-    refuse_other_size(depth.shape, size, container.place(name))
+    errors.refuse_other_size(depth.shape, size, container.place(name))
     return depth
 
 

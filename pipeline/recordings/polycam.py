@@ -17,18 +17,10 @@ from jaxtyping import Float, UInt8
 
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
+from pipeline.recordings import errors
 from pipeline.recordings.containers import FolderContainer
 from pipeline.recordings.conventions import OPENGL
-from pipeline.recordings.recording import (
-    Y_UP,
-    Recording,
-    broken_metadata,
-    damaged,
-    intrinsics_from_coefficients,
-    no_depth,
-    no_frames,
-    pose_from_matrix,
-)
+from pipeline.recordings.recording import Y_UP, Recording, intrinsics_from_coefficients, pose_from_matrix
 
 TRUSTED_M = 5.0
 """maximum trusted depth, meters"""
@@ -47,14 +39,14 @@ def open_recording(path: Path) -> Recording:
     color, camera = ("corrected_images", "corrected_cameras") if corrected else ("images", "cameras")
     files = [container.numbered(f"keyframes/{part}") for part in (color, camera, "depth")]
     if not files[2]:
-        raise no_depth(container.where, "keyframes/depth is empty: record in LiDAR or room mode")
+        raise errors.no_depth(container.where, "keyframes/depth is empty: record in LiDAR or room mode")
     index = np.array(sorted(set.intersection(*map(set, files))), int)
     if len(index) == 0:
-        raise no_frames(container.where, "no keyframe has picture, camera and depth")
+        raise errors.no_frames(container.where, "no keyframe has picture, camera and depth")
     tables = [_camera(container, f"keyframes/{camera}/{number}.json") for number in index]
     sizes = {(int(table["height"]), int(table["width"])) for table in tables}
     if len(sizes) != 1:
-        raise broken_metadata(container.where, f"keyframes of {len(sizes)} sizes")
+        raise errors.broken_metadata(container.where, f"keyframes of {len(sizes)} sizes")
     size = _depth(container, int(index[0]), None).shape
     matrices = _columns(tables, MATRIX).reshape(-1, 3, 4)
     confidence = container.numbered("keyframes/confidence")
@@ -92,7 +84,7 @@ def _camera(container: FolderContainer, name: str) -> dict[str, float]:
         table = container.table(name)
         return {key: float(table[key]) for key in (*COEFFICIENTS, "width", "height", *MATRIX)}
     except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise broken_metadata(container.place(name), f"not a camera ({error!r})") from error
+        raise errors.broken_metadata(container.place(name), f"not a camera ({error!r})") from error
 
 
 def _columns(tables: list[dict[str, float]], keys: tuple[str, ...]) -> Float[np.ndarray, "frame column"]:
@@ -114,16 +106,16 @@ def _mesh(container: FolderContainer) -> Mesh:
         world_from_aligned = np.linalg.inv(aligned_from_world)
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         where = container.place("mesh_info.json")
-        raise broken_metadata(where, f"no alignmentTransform of 16 numbers ({error!r})") from error
+        raise errors.broken_metadata(where, f"no alignmentTransform of 16 numbers ({error!r})") from error
     try:
         data = container.read("raw.glb", MAX_MESH_BYTES)
         listed = json.loads(data[GLB_JSON_AT:][: struct.unpack_from("<I", data, GLB_JSON_LENGTH_AT)[0]])
         assert sum(each["count"] for each in listed["accessors"]) <= len(data), "more values than bytes"
         loaded = trimesh.load(io.BytesIO(data), file_type="glb", force="mesh")
     except Exception as error:  # readers raise anything for a truncated file
-        raise damaged(container.place("raw.glb"), repr(error)) from error
+        raise errors.damaged(container.place("raw.glb"), repr(error)) from error
     if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
-        raise damaged(container.place("raw.glb"), "it holds no surface")
+        raise errors.damaged(container.place("raw.glb"), "it holds no surface")
     vertices = rigid.apply(world_from_aligned, np.asarray(loaded.vertices, float)).astype(np.float32)
     return Mesh(vertices, np.asarray(loaded.faces, np.int32), np.full((len(vertices), 3), 128, np.uint8))
 

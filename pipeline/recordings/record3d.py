@@ -5,7 +5,6 @@ Files are matched with rows of the metadata by number, so that missing ones do n
 
 import math
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,25 +14,10 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.core.errors import InputError
 from pipeline.data import images
-from pipeline.recordings.containers import (
-    Container,
-    FolderContainer,
-    ZipContainer,
-    frame_number,
-    refuse_surplus_members,
-)
+from pipeline.recordings import errors
+from pipeline.recordings.containers import Container, FolderContainer, ZipContainer, frame_number
 from pipeline.recordings.conventions import OPENGL
-from pipeline.recordings.recording import (
-    Y_UP,
-    Recording,
-    broken_metadata,
-    damaged,
-    intrinsics_from_coefficients,
-    no_depth,
-    no_frames,
-    refuse_other_size,
-    wrong_depth,
-)
+from pipeline.recordings.recording import Y_UP, Recording, intrinsics_from_coefficients
 
 DEPTH_SIZES = {49_152: (256, 192), 307_200: (640, 480), 691_200: (960, 720)}
 """floats per picture -> (height, width) of a portrait recording, if the metadata lack it"""
@@ -59,11 +43,11 @@ class _Layout:
     metadata: str
     color: str
     depth: str
-    confidence: str
 
 
-_ARCHIVE = _Layout("metadata", "rgbd/%d.jpg", "rgbd/%d.depth", "rgbd/%d.conf")
-_FOLDER = _Layout("metadata.json", "rgb/%d.jpg", "depth/%d.exr", "confidence/%d.png")
+_ARCHIVE = _Layout("metadata", "rgbd/%d.jpg", "rgbd/%d.depth")
+_FOLDER = _Layout("metadata.json", "rgb/%d.jpg", "depth/%d.exr")
+_CONFIDENCE = "rgbd/%d.conf"
 
 
 def open_recording(path: Path) -> Recording:
@@ -83,18 +67,26 @@ def _open(container: Container, layout: _Layout) -> Recording:
         remedy = "export from Record3D as 'Shareable/Internal format (.r3d)' or 'EXR + JPG sequence'"
         raise InputError("CAP-003", what, container.where, remedy)
     metadata = _Metadata(container, layout.metadata)
-    refuse_surplus_members(container, metadata.declared_frames())
+    container.refuse_surplus_members(metadata.declared_frames())
     stored, pictures = (_numbers(container.names, each) for each in (layout.depth, layout.color))
     if not stored:
-        raise no_depth(container.where, "Record3D's archive holds none")
+        raise errors.no_depth(container.where, "Record3D's archive holds none")
     index = np.array(sorted(stored & pictures), int)
     if len(index) == 0:
-        raise no_frames(container.where, "none has color and depth")
+        raise errors.no_frames(container.where, "none has color and depth")
     timestamp_s = metadata.timestamp_s(index)
     index, timestamp_s = index[np.isfinite(timestamp_s)], timestamp_s[np.isfinite(timestamp_s)]
     intrinsics, pose = metadata.intrinsics(index), metadata.pose(index)
     depth_size = _depth_size(container, layout, metadata, int(index[0]))
     _refuse_face_id(depth_size, metadata.camera_type(), container.where)
+    confident = _numbers(container.names, _CONFIDENCE)
+
+    def confidence(frame: int) -> np.ndarray | None:
+        if frame not in confident:
+            return None
+        data = _decompress_exactly(container, _CONFIDENCE % frame, math.prod(depth_size))
+        return np.frombuffer(data, np.uint8).reshape(depth_size)
+
     return Recording(
         where=container.where,
         kind="Record3D .r3d" if layout is _ARCHIVE else "Record3D EXR + JPG",
@@ -106,7 +98,7 @@ def _open(container: Container, layout: _Layout) -> Recording:
         depth_size=depth_size,
         read_color=lambda i: container.read(layout.color % i),
         read_depth=lambda i: _read_depth(container, layout.depth % i, depth_size),
-        read_confidence=_confidence_reader(container, layout, index, depth_size),
+        read_confidence=None if confident.isdisjoint(index) else confidence,
         convention=OPENGL,
         up=metadata.up(),
         remarks=tuple(metadata.remarks),
@@ -214,7 +206,7 @@ class _Metadata:
         return array
 
     def _broken(self, why: str) -> InputError:
-        return broken_metadata(self._where, why)
+        return errors.broken_metadata(self._where, why)
 
 
 def _numbers(names: frozenset[str], pattern: str) -> set[int]:
@@ -233,7 +225,9 @@ def _depth_size(container: Container, layout: _Layout, metadata: _Metadata, firs
         return height, width
     floats = len(_decompress(container, layout.depth % first, 4 * max(DEPTH_SIZES))) // 4
     if floats not in DEPTH_SIZES:
-        raise wrong_depth(container.place(layout.depth % first), f"{floats} values fit no known depth camera")
+        raise errors.wrong_depth(
+            container.place(layout.depth % first), f"{floats} values fit no known depth camera"
+        )
     height, width = DEPTH_SIZES[floats]  # upright
     return (height, width) if metadata.color_size[0] >= metadata.color_size[1] else (width, height)
 
@@ -250,31 +244,14 @@ def _read_depth(container: Container, name: str, size: tuple[int, int]) -> Float
         depth = images.read_depth(container.path(name), channel="R")
     else:
         depth = np.frombuffer(_decompress_exactly(container, name, 4 * math.prod(size)), "<f4").reshape(size)
-    refuse_other_size(depth.shape, size, container.place(name))
+    errors.refuse_other_size(depth.shape, size, container.place(name))
     return depth
-
-
-def _confidence_reader(
-    container: Container, layout: _Layout, index: np.ndarray, size: tuple[int, int]
-) -> Callable[[int], np.ndarray | None] | None:
-    """Return a reader of confidence pictures, if frames have them."""
-    known = _numbers(container.names, layout.confidence)
-    if isinstance(container, FolderContainer) or known.isdisjoint(index):
-        return None
-
-    def read(frame: int) -> np.ndarray | None:
-        if frame not in known:
-            return None
-        data = _decompress_exactly(container, layout.confidence % frame, math.prod(size))
-        return np.frombuffer(data, np.uint8).reshape(size)
-
-    return read
 
 
 def _decompress_exactly(container: Container, name: str, expected: int) -> bytes:
     data = _decompress(container, name, expected)
     if len(data) != expected:
-        raise wrong_depth(container.place(name), f"{len(data)} bytes instead of {expected}")
+        raise errors.wrong_depth(container.place(name), f"{len(data)} bytes instead of {expected}")
     return data
 
 
@@ -284,10 +261,10 @@ def _decompress(container: Container, name: str, max_bytes: int) -> bytes:
     packed = container.read(name, max_bytes + max_bytes // 8 + 4096)
     try:
         if unpacked_bytes(packed) > max_bytes:
-            raise wrong_depth(where, f"more than {max_bytes} bytes")
+            raise errors.wrong_depth(where, f"more than {max_bytes} bytes")
         return lzfse.decompress(packed)
     except (BrokenBlockError, lzfse.error, MemoryError, ValueError) as error:
-        raise damaged(where, f"LZFSE: {error}") from error
+        raise errors.damaged(where, f"LZFSE: {error}") from error
 
 
 class BrokenBlockError(ValueError):

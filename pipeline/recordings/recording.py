@@ -10,17 +10,33 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from pipeline.core.errors import InputError
-from pipeline.geometry import rigid
+from pipeline.geometry import cameras, rigid
 from pipeline.geometry.meshes import Mesh
+from pipeline.recordings import errors
 from pipeline.recordings.conventions import OPENCV, Convention
-from pipeline.recordings.depth_camera import DepthCamera
 
 Y_UP = (0.0, 1.0, 0.0)
 ORTHONORMAL = 0.02
 """maximum deviation of R R^T from the identity, per entry"""
 Picture = bytes | UInt8[np.ndarray, "height width 3"]
 """an encoded JPEG or PNG, or decoded RGB"""
+NEAREST_M = 0.05
+"""minimum depth in the color camera, meters"""
+
+
+@dataclass(frozen=True)
+class DepthCamera:
+    """Intrinsics and extrinsics of a depth camera; both cameras have OpenCV axes."""
+
+    intrinsics: Float[np.ndarray, "3 3"]
+    """pixels of the depth picture as stored"""
+    depth_from_color: Float[np.ndarray, "4 4"]
+    """rigid, meters"""
+
+    @property
+    def baseline_m(self) -> float:
+        """Distance between the two cameras, meters."""
+        return float(np.linalg.norm(self.depth_from_color[:3, 3]))
 
 
 @dataclass(frozen=True)
@@ -69,40 +85,6 @@ class Recording:
         return max(0, self.listed - len(self.index)) / max(self.listed, 1)
 
 
-def damaged(where: str, why: str) -> InputError:
-    """Return the error for a damaged or truncated file."""
-    what = f"the recording is damaged or was not copied completely ({why})"
-    return InputError("CAP-001", what, where, "export it from the phone again")
-
-
-def broken_metadata(where: str, why: str) -> InputError:
-    """Return the error for invalid metadata, as after a change of the format."""
-    remedy = "export it from the phone again; if a newer app wrote it, report the app's version"
-    return InputError("CAP-004", f"the recording's metadata cannot be used: {why}", where, remedy)
-
-
-def no_depth(where: str, why: str) -> InputError:
-    """Return the error for recordings without depth."""
-    remedy = "record with a LiDAR phone, or add a depth picture per frame: see the README's table of formats"
-    return InputError("CAP-006", f"no depth: {why}", where, remedy)
-
-
-def no_frames(where: str, why: str) -> InputError:
-    """Return the error for recordings without a complete frame."""
-    return InputError("CAP-007", f"no usable frames: {why}", where, "export it from the phone again")
-
-
-def wrong_depth(where: str, why: str) -> InputError:
-    """Return the error for a depth picture of a wrong size or type."""
-    return InputError("CAP-008", f"a depth picture is wrong: {why}", where, "export it from the phone again")
-
-
-def refuse_other_size(shape: tuple[int, ...], size: tuple[int, int] | None, where: str) -> None:
-    """Raise CAP-008 for a depth picture whose (height, width) is not ``size``, if given."""
-    if size is not None and shape != size:
-        raise wrong_depth(where, f"{shape[1]} x {shape[0]} instead of {size[1]} x {size[0]}")
-
-
 def pose_from_matrix(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "frame 7"]:
     """Convert matrices to poses (quaternion xyzw, translation); NaN where one is not a rigid motion."""
     pose = np.full((len(world_from_camera), 7), np.nan)
@@ -125,7 +107,41 @@ def intrinsics_from_coefficients(
 ) -> Float[np.ndarray, "frame 3 3"]:
     """Convert (fx, fy, cx, cy) per frame to matrices. Raises CAP-004 for impossible values."""
     if not np.isfinite(coefficients).all() or np.any(coefficients[:, :2] <= 0):
-        raise broken_metadata(where, "the focal length must be positive")
+        raise errors.broken_metadata(where, "the focal length must be positive")
     intrinsics = np.tile(np.eye(3), (len(coefficients), 1, 1))
     intrinsics[:, [0, 1, 0, 1], [0, 1, 2, 2]] = coefficients
     return intrinsics
+
+
+def grid_size(depth_size: tuple[int, int], color_size: tuple[int, int]) -> tuple[int, int]:
+    """Return the (height, width) of reprojected depth: the color's aspect ratio, the depth's longer side."""
+    share = max(depth_size) / max(color_size)
+    return round(color_size[0] * share), round(color_size[1] * share)
+
+
+def reproject(
+    depth: Float[np.ndarray, "depth_height depth_width"],
+    camera: DepthCamera,
+    color_intrinsics: Float[np.ndarray, "3 3"],
+    color_size: tuple[int, int],
+) -> Float[np.ndarray, "height width"]:
+    """Return the depth that the color camera would measure, meters, 0 = unknown, on a grid of `grid_size`.
+
+    Every known pixel is splatted to the cells that its footprint covers, the nearest surface wins.
+    """
+    height, width = size = grid_size(depth.shape, color_size)
+    intrinsics = cameras.scale_intrinsics(color_intrinsics, color_size, size)
+    known = depth > 0
+    points_depth = cameras.back_project(depth, camera.intrinsics)[known]
+    pixel, z = cameras.project(rigid.apply(rigid.inverse(camera.depth_from_color), points_depth), intrinsics)
+    ahead = z > NEAREST_M
+    pixel, z = pixel[ahead], z[ahead].astype(np.float32)
+    footprint = intrinsics[[0, 1], [0, 1]] / camera.intrinsics[[0, 1], [0, 1]]
+    cells = max(1, int(np.ceil(footprint.max())))
+    nearest = np.full(height * width, np.inf, np.float32)
+    for down in range(cells):
+        for right in range(cells):
+            corner = np.floor(pixel - (cells - 1) / 2).astype(int) + np.array([right, down])
+            inside = (corner >= 0).all(1) & (corner < (width, height)).all(1)
+            np.minimum.at(nearest, corner[inside, 1] * width + corner[inside, 0], z[inside])
+    return np.where(np.isfinite(nearest), nearest, np.float32(0)).reshape(size)

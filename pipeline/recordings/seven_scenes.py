@@ -9,14 +9,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.recordings import text_files
+from pipeline.recordings import errors, text_files
 from pipeline.recordings.containers import FolderContainer
-from pipeline.recordings.depth_camera import DepthCamera
 from pipeline.recordings.recording import (
+    DepthCamera,
     Recording,
     intrinsics_from_coefficients,
-    no_depth,
-    no_frames,
     pose_from_matrix,
 )
 
@@ -42,18 +40,19 @@ def open_recording(path: Path) -> Recording:
         if match:
             files[match[2].split(".")[0]][int(match[1])] = name
     if not files["depth"]:
-        raise no_depth(container.where, "there is no frame-*.depth.png")
+        raise errors.no_depth(container.where, "there is no frame-*.depth.png")
     index = np.array(sorted(files["color"].keys() & files["depth"].keys()), int)
     if len(index) == 0:
-        raise no_frames(container.where, "no frame has color and depth")
+        raise errors.no_frames(container.where, "no frame has color and depth")
     first = int(index[0])
     sizes = container.color(files["color"][first]).shape[:2], container.meters(files["depth"][first]).shape
     kinect = sizes == (KINECT_SIZE, KINECT_SIZE)
-    coefficients, remarks = text_files.coefficients(container, KINECT_DEPTH if kinect else None)
-    intrinsics = intrinsics_from_coefficients(np.tile(coefficients, (len(index), 1)), container.where)
+    default = KINECT_DEPTH if kinect else None
+    intrinsics, remarks = text_files.read_intrinsics(container, len(index), default)
     camera, camera_remarks = text_files.depth_camera(container, intrinsics[0], sizes)
-    if camera is None and kinect and np.abs(coefficients - KINECT_DEPTH).max() < SAME_LENS_PX:
-        camera = DepthCamera(intrinsics[0], KINECT_DEPTH_FROM_COLOR, KINECT_SIZE)
+    given = intrinsics[0, [0, 1, 0, 1], [0, 1, 2, 2]]
+    if camera is None and kinect and np.abs(given - KINECT_DEPTH).max() < SAME_LENS_PX:
+        camera = DepthCamera(intrinsics[0], KINECT_DEPTH_FROM_COLOR)
         intrinsics = intrinsics_from_coefficients(np.tile(KINECT_COLOR, (len(index), 1)), container.where)
         camera_remarks = (text_files.depth_camera_remark(camera, intrinsics[0]),)
     return Recording(

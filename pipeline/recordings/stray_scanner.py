@@ -12,19 +12,10 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from pipeline.core.errors import InputError
-from pipeline.recordings import text_files
+from pipeline.recordings import errors, text_files
 from pipeline.recordings.containers import FolderContainer
 from pipeline.recordings.movies import Movie
-from pipeline.recordings.recording import (
-    Y_UP,
-    Recording,
-    broken_metadata,
-    intrinsics_from_coefficients,
-    no_depth,
-    no_frames,
-    refuse_other_size,
-    wrong_depth,
-)
+from pipeline.recordings.recording import Y_UP, Recording, intrinsics_from_coefficients
 
 INTRINSICS_SIZE = (1440, 1920)
 """(height, width) that the app's intrinsics refer to, whatever the video's size"""
@@ -58,11 +49,11 @@ def open_recording(path: Path) -> Recording:
     rows = read_odometry(container.text("odometry.csv"), container.place("odometry.csv"))
     depth = container.numbered("depth")
     if not depth:
-        raise no_depth(container.where, "the folder depth/ is empty")
+        raise errors.no_depth(container.where, "the folder depth/ is empty")
     complete = depth.keys() & set(movie.complete.tolist())
     valid = np.array([int(number) in complete for number in rows.frame], bool)
     if not valid.any():
-        raise no_frames(container.where, "none has color, depth and odometry")
+        raise errors.no_frames(container.where, "none has color, depth and odometry")
     index = rows.frame[valid]
     timestamp_s = movie.timestamp_s[index] if rows.timestamp_s is None else rows.timestamp_s[valid]
     size = _depth(container, depth[int(index[0])], None).shape
@@ -101,7 +92,7 @@ def read_odometry(text: str, where: str) -> OdometryTable:
     if {"timestamp", *POSE} <= set(header):
         lines = lines[1:]
     elif len(header) != len(OLDEST):
-        raise broken_metadata(where, f"columns {', '.join(header) or 'none'} are no odometry")
+        raise errors.broken_metadata(where, f"columns {', '.join(header) or 'none'} are no odometry")
     else:
         header = OLDEST
     lines = lines[: len(lines) - (len(lines) > 1 and len(lines[-1]) < len(lines[0]))]
@@ -109,15 +100,15 @@ def read_odometry(text: str, where: str) -> OdometryTable:
     try:
         column = {name: np.array([float(row[i] or "nan") for row in lines]) for i, name in known}
     except (ValueError, IndexError) as error:
-        raise broken_metadata(where, f"a row is cut or no numbers ({error})") from error
+        raise errors.broken_metadata(where, f"a row is cut or no numbers ({error})") from error
     timestamp_s = column.get("timestamp", np.arange(len(lines)))
     later = timestamp_s > np.fmax.accumulate(np.r_[-np.inf, timestamp_s[:-1]])
     if later.sum() < MIN_TIMED * len(lines):
-        raise broken_metadata(where, "the times must increase")
+        raise errors.broken_metadata(where, "the times must increase")
     column = {name: values[later] for name, values in column.items()}
     frame = column.get("frame", np.flatnonzero(later))
     if not (np.isfinite(frame) & (frame >= 0) & (frame < MAX_FRAMES)).all():
-        raise broken_metadata(where, "a frame has no number")
+        raise errors.broken_metadata(where, "a frame has no number")
     pose, coefficients = np.stack([column[name] for name in POSE], axis=1), None
     if set(COEFFICIENTS) <= set(column):
         coefficients = np.stack([column[name] for name in COEFFICIENTS], axis=1)
@@ -133,7 +124,7 @@ def _intrinsics(
         coefficients = rows.coefficients[valid]
     else:
         if "camera_matrix.csv" not in container.names:
-            raise broken_metadata(container.where, "camera_matrix.csv is missing")
+            raise errors.broken_metadata(container.where, "camera_matrix.csv is missing")
         coefficients = text_files.read_coefficients(container, "camera_matrix.csv")
         coefficients = np.tile(coefficients, (int(valid.sum()), 1))
     height, width = (size[0] / INTRINSICS_SIZE[0], size[1] / INTRINSICS_SIZE[1])
@@ -149,10 +140,10 @@ def _depth(
     try:
         raw = np.load(io.BytesIO(container.read(name)), allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
-        raise wrong_depth(container.place(name), str(error)) from error
+        raise errors.wrong_depth(container.place(name), str(error)) from error
     if raw.ndim != 2 or raw.dtype != np.uint16:
-        raise wrong_depth(container.place(name), f"{raw.dtype} {raw.shape}")
-    refuse_other_size(raw.shape, size, container.place(name))
+        raise errors.wrong_depth(container.place(name), f"{raw.dtype} {raw.shape}")
+    errors.refuse_other_size(raw.shape, size, container.place(name))
     return raw.astype(np.float32) / np.float32(1000)
 
 

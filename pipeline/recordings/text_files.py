@@ -5,9 +5,9 @@ from jaxtyping import Float
 
 from pipeline.core.errors import InputError
 from pipeline.geometry import cameras
+from pipeline.recordings import errors
 from pipeline.recordings.containers import Container
-from pipeline.recordings.depth_camera import DepthCamera
-from pipeline.recordings.recording import broken_metadata, intrinsics_from_coefficients, pose_from_matrix
+from pipeline.recordings.recording import DepthCamera, intrinsics_from_coefficients, pose_from_matrix
 
 INTRINSICS = ("intrinsics.txt", "camera-intrinsics.txt", "camera_matrix.csv")
 """3 x 3 or 4 x 4 matrix, or the four numbers fx fy cx cy, in color pixels"""
@@ -34,28 +34,30 @@ def table(
         read = np.array(numbers).reshape(len(cells), columns)
     except ValueError as error:
         why = f"not a table of {columns} columns of numbers"
-        raise broken_metadata(container.place(name), why) from error
+        raise errors.broken_metadata(container.place(name), why) from error
     if rows is not None and len(read) != rows:
-        raise broken_metadata(container.place(name), f"{len(read)} rows instead of {rows}")
+        raise errors.broken_metadata(container.place(name), f"{len(read)} rows instead of {rows}")
     return read
 
 
-def coefficients(
-    container: Container, default: tuple[float, ...] | None
-) -> tuple[Float[np.ndarray, "4"], tuple[str, ...]]:
-    """Return (fx, fy, cx, cy) from a file beside the pictures, or the default and a remark.
+def read_intrinsics(
+    container: Container, frames: int, default: tuple[float, ...] | None
+) -> tuple[Float[np.ndarray, "frame 3 3"], tuple[str, ...]]:
+    """Return the intrinsics of all frames, from a file beside the pictures, or the default and a remark.
 
-    Raises CAP-011 without either.
+    ``default`` is (fx, fy, cx, cy). Raises CAP-011 without either.
     """
-    name = next((name for name in INTRINSICS if name in container.names), None)
+    name, remarks = next((name for name in INTRINSICS if name in container.names), None), ()
     if name is not None:
-        return read_coefficients(container, name), ()
-    if default is None:
+        coefficients = read_coefficients(container, name)
+    elif default is not None:
+        coefficients, (fx, _, cx, cy) = np.array(default), default
+        remarks = (f"no intrinsics.txt: the default fx {fx:g}, cx {cx:g}, cy {cy:g} is assumed",)
+    else:
         remedy = "write intrinsics.txt with the four numbers fx fy cx cy, in color pixels"
         what = "the focal length of these pictures is unknown"
         raise InputError("CAP-011", what, container.where, remedy)
-    fx, _, cx, cy = default
-    return np.array(default), (f"no intrinsics.txt: the default fx {fx:g}, cx {cx:g}, cy {cy:g} is assumed",)
+    return intrinsics_from_coefficients(np.tile(coefficients, (frames, 1)), container.where), remarks
 
 
 def read_coefficients(container: Container, name: str) -> Float[np.ndarray, "4"]:
@@ -63,14 +65,14 @@ def read_coefficients(container: Container, name: str) -> Float[np.ndarray, "4"]
     try:
         numbers = np.array([float(cell) for cell in container.text(name).replace(",", " ").split()])
     except ValueError as error:
-        raise broken_metadata(container.place(name), "it holds more than numbers") from error
+        raise errors.broken_metadata(container.place(name), "it holds more than numbers") from error
     if len(numbers) == 4:
         return numbers
     if len(numbers) in (9, 16):
         side = 3 if len(numbers) == 9 else 4
         return numbers.reshape(side, side)[[0, 1, 0, 1], [0, 1, 2, 2]]
     why = f"{len(numbers)} numbers are neither fx fy cx cy nor a matrix"
-    raise broken_metadata(container.place(name), why)
+    raise errors.broken_metadata(container.place(name), why)
 
 
 def depth_camera(
@@ -95,8 +97,8 @@ def depth_camera(
         depth_from_color = table(container, DEPTH_FROM_COLOR, 4, rows=4)
         if not np.isfinite(pose_from_matrix(depth_from_color[None])).all():
             why = "it is no rigid motion: rotation and translation in meters, four rows"
-            raise broken_metadata(container.place(DEPTH_FROM_COLOR), why)
-    found = DepthCamera(intrinsics, depth_from_color, depth_size)
+            raise errors.broken_metadata(container.place(DEPTH_FROM_COLOR), why)
+    found = DepthCamera(intrinsics, depth_from_color)
     return found, (depth_camera_remark(found, color_intrinsics),)
 
 

@@ -11,16 +11,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.geometry import cameras
-from pipeline.recordings import text_files
+from pipeline.recordings import errors, text_files
 from pipeline.recordings.containers import FolderContainer
 from pipeline.recordings.conventions import OPENCV, DepthPicture, check_poses
-from pipeline.recordings.recording import (
-    Recording,
-    broken_metadata,
-    intrinsics_from_coefficients,
-    no_depth,
-    no_frames,
-)
+from pipeline.recordings.recording import Recording
 
 DEFAULT_SIZE = (480, 640)
 """(height, width) that the default intrinsics refer to"""
@@ -41,9 +35,9 @@ def open_recording(path: Path) -> Recording:
     container = FolderContainer(path)
     color, depth_files = _listed(container, "rgb.txt"), _listed(container, "depth.txt")
     if not depth_files:
-        raise no_depth(container.where, "depth.txt lists nothing")
+        raise errors.no_depth(container.where, "depth.txt lists nothing")
     if not color:
-        raise no_frames(container.where, "rgb.txt lists nothing")
+        raise errors.no_frames(container.where, "rgb.txt lists nothing")
     times = np.array([time for time, _ in color])
     partner = nearest(times, np.array([time for time, _ in depth_files]), NEAREST_S)
     paired = np.flatnonzero(partner >= 0)
@@ -51,11 +45,10 @@ def open_recording(path: Path) -> Recording:
     present = np.array([set(pair) <= container.names for pair in pairs], bool)
     paired, pairs = paired[present], [pair for pair, there in zip(pairs, present, strict=True) if there]
     if not pairs:
-        raise no_frames(container.where, "no color picture has depth within 20 ms")
+        raise errors.no_frames(container.where, "no color picture has depth within 20 ms")
     color_size, depth_size = container.color(pairs[0][0]).shape[:2], container.meters(pairs[0][1]).shape
     default = DEFAULT if color_size == DEFAULT_SIZE else None
-    coefficients, remarks = text_files.coefficients(container, default)
-    intrinsics = intrinsics_from_coefficients(np.tile(coefficients, (len(pairs), 1)), container.where)
+    intrinsics, remarks = text_files.read_intrinsics(container, len(pairs), default)
     camera, camera_remarks = text_files.depth_camera(container, intrinsics[0], (color_size, depth_size))
     pose = _poses(container, times[paired])
 
@@ -104,7 +97,7 @@ def _listed(container: FolderContainer, name: str) -> list[tuple[float, str]]:
             found.append((time_s, cells[1]))
         except (ValueError, IndexError) as error:
             why = f"{line[:QUOTED]!r} is no time and file name"
-            raise broken_metadata(container.place(name), why) from error
+            raise errors.broken_metadata(container.place(name), why) from error
     return sorted(dict(found).items())
 
 
@@ -136,7 +129,7 @@ def _units_per_meter(
     if name in container.names:
         per_meter = float(text_files.table(container, name, 1, rows=1)[0, 0])
         if not 0 < per_meter < np.inf:
-            raise broken_metadata(container.place(name), "the units per meter must be positive")
+            raise errors.broken_metadata(container.place(name), "the units per meter must be positive")
         return per_meter, ()
     assumed = PER_METER, (f"no {name}: {PER_METER:g} units per meter are assumed",)
     known = np.arange(0) if pose is None else np.flatnonzero(np.isfinite(pose).all(1))

@@ -10,9 +10,9 @@ from jaxtyping import Float, UInt8
 from pipeline.geometry import rigid
 from pipeline.geometry.subsampling import evenly
 from pipeline.mapping.picture_agreement import PictureAgreement
-from pipeline.recordings import extraction
+from pipeline.recordings import errors, extraction
 from pipeline.recordings.extraction import ExtractionPlan
-from pipeline.recordings.recording import Recording, damaged
+from pipeline.recordings.recording import Recording
 
 SIDE_PX, JPEG_QUALITY = 640, 50
 """of the pictures, which are not kept"""
@@ -155,4 +155,4 @@ def _look_at_pictures(recording: Recording, count: int) -> RecordingSample:
 
 def _refuse_empty(recording: Recording, shots: Sequence[SampledFrame]) -> None:
     if not shots:
-        raise damaged(recording.where, "none of the sampled pictures can be decoded")
+        raise errors.damaged(recording.where, "none of the sampled pictures can be decoded")

@@ -36,8 +36,8 @@ MIN_AGREEING = 2
 """Other frames that must agree on a depth; one more makes it certain."""
 
 ROUNDS, MIN_PIXELS, DEPTH_RANGE_M = 8, 50, (0.1, 20.0)
-"""Alignment of a network's depth: iterations of reweighted least squares, least map pixels, and range of valid
-depth, meters."""
+"""Alignment of a network's depth: iterations of reweighted least squares, least map pixels, range of depth in
+meters."""
 
 DepthNet = Callable[[int, Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]], np.ndarray]
 """Depth of one frame by a network, meters, given the map's depth and where it is valid."""

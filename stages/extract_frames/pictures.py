@@ -9,8 +9,8 @@ from pipeline.core.progress import log, track
 from pipeline.data import images, qa
 from pipeline.data.clips import PICTURES
 from pipeline.geometry import cameras
-from pipeline.recordings import extraction
-from pipeline.recordings.recording import Recording, damaged
+from pipeline.recordings import errors, extraction
+from pipeline.recordings.recording import Recording
 from stages.extract_frames.config import Config
 from stages.extract_frames.writing import BLURRED_SHARE, MAX_LOST, MIN_FRAMES, SHEET_FRAMES, thumbnail
 
@@ -33,7 +33,9 @@ def write(folder: Path, recording: Recording, config: Config) -> None:
         if row in shown:
             strip.append(thumbnail(color))
     if len(rows) - len(chosen) > MAX_LOST * len(rows):
-        raise damaged(recording.where, f"{len(rows) - len(chosen)} of {len(rows)} pictures cannot be decoded")
+        raise errors.damaged(
+            recording.where, f"{len(rows) - len(chosen)} of {len(rows)} pictures cannot be decoded"
+        )
     if len(chosen) < MIN_FRAMES:
         what = f"{len(chosen)} pictures, {MIN_FRAMES} are the least"
         raise InputError("CAP-007", what, recording.where, "record some seconds at least")

@@ -12,9 +12,9 @@ from pipeline.core.errors import InputError
 from pipeline.data import images, ply, qa
 from pipeline.data.clips import FRAMES
 from pipeline.mapping.picture_agreement import PictureAgreement
-from pipeline.recordings import extraction
+from pipeline.recordings import errors, extraction
 from pipeline.recordings.extraction import DARK, MEASURED, RELATIVE, ExtractedFrame, ExtractionPlan
-from pipeline.recordings.recording import Recording, damaged
+from pipeline.recordings.recording import Recording
 
 MAX_LOST = 0.5
 """maximum share of damaged pictures (0..1)"""
@@ -67,7 +67,7 @@ def write_frames(
         statistics.append((frame.sharpness, frame.brightness, frame.depth_valid))
         usable[number] = True
     if lost > MAX_LOST * total:
-        raise damaged(where, f"{lost} of {total} pictures cannot be decoded")
+        raise errors.damaged(where, f"{lost} of {total} pictures cannot be decoded")
     if len(statistics) < MIN_FRAMES:
         known = f"{min_depth_valid:.0%} of the depth is known in {len(statistics)} of {total} frames"
         what = f"{known}; {MIN_FRAMES} are the least"

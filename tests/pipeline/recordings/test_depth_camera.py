@@ -6,9 +6,9 @@ import pytest
 from pipeline.core.errors import InputError
 from pipeline.geometry import cameras, rigid
 from pipeline.geometry.meshes import RayCaster, render_view
-from pipeline.recordings import depth_camera, extraction
-from pipeline.recordings.depth_camera import DepthCamera
+from pipeline.recordings import extraction
 from pipeline.recordings.formats import open_recording
+from pipeline.recordings.recording import DepthCamera, reproject
 from tests.pipeline.recordings import made_formats
 from tests.stages import textured_room
 from tests.stages.extract_frames.made_recordings import walk
@@ -28,8 +28,8 @@ def test_reprojected_depth_equals_that_of_the_color_camera(share):
     lens = cameras.scale_intrinsics(DEPTH, DEPTH_SIZE, size)
     measured, _ = render_view(caster, place @ rigid.inverse(DEPTH_FROM_COLOR), lens, *size)
     true, _ = render_view(caster, place, cameras.scale_intrinsics(COLOR, COLOR_SIZE, size), *size)
-    camera = DepthCamera(lens, DEPTH_FROM_COLOR, size)
-    found = depth_camera.reproject(measured, camera, COLOR, COLOR_SIZE)
+    camera = DepthCamera(lens, DEPTH_FROM_COLOR)
+    found = reproject(measured, camera, COLOR, COLOR_SIZE)
     assert found.shape == true.shape
     known = (found > 0) & (true > 0)
     error = np.abs(found - true)[known]
@@ -43,8 +43,8 @@ def test_occluded_surfaces_are_removed():
     """A post at 1 m occludes different strips of the wall in each camera: the nearer surface wins."""
     depth = np.full(DEPTH_SIZE, 3.0, np.float32)
     depth[:, 150:170] = 1.0
-    camera = DepthCamera(COLOR, rigid.make(np.eye(3), np.array([0.05, 0.0, 0.0])), DEPTH_SIZE)
-    found = depth_camera.reproject(depth, camera, COLOR, COLOR_SIZE)
+    camera = DepthCamera(COLOR, rigid.make(np.eye(3), np.array([0.05, 0.0, 0.0])))
+    found = reproject(depth, camera, COLOR, COLOR_SIZE)
     shift = round(210 * 0.05)
     assert (found[120, 151 - shift : 169 - shift] == 1.0).all()
     assert found[120, 100] == 3.0

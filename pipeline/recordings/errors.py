@@ -1,0 +1,37 @@
+"""The errors that several readers of recordings raise."""
+
+from pipeline.core.errors import InputError
+
+
+def damaged(where: str, why: str) -> InputError:
+    """Return the error for a damaged or truncated file."""
+    what = f"the recording is damaged or was not copied completely ({why})"
+    return InputError("CAP-001", what, where, "export it from the phone again")
+
+
+def broken_metadata(where: str, why: str) -> InputError:
+    """Return the error for invalid metadata, as after a change of the format."""
+    remedy = "export it from the phone again; if a newer app wrote it, report the app's version"
+    return InputError("CAP-004", f"the recording's metadata cannot be used: {why}", where, remedy)
+
+
+def no_depth(where: str, why: str) -> InputError:
+    """Return the error for recordings without depth."""
+    remedy = "record with a LiDAR phone, or add a depth picture per frame: see the README's table of formats"
+    return InputError("CAP-006", f"no depth: {why}", where, remedy)
+
+
+def no_frames(where: str, why: str) -> InputError:
+    """Return the error for recordings without a complete frame."""
+    return InputError("CAP-007", f"no usable frames: {why}", where, "export it from the phone again")
+
+
+def wrong_depth(where: str, why: str) -> InputError:
+    """Return the error for a depth picture of a wrong size or type."""
+    return InputError("CAP-008", f"a depth picture is wrong: {why}", where, "export it from the phone again")
+
+
+def refuse_other_size(shape: tuple[int, ...], size: tuple[int, int] | None, where: str) -> None:
+    """Raise CAP-008 for a depth picture whose (height, width) is not ``size``, if given."""
+    if size is not None and shape != size:
+        raise wrong_depth(where, f"{shape[1]} x {shape[0]} instead of {size[1]} x {size[0]}")
