@@ -1,5 +1,4 @@
-"""Checkpoints of foundation models: folders as `save_pretrained` writes them, read with the optional
-`transformers`.
+"""Checkpoints of foundation models: folders of `save_pretrained`, read with the optional `transformers`.
 
 Nothing is downloaded: a missing library or checkpoint is an error that says where to get it. Pictures are
 prepared here, without torchvision, as the checkpoint's own `preprocessor_config.json` says.

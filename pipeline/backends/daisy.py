@@ -4,12 +4,9 @@
 `FeatureBasis.project` gives the 16 unit-length channels that fields, templates and losses use. Gradients
 normalized per patch make them blind to exposure and white balance.
 
-Chosen by measurement (`benchmarks.descriptors`: share of cells whose likest cell in a view 5-45 degrees away
-is the true one or touches it; raw, then with 16 channels). 12 pairs each of a real kitchen, of the same with
-one view relit, and between built-in sessions: DAISY 0.132 0.120, 0.130 0.117, 0.266 0.228; dense SIFT 0.140
-0.120, 0.139 0.120, 0.270 0.228 at three times the seconds. Between sessions only: multiple kernel descriptors
-0.220 0.182 (DAISY 0.266 0.229) and, on 5 pairs, VGG 0.152 0.132 (DAISY 0.205 0.194). DAISY of radius 8 with
-partial normalization finds half of what this one finds.
+Chosen by measurement (`benchmarks.descriptors`): with 16 channels 0.120 of the cells of a real kitchen find
+their true cell in another view, as many as by dense SIFT in three times the seconds; multiple kernel
+descriptors and VGG find fewer, and so does DAISY of radius 8 with partial normalization.
 """
 
 from dataclasses import dataclass

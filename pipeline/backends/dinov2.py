@@ -1,7 +1,5 @@
 """DINOv2 (Oquab et al. 2023) as dense descriptors: a patch per cell, so that cells need no interpolation."""
 
-from pathlib import Path
-
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -17,7 +15,7 @@ class Dinov2:
 
     def __init__(self, weights: str, device: str) -> None:
         """Load a checkpoint folder. Raises MOD-001, MOD-002 and MOD-003 as `checkpoints` does."""
-        path: Path = checkpoints.folder(weights, "DINOv2", CHECKPOINT)
+        path = checkpoints.folder(weights, "DINOv2", CHECKPOINT)
         self._model = checkpoints.model("Dinov2Model", path, device)
         self._preparation = checkpoints.Preparation.read(path, Image.Resampling.BICUBIC)
         self._device = device

@@ -1,10 +1,8 @@
-"""Depth from one picture by a network: Depth Anything V2 (Yang et al. 2024) or Depth Pro (Bochkovskii et al.
-2024).
+"""Depth from one picture: Depth Anything V2 (Yang et al. 2024) or Depth Pro (Bochkovskii et al. 2024).
 
 Both answer in proportion to inverse depth, or are turned into it; meters come from whoever knows some.
 """
 
-from pathlib import Path
 from typing import Literal, assert_never
 
 import numpy as np
@@ -32,7 +30,7 @@ class MonocularDepth:
 
     def __init__(self, kind: Kind, weights: str, device: str) -> None:
         """Load a checkpoint folder. Raises MOD-001, MOD-002 and MOD-003 as `checkpoints` does."""
-        path: Path = checkpoints.folder(weights, kind, CHECKPOINTS[kind])
+        path = checkpoints.folder(weights, kind, CHECKPOINTS[kind])
         self._kind: Kind = kind
         self._device = device
         match kind:

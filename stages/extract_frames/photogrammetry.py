@@ -9,7 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Int, UInt8
 
 from pipeline.core.errors import InputError
 from pipeline.core.progress import track
@@ -61,7 +61,20 @@ def map_pictures(
     world_from_camera[:, :3, 3] *= unit_m
     views_m = [(each, view.intrinsics) for each, view in zip(depth, views, strict=True)]
     turns = recording.quarter_turns or upright.quarter_turns_from_room(world_from_camera, views_m)
-    plan = _plan(recording, solved, views, world_from_camera, turns, size, scale)
+    intrinsics = cameras.turn_intrinsics(solved.intrinsics, size, turns)
+    depth_intrinsics = [cameras.turn_intrinsics(view.intrinsics, view.gray.shape, turns) for view in views]
+    plan = ExtractionPlan(
+        chosen=sparse.frame,
+        timestamp_s=recording.timestamp_s[sparse.frame],
+        stored_size=size,
+        intrinsics=np.repeat(intrinsics[None], len(views), axis=0),
+        depth_intrinsics=np.stack(depth_intrinsics),
+        odometry_from_camera=cameras.turn_camera(world_from_camera, turns),
+        gravity_known=False,
+        quarter_turns=turns,
+        pose_check=PoseCheck("untested", OPENCV, "poses and depth from the pictures alone"),
+        scale=scale,
+    )
     upright_frames = zip(pictures, depth, confidence, strict=True)
     frames = (_frame(*each, turns, settings.jpeg_quality) for each in upright_frames)
     return plan, frames, _summary(recording, rows, solved, scale)
@@ -173,32 +186,6 @@ def _unit_m(
             return unit_m, name
     known = np.concatenate([each[each > 0] for each in depth])
     return TYPICAL_DEPTH_M / float(np.median(known)) if len(known) else 1.0, extraction.RELATIVE
-
-
-def _plan(
-    recording: Recording,
-    solved: Structure,
-    views: list[SweepView],
-    world_from_camera: Float[np.ndarray, "key 4 4"],
-    turns: int,
-    size: tuple[int, int],
-    scale: str,
-) -> ExtractionPlan:
-    rows = solved.sparse.frame
-    intrinsics = cameras.turn_intrinsics(solved.intrinsics, size, turns)
-    depth_intrinsics = [cameras.turn_intrinsics(view.intrinsics, view.gray.shape, turns) for view in views]
-    return ExtractionPlan(
-        chosen=rows,
-        timestamp_s=recording.timestamp_s[rows],
-        stored_size=size,
-        intrinsics=np.repeat(intrinsics[None], len(rows), axis=0),
-        depth_intrinsics=np.stack(depth_intrinsics),
-        odometry_from_camera=cameras.turn_camera(world_from_camera, turns),
-        gravity_known=False,
-        quarter_turns=turns,
-        pose_check=PoseCheck("untested", OPENCV, "poses and depth from the pictures alone"),
-        scale=scale,
-    )
 
 
 def _frame(

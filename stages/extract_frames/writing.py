@@ -131,8 +131,11 @@ def report_quality(
         qa.Check("clockwise quarter turns applied", float(plan.quarter_turns)),
         qa.Check("device poses usable", with_poses, "", warn=0.5, better="higher"),
         _check_of_poses(plan),
-        *_check_of_pictures(agreement),
     ]
+    if agreement is not None and agreement.verdict != "untested":
+        agreeing = {"agree": 1.0, "unconfirmed": 0.5, "contradict": 0.0}[agreement.verdict]
+        name = f"pictures against depth, intrinsics and poses ({agreement.reason})"
+        checks.append(qa.Check(name, agreeing, "", warn=0.75, fail=0.25, better="higher"))
     pictures = [
         qa.Picture("contact_sheet", written.color_strip, "frames spread over the recording, as understood"),
         qa.Picture("depth_strip", written.depth_strip, "their depth, near is bright, black is unknown"),
@@ -157,15 +160,6 @@ def _check_of_poses(plan: ExtractionPlan) -> qa.Check:
     residual_mm = 1000 * check.residual_m if check.verdict in ("documented", "other") else None
     name = f"device poses against depth ({check.reason})"
     return qa.Check(name, residual_mm, "mm", warn=1000 * check.tolerance_m)
-
-
-def _check_of_pictures(agreement: PictureAgreement | None) -> list[qa.Check]:
-    """Return the check of pictures against depth, intrinsics and poses, if they could be compared."""
-    if agreement is None or agreement.verdict == "untested":
-        return []
-    agreeing = {"agree": 1.0, "unconfirmed": 0.5, "contradict": 0.0}[agreement.verdict]
-    name = f"pictures against depth, intrinsics and poses ({agreement.reason})"
-    return [qa.Check(name, agreeing, "", warn=0.75, fail=0.25, better="higher")]
 
 
 def thumbnail(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "_ _ 3"]:

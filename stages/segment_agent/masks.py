@@ -193,9 +193,11 @@ def learn_appearance(
     ]
     elsewhere = () if known is None else known.examples
     network = learn([*shown, *elsewhere], config.learning, rng, room=room)
-    if network is None or not _finds_animal(network, shown[:: max(1, len(shown) // PROBES)]):
+    if network is None:
         return None
-    return network
+    probes = [each for each in shown[:: max(1, len(shown) // PROBES)] if (each.labels == 255).any()]
+    recall = [(network.log_odds(each.color)[each.labels == 255] > 0).mean() for each in probes]
+    return network if recall and float(np.mean(recall)) > MIN_RECALL else None
 
 
 def _label_room(
@@ -210,16 +212,6 @@ def _label_room(
     moving = movers.moving(free_space.vote(references, points, frame))
     size, near = working_size(clip, segmenter.height_px), cv2.dilate(moving.astype(np.uint8), DILATION)
     return cv2.resize(near, size[::-1], interpolation=cv2.INTER_NEAREST) * np.uint8(128)
-
-
-def _finds_animal(network: Appearance, examples: list[Example]) -> bool:
-    """Return whether the network's recall on its training examples is high enough."""
-    shown = [
-        (network.log_odds(each.color)[each.labels == 255] > 0).mean()
-        for each in examples
-        if (each.labels == 255).any()
-    ]
-    return bool(shown) and float(np.mean(shown)) > MIN_RECALL
 
 
 def occlusion_mask(segmenter: Segmenter, frame: int, network: Appearance) -> Bool[np.ndarray, "height width"]:

@@ -161,17 +161,13 @@ def _persistent(
     for step in (1, -1):
         for number, following in pairwise(range(len(own))[::step]):
             ends = [own[number][-1 if step > 0 else 0], own[following][0 if step > 0 else -1]]
-            is_person[following] |= is_person[number] and _reachable(place[ends], timestamp_s[ends])
+            gap_s = float(np.ptp(timestamp_s[ends]))
+            off_m = np.linalg.norm((place[ends[1]] - place[ends[0]])[[0, 2]])
+            near = off_m < movers.JUMP_M + REACH_M + WALKING_M_S * gap_s
+            is_person[following] |= is_person[number] and gap_s < movers.PRESUMED_S and bool(near)
     for frames, yes in zip(own, is_person, strict=True):
         person[frames] = yes
     return person
-
-
-def _reachable(place_world: Float[np.ndarray, "2 3"], timestamp_s: Float[np.ndarray, "2"]) -> bool:
-    """Return whether a person can have walked from one place to another within a short gap."""
-    gap_s = abs(float(timestamp_s[1] - timestamp_s[0]))
-    off_m = float(np.linalg.norm((place_world[1] - place_world[0])[[0, 2]]))
-    return gap_s < movers.PRESUMED_S and off_m < movers.JUMP_M + REACH_M + WALKING_M_S * gap_s
 
 
 def _fill_gaps(
