@@ -1,7 +1,5 @@
 """Grounding DINO (Liu et al. 2023): boxes in a picture from words, with the optional `transformers`."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -11,16 +9,6 @@ from pipeline.backends import checkpoints
 
 CHECKPOINT = "IDEA-Research/grounding-dino-tiny"
 SHORTEST_PX, LONGEST_PX = 800, 1333
-
-
-@dataclass(frozen=True)
-class Found:
-    """Boxes, most certain first."""
-
-    boxes_px: Float[np.ndarray, "box 4"]
-    """x0, y0, x1, y1 in the picture's pixels"""
-    score: Float[np.ndarray, "box"]
-    """0..1"""
 
 
 class GroundingDino:
@@ -35,10 +23,18 @@ class GroundingDino:
         self._device = device
 
     @torch.inference_mode()
-    def find(self, color: UInt8[np.ndarray, "height width 3"], description: str, threshold: float) -> Found:
-        """Find what is described; every phrase ends with a full stop (``a cat.``)."""
-        height, width = color.shape[:2]
-        pixels = self._preparation.pixels(color, fitted((height, width), self._preparation.size or {}))
+    def find(
+        self, color: UInt8[np.ndarray, "height width 3"], description: str, threshold: float
+    ) -> tuple[Float[np.ndarray, "box 4"], Float[np.ndarray, "box"]]:
+        """Return boxes (x0, y0, x1, y1, pixels) of what is described and scores (0..1), most certain first.
+
+        Every phrase ends with a full stop (``a cat.``).
+        """
+        from transformers.image_transforms import get_size_with_aspect_ratio
+
+        (height, width), wanted = color.shape[:2], self._preparation.size or {}
+        edges = wanted.get("shortest_edge") or SHORTEST_PX, wanted.get("longest_edge") or LONGEST_PX
+        pixels = self._preparation.pixels(color, get_size_with_aspect_ratio((height, width), *edges))
         sentence = description.lower().strip().rstrip(".") + "."
         words = self._tokenizer(sentence, return_tensors="pt").to(self._device)
         answer = self._model(pixel_values=torch.from_numpy(pixels).to(self._device), **words)
@@ -48,16 +44,4 @@ class GroundingDino:
         boxes = corners * torch.tensor([width, height] * 2, device=center.device)
         order = torch.argsort(score, descending=True, stable=True)
         order = order[score[order] > threshold]
-        return Found(boxes[order].cpu().numpy(), score[order].cpu().numpy())
-
-
-def fitted(size: tuple[int, int], wanted: dict[str, int]) -> tuple[int, int]:
-    """Return (height, width) with the shorter side as wanted unless the longer one then grew too long."""
-    shortest, longest = wanted.get("shortest_edge") or SHORTEST_PX, wanted.get("longest_edge") or LONGEST_PX
-    short, long = min(size), max(size)
-    exact = longest * short / long if long / short * shortest > longest else float(shortest)
-    side = round(exact)
-    if side == short:
-        return size
-    other = int(exact * long / short)
-    return (side, other) if size[0] <= size[1] else (other, side)
+        return boxes[order].cpu().numpy(), score[order].cpu().numpy()

@@ -78,7 +78,10 @@ def _open(container: Container, layout: _Layout) -> Recording:
     index, timestamp_s = index[np.isfinite(timestamp_s)], timestamp_s[np.isfinite(timestamp_s)]
     intrinsics, pose = metadata.intrinsics(index), metadata.pose(index)
     depth_size = _depth_size(container, layout, metadata, int(index[0]))
-    _refuse_face_id(depth_size, metadata.camera_type(), container.where)
+    if metadata.camera_type() == FACE_ID or math.prod(depth_size) in FACE_ID_FLOATS:
+        what = "recorded with the Face-ID camera: it has no device poses"
+        remedy = "record with the LiDAR camera at the back of the phone"
+        raise InputError("CAP-005", what, container.where, remedy)
     confident = _numbers(container.names, _CONFIDENCE)
 
     def confidence(frame: int) -> np.ndarray | None:
@@ -230,13 +233,6 @@ def _depth_size(container: Container, layout: _Layout, metadata: _Metadata, firs
         )
     height, width = DEPTH_SIZES[floats]  # upright
     return (height, width) if metadata.color_size[0] >= metadata.color_size[1] else (width, height)
-
-
-def _refuse_face_id(depth_size: tuple[int, int], camera_type: int | None, where: str) -> None:
-    """Raise CAP-005 for the front camera, known by depth size or camera type: it has no device poses."""
-    if camera_type == FACE_ID or math.prod(depth_size) in FACE_ID_FLOATS:
-        remedy = "record with the LiDAR camera at the back of the phone"
-        raise InputError("CAP-005", "recorded with the Face-ID camera: it has no device poses", where, remedy)
 
 
 def _read_depth(container: Container, name: str, size: tuple[int, int]) -> Float[np.ndarray, "height width"]:

@@ -57,7 +57,11 @@ def open_recording(path: Path) -> Recording:
     index = rows.frame[valid]
     timestamp_s = movie.timestamp_s[index] if rows.timestamp_s is None else rows.timestamp_s[valid]
     size = _depth(container, depth[int(index[0])], None).shape
-    _refuse_constant_rows(container, [depth[int(number)] for number in index[:: max(1, len(index) // 5)]])
+    some = [_depth(container, depth[int(number)], None) for number in index[:: max(1, len(index) // 5)]]
+    if all(np.ptp(picture, axis=1).max() == 0 and np.ptp(picture) > 0 for picture in some):
+        what = "every row of the depth pictures holds one value: a fault of this version of Stray Scanner"
+        remedy = "update the app and record again; the depth of this recording is lost"
+        raise InputError("CAP-009", what, container.where, remedy)
     confidence = container.numbered("confidence")
 
     def confident(number: int) -> UInt8[np.ndarray, "height width"] | None:
@@ -145,12 +149,3 @@ def _depth(
         raise errors.wrong_depth(container.place(name), f"{raw.dtype} {raw.shape}")
     errors.refuse_other_size(raw.shape, size, container.place(name))
     return raw.astype(np.float32) / np.float32(1000)
-
-
-def _refuse_constant_rows(container: FolderContainer, names: list[str]) -> None:
-    """Raise CAP-009 for depth of app versions whose encoder repeated one value along each row."""
-    pictures = [_depth(container, name, None) for name in names]
-    if all(np.ptp(picture, axis=1).max() == 0 and np.ptp(picture) > 0 for picture in pictures):
-        what = "every row of the depth pictures holds one value: a fault of this version of Stray Scanner"
-        remedy = "update the app and record again; the depth of this recording is lost"
-        raise InputError("CAP-009", what, container.where, remedy)

@@ -78,16 +78,10 @@ def _best_place(
         matched = (frame.points.points_camera[mine], known.points.points_camera[theirs])
         fitted, agree = align.ransac_rigid(*matched, threshold_m=WITHIN_M, iterations=TRIALS, rng=rng)
         if agree.sum() > best:
-            best, place = int(agree.sum()), _in_odometry(known.shot, fitted, frame.shot)
+            best, place = int(agree.sum()), fitted
+            if known.shot.odometry_from_camera is not None and frame.shot.odometry_from_camera is not None:
+                place = known.shot.odometry_from_camera @ fitted @ frame.shot.camera_from_odometry
     return place
-
-
-def _in_odometry(
-    known: SampledFrame, known_from_frame: np.ndarray, frame: SampledFrame
-) -> Float[np.ndarray, "4 4"]:
-    if known.odometry_from_camera is None or frame.odometry_from_camera is None:
-        return known_from_frame
-    return known.odometry_from_camera @ known_from_frame @ rigid.inverse(frame.odometry_from_camera)
 
 
 def drift_m(shots: Sequence[SampledFrame]) -> float:

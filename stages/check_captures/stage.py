@@ -79,11 +79,13 @@ def _described(name: str, role: Role, seen: CaptureMeasurements) -> str:
     """Return a recording's format, measurements, and problems with remedies."""
     sample, recording, found = seen.sample, seen.sample.recording, problems(seen, role)
     height, width = recording.color_size
+    turns = sample.plan.quarter_turns if sample.plan else recording.quarter_turns
+    turned = f"turned {90 * turns} deg clockwise to be upright" if turns else "upright as stored"
     lines = [
         f"{name}  {role}, {recording.kind}",
-        f"  {sample.duration_s:.1f} s, {sample.rate_hz:.1f} fps, {width} x {height}, {_turn(seen)}",
+        f"  {sample.duration_s:.1f} s, {sample.rate_hz:.1f} fps, {width} x {height}, {turned}",
+        f"  pictures: dark {sample.dark:.0%}, blurred {sample.blurred:.0%}",
     ]
-    lines.append(f"  pictures: dark {sample.dark:.0%}, blurred {sample.blurred:.0%}")
     if sample.plan is not None:
         lines[-1] += f"; depth: typically {sample.depth_m:.1f} m, known {sample.depth_valid:.0%}"
         lines[-1] += f", beyond range {sample.beyond:.0%}"
@@ -95,11 +97,6 @@ def _described(name: str, role: Role, seen: CaptureMeasurements) -> str:
     lines += [f"  note: {remark}" for remark in recording.remarks]
     lines += [f"  {each.code} {each.what}\n    -> {each.remedy}" for each in found]
     return "\n".join(lines if found else [*lines, "  good"])
-
-
-def _turn(seen: CaptureMeasurements) -> str:
-    turns = seen.sample.plan.quarter_turns if seen.sample.plan else seen.sample.recording.quarter_turns
-    return f"turned {90 * turns} deg clockwise to be upright" if turns else "upright as stored"
 
 
 def _poses(seen: CaptureMeasurements) -> str:

@@ -19,7 +19,15 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from pipeline.data import npz
-from stages.segment_agent.appearance import LOGIT_SCALE, RATE, WEIGHT_DECAY, Appearance, normalized, to_batch
+from stages.segment_agent.appearance import (
+    LOGIT_SCALE,
+    RATE,
+    WEIGHT_DECAY,
+    Appearance,
+    Example,
+    normalized,
+    to_batch,
+)
 from stages.segment_agent.identities.config import Config
 from stages.segment_agent.windows import bounding_slices
 
@@ -53,12 +61,10 @@ WINDOW_SHARE = 0.08
 
 
 @dataclass(frozen=True)
-class Portrait:
-    """A picture of one animal and its mask: 255 animal, 0 not, 128 unknown."""
+class Portrait(Example):
+    """An example that shows one animal, the index of its name."""
 
     animal: int
-    color: UInt8[np.ndarray, "height width 3"]
-    labels: UInt8[np.ndarray, "height width"]
 
 
 def save_portraits(folder: Path, portraits: Sequence[Portrait]) -> None:
@@ -74,7 +80,7 @@ def load_portraits(folder: Path) -> list[Portrait]:
     """Read what `save_portraits` wrote."""
     table = npz.load(folder / PORTRAITS)
     return [
-        Portrait(int(animal), table[f"{row:03d}/color"], table[f"{row:03d}/labels"])
+        Portrait(table[f"{row:03d}/color"], table[f"{row:03d}/labels"], int(animal))
         for row, animal in enumerate(table["animal"])
     ]
 

@@ -11,14 +11,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float
 
 from pipeline.core.errors import InputError
 from pipeline.core.progress import log
 from pipeline.data.clips import Clip
 from pipeline.geometry import subsampling
 from stages.segment_agent import free_space, identity, masks, people
-from stages.segment_agent.appearance import Appearance, Example
 from stages.segment_agent.config import Config
 from stages.segment_agent.evidence import ROOM, Evidence, EvidenceOf, motion_evidence
 from stages.segment_agent.free_space import References
@@ -27,7 +26,7 @@ from stages.segment_agent.locate import AppearanceOf, find_mover
 from stages.segment_agent.masks import Segmentation
 from stages.segment_agent.segmenter import Mask, Segmenter, with_color_histogram
 from stages.segment_agent.trajectory import estimate_trajectory
-from stages.segment_agent.windows import Sphere, Window, tracked, working_picture
+from stages.segment_agent.windows import Sphere, Window, tracked, working_picture, working_size
 
 QUANTIZATION = 127 / identity.MAX_LOG_ODDS
 """8-bit levels per unit of stored log-odds"""
@@ -130,7 +129,14 @@ def find_all(
         examples = examples_of(portraits, animal, portrait_count)
         known = masks.KnownAppearance(examples, scores.recognized(animal))
         networks.append(masks.learn_appearance(segmenter, references, config, rng, known))
-    room = free_space.masked(references, lambda frame: _joint_occlusion(segmenters, networks, frame))
+
+    def occluded(frame: int) -> Bool[np.ndarray, "height width"]:
+        found = [np.zeros(working_size(clip, config.height_px), bool)]
+        for segmenter, network in zip(segmenters, networks, strict=True):
+            found += [] if network is None else [masks.occlusion_mask(segmenter, frame, network)]
+        return np.any(found, axis=0)
+
+    room = free_space.masked(references, occluded)
     evidence_of = motion_evidence(room)
     for animal, network in enumerate(networks):
         if network is None:
@@ -143,11 +149,10 @@ def find_all(
     return segmenters
 
 
-def examples_of(portraits: Sequence[Portrait], animal: int, portrait_count: int) -> list[Example]:
-    """Return evenly chosen portraits of one animal as examples."""
+def examples_of(portraits: Sequence[Portrait], animal: int, portrait_count: int) -> list[Portrait]:
+    """Return evenly chosen portraits of one animal."""
     own = [each for each in portraits if each.animal == animal]
-    chosen = [own[index] for index in subsampling.evenly(len(own), portrait_count)]
-    return [Example(each.color, each.labels) for each in chosen]
+    return [own[index] for index in subsampling.evenly(len(own), portrait_count)]
 
 
 def identity_evidence(evidence_of: EvidenceOf, margin_of: AppearanceOf) -> EvidenceOf:
@@ -199,16 +204,3 @@ def _is_present(segmenter: Segmenter, margin_of: AppearanceOf) -> bool:
         if inside.any():
             shares.append(float((1 / (1 + np.exp(-margin_of(frame)[inside]))).mean()))
     return bool(shares) and float(np.mean(shares)) > MIN_PROBABILITY
-
-
-def _joint_occlusion(
-    segmenters: list[Segmenter], networks: list[Appearance | None], frame: int
-) -> UInt8[np.ndarray, "height width"]:
-    """Mark where any of the animals occludes the room."""
-    found = [
-        masks.occlusion_mask(segmenter, frame, network)
-        for segmenter, network in zip(segmenters, networks, strict=True)
-        if network is not None
-    ]
-    size = segmenters[0].working_picture(frame).shape[:2]
-    return np.any([np.zeros(size, bool), *found], axis=0)

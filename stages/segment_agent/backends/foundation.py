@@ -41,14 +41,13 @@ def _find(
     """Return the frame and box (x0, y0, x1, y1, pixels) of the detection with the highest score."""
     best: tuple[float, int, np.ndarray] | None = None
     for frame in subsampling.evenly(len(clip), LOOKED_AT, rounded=True).tolist():
-        found = detector.find(clip.color(frame), options.description, options.threshold)
-        if len(found.score) and (best is None or found.score[0] > best[0]):
-            best = (float(found.score[0]), frame, found.boxes_px[0])
+        boxes_px, score = detector.find(clip.color(frame), options.description, options.threshold)
+        if len(score) and (best is None or score[0] > best[0]):
+            best = (float(score[0]), frame, boxes_px[0])
     if best is None:
         what = f"{options.description!r} was found in none of {LOOKED_AT} frames"
-        raise InputError(
-            "MSK-004", what, str(clip.folder), "describe the animal otherwise, or point at it with a prompt"
-        )
+        remedy = "describe the animal otherwise, or point at it with a prompt"
+        raise InputError("MSK-004", what, str(clip.folder), remedy)
     return best[1], best[2]
 
 

@@ -79,7 +79,7 @@ def portraits(
     clip = Clip.open(frames)
     segmenter = masks.turnaround_segmenter(clip, flow, MaskConfig(height_px=config.height_px), rng)
     found = [
-        Portrait(animal, segmenter.working_picture(frame), segmenter.working_mask(frame).labels)
+        Portrait(segmenter.working_picture(frame), segmenter.working_mask(frame).labels, animal)
         for frame in subsampling.evenly(len(clip), config.portraits).tolist()
     ]
     return [each for each in found if (each.labels == 255).any()]
