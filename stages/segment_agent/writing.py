@@ -20,7 +20,8 @@ LOW_CONFIDENCE = 0.75
 RIGHT_IOU, WRONG_IOU = 0.75, 0.6
 """mean IoU that `evaluate` requires, and an estimate below that of all good masks: on nine sessions their
 estimates are at most 0.07 off, those of bad masks up to 0.14 too high and 0.22 too low"""
-GREEN, BLUE = (60, 255, 90), (60, 90, 255)
+GREEN, BLUE, DIM, TINT = (60, 255, 90), (60, 90, 255), 0.6, 0.6
+"""colors of the animal's outline and of unknown pixels; brightness of the room, share of blue"""
 SHOWN, COLUMNS, WIDTH_PX = 12, 6, 200
 """masks on the contact sheet, its columns, and the width of each"""
 CAPTIONS = {
@@ -66,8 +67,8 @@ def overlay(
     color: UInt8[np.ndarray, "height width 3"], labels: UInt8[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Draw the agent's outline in green and unknown pixels in blue."""
-    picture = color.astype(np.float32) * np.where(labels == 0, 0.6, 1.0)[..., None]
-    picture[labels == 128] = 0.4 * picture[labels == 128] + 0.6 * np.array(BLUE)
+    picture = color.astype(np.float32) * np.where(labels == 0, DIM, 1.0)[..., None]
+    picture[labels == 128] = (1 - TINT) * picture[labels == 128] + TINT * np.array(BLUE)
     return plots.outlined(picture.astype(np.uint8), labels == 255, GREEN)
 
 
