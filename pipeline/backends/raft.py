@@ -7,6 +7,7 @@ Written anew; parameters carry the names of the official weights (`raft-things.p
 import math
 from collections import OrderedDict
 from pathlib import Path
+from pickle import UnpicklingError
 
 import numpy as np
 import torch
@@ -66,13 +67,9 @@ def load(path: Path, device: str = "cpu") -> Raft:
         network = Raft()
         # `norm3` is the second name of what `downsample.1` holds.
         network.load_state_dict({name: value for name, value in stored.items() if ".norm3." not in name})
-    except (RuntimeError, AttributeError, EOFError, ValueError) as error:
+    except (RuntimeError, AttributeError, EOFError, ValueError, UnpicklingError) as error:
         what = f"these are not weights of the basic RAFT ({str(error)[:LONGEST_REASON]})"
         raise InputError("MOD-003", what, str(path), REMEDY) from error
-    except Exception as error:
-        if type(error).__name__ == "UnpicklingError":
-            raise InputError("MOD-003", "these are not plain weights", str(path), REMEDY) from error
-        raise
     return network.to(device).eval()
 
 

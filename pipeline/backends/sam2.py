@@ -47,8 +47,11 @@ class Sam2:
                 self._point_at(session, frame, box_px, picture.shape[:2])
             pixels, reverse = self.prepared(picture), position > 0 and frames.step < 0
             answer = self._model(inference_session=session, frame=pixels, frame_idx=frame, reverse=reverse)
-            masks = _enlarged(answer.pred_masks, self._side, picture.shape[:2])
-            yield masks, float(answer.object_score_logits.reshape(-1)[0])
+            # to the picture's size, by way of the network's
+            masks = answer.pred_masks.reshape(1, 1, *answer.pred_masks.shape[-2:]).float()
+            for size in ((self._side, self._side), picture.shape[:2]):
+                masks = F.interpolate(masks, size, mode="bilinear", align_corners=False)
+            yield masks[0, 0].cpu().numpy(), float(answer.object_score_logits.reshape(-1)[0])
             self._forget(session, frame, frames.step)
 
     def prepared(self, picture: Picture) -> Float[torch.Tensor, "1 3 side side"]:
@@ -90,10 +93,3 @@ class Sam2:
                 output.pop("high_res_masks", None)
         for tracked in session.frames_tracked_per_obj.values():
             tracked.pop(frame - step * reach, None)
-
-
-def _enlarged(masks: torch.Tensor, side: int, size: tuple[int, int]) -> Float[np.ndarray, "height width"]:
-    """Bring low-resolution log-odds to the picture's size, by way of the network's."""
-    masks = masks.reshape(1, 1, *masks.shape[-2:]).float()
-    masks = F.interpolate(masks, (side, side), mode="bilinear", align_corners=False)
-    return F.interpolate(masks, size, mode="bilinear", align_corners=False)[0, 0].cpu().numpy()

@@ -29,7 +29,6 @@ from stages.segment_agent.appearance import (
     to_batch,
 )
 from stages.segment_agent.identities.config import Config
-from stages.segment_agent.windows import bounding_slices
 
 FILE, PORTRAITS = "identities.safetensors", "portraits.npz"
 BACKGROUND = 0
@@ -71,7 +70,9 @@ def save_portraits(folder: Path, portraits: Sequence[Portrait]) -> None:
     """Write `portraits.npz`: each cropped around its animal."""
     rows = {}
     for row, each in enumerate(portraits):
-        part = bounding_slices(each.labels == 255, MARGIN_PX)
+        left, top, width, height = cv2.boundingRect((each.labels == 255).astype(np.uint8))
+        bounds = (top, top + height - 1), (left, left + width - 1)
+        part = tuple(slice(max(low - MARGIN_PX, 0), high + MARGIN_PX) for low, high in bounds)
         rows |= {f"{row:03d}/color": each.color[part], f"{row:03d}/labels": each.labels[part]}
     npz.save(folder / PORTRAITS, compress=True, animal=np.array([each.animal for each in portraits]), **rows)
 

@@ -61,14 +61,6 @@ def working_picture(clip: Clip, frame: int, height_px: int) -> UInt8[np.ndarray,
     return color if size == clip.color_size else cv2.resize(color, size[::-1], interpolation=cv2.INTER_AREA)
 
 
-def bounding_slices(mask: Bool[np.ndarray, "height width"], margin_px: int) -> tuple[slice, slice]:
-    """Return the rows and columns of a mask's bounding box, with a margin."""
-    rows, columns = (
-        slice(max(int(at.min()) - margin_px, 0), int(at.max()) + margin_px) for at in np.nonzero(mask)
-    )
-    return rows, columns
-
-
 def project_sphere(
     clip: Clip, frame: int, world_from_camera: Float[np.ndarray, "4 4"], sphere: Sphere, size: tuple[int, int]
 ) -> tuple[slice, slice]:
