@@ -111,6 +111,13 @@ class PoseSpace(nn.Module):
         self.explained.fill_(float((singular[:retained] ** 2).sum() / (singular**2).sum()))
         return self
 
+    def channels(
+        self, agent_from_bone: Float[np.ndarray, "*batch bone 4 4"]
+    ) -> Float[Tensor, "*batch channel"]:
+        """Return the channels of bones, radians and meters."""
+        bones, rest = np.asarray(agent_from_bone, np.float64), self.rest.double().numpy()
+        return torch.from_numpy(channels_from_bones(bones, rest)).float()
+
     def encode(self, channels: Float[Tensor, "*batch channel"]) -> Float[Tensor, "*batch component"]:
         """Encode channels of bones as p."""
         return (channels - self.mean) @ self.inverse

@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.behavior.model import channels_from_bones
 from pipeline.behavior.perception import world_from_ego
 from pipeline.geometry import rigid, rigid_torch
 from pipeline.longterm.bodies import PoseSpace
@@ -50,15 +49,6 @@ def root_channels(a_from_agent: Float[np.ndarray, "*batch 4 4"]) -> Float[Tensor
     """Return t and r of roots."""
     root = torch.from_numpy(np.asarray(a_from_agent)).float()
     return torch.cat([root[..., :3, 3], rigid_torch.rotation_to_6d(root[..., :3, :3])], dim=-1)
-
-
-def pose_channels(
-    agent_from_bone: Float[np.ndarray, "*batch bone 4 4"], poses: PoseSpace
-) -> Float[Tensor, "*batch pose"]:
-    """Return the pose code p of LTM 3.2, without unit."""
-    rest = poses.rest.double().numpy()
-    channels = channels_from_bones(np.asarray(agent_from_bone, np.float64), rest)
-    return poses.encode(torch.from_numpy(channels).float())
 
 
 def clip_frames(
@@ -107,8 +97,7 @@ def decode_clip(
     with torch.no_grad():
         posed = poses.decode(channels[..., ROOT_CHANNELS:])
         if ends is not None:
-            rest = poses.rest.double().numpy()
-            given = torch.from_numpy(channels_from_bones(np.asarray(ends, np.float64), rest)).float()
+            given = poses.channels(ends)
             residual = given - poses.decode(poses.encode(given))
             share = torch.linspace(0, 1, len(channels))[:, None]
             posed = posed + torch.lerp(residual[0], residual[1], share)

@@ -83,7 +83,7 @@ def find_contact_vertices(
     touches, frames = np.zeros(len(body.mesh.vertices)), 0
     for motion, scene in zip(motions, scenes, strict=True):
         part = motion[:: min(every, len(motion))]
-        distance = scene.at(surface(*motion_tensors(part))).numpy()
+        distance = scene.at(surface(*part.tensors())).numpy()
         touches += (distance < np.percentile(distance, 1, axis=1, keepdims=True) + TOUCH_M).sum(0)
         frames += len(part)
     share = touches / max(frames, 1)
@@ -182,12 +182,6 @@ def _make_room_to_swing(
         return None
     early = int(np.clip(lacking // 2, lacking - min(spare[1], lacking), spare[0]))
     return range(before.start, before.stop - early), range(after.start + lacking - early, after.stop)
-
-
-def motion_tensors(motion: BodyMotion) -> tuple[Float[Tensor, "frame 4 4"], Float[Tensor, "frame bone 4 4"]]:
-    """Return root and bones of a motion as torch tensors, meters."""
-    root, bones = np.asarray(motion.world_from_agent), np.asarray(motion.agent_from_bone)
-    return torch.from_numpy(root).float(), torch.from_numpy(bones).float()
 
 
 def _speed(points: Float[np.ndarray, "frame foot 3"]) -> Float[np.ndarray, "frame foot"]:

@@ -19,14 +19,7 @@ from pipeline.behavior.trajectories import TRAIN, BehaviorData
 from pipeline.geometry import rigid
 from pipeline.geometry.signed_distance import SignedDistance
 from pipeline.longterm.bodies import PoseSpace, SkinnedBody, load_body
-from pipeline.longterm.clip_channels import (
-    Clips,
-    EncodedPlaces,
-    encode_clips,
-    encode_places,
-    pose_channels,
-    root_channels,
-)
+from pipeline.longterm.clip_channels import Clips, EncodedPlaces, encode_clips, encode_places, root_channels
 from pipeline.longterm.short_motions import STEPS, BodyMotion, stretches
 from pipeline.longterm.surroundings import MotionScene
 
@@ -151,7 +144,7 @@ def encode_selection(
     dataset: MotionDataset, selection: ClipSelection, poses: PoseSpace, points: int, rng: np.random.Generator
 ) -> Clips:
     """Encode clips as network channels; the poses of each stretch are encoded once."""
-    p = [pose_channels(stretch.agent_from_bone, poses) for stretch in dataset.stretches]
+    p = [poses.encode(poses.channels(stretch.agent_from_bone)) for stretch in dataset.stretches]
     pairs = list(zip(selection.stretch, selection.start, strict=True))
     roots = [stretch.world_from_agent for stretch in dataset.stretches]
     root = np.stack([roots[stretch][start : start + STEPS + 1] for stretch, start in pairs])
@@ -180,15 +173,8 @@ def sample_static_bodies(
     given[loose] = world_from_ego(root[loose], "yaw")
     given[loose, 1, 3] += rng.normal(0, LEVEL_HEIGHT_M, loose.sum())
     places = encode_places(given, scene, dataset.scenes, points, rng)
-    return StaticBodies(places, body_channels(places.world_from_place, BodyMotion(root, bones), poses), scene)
-
-
-def body_channels(
-    world_from_place: Float[np.ndarray, "body 4 4"], bodies: BodyMotion, poses: PoseSpace
-) -> Float[Tensor, "body channel"]:
-    """Return t, r and p of bodies, root in the frames of their places."""
-    root = root_channels(rigid.inverse(world_from_place) @ bodies.world_from_agent)
-    return torch.cat([root, pose_channels(bodies.agent_from_bone, poses)], dim=-1)
+    t_and_r = root_channels(rigid.inverse(places.world_from_place) @ root)
+    return StaticBodies(places, torch.cat([t_and_r, poses.encode(poses.channels(bones))], dim=-1), scene)
 
 
 def fit_pose_space(

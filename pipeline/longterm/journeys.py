@@ -72,9 +72,7 @@ def refine_motion(
 ) -> Journey:
     """Optimize any motion at 30 fps, unless ``settings`` is None; the journey has no sub-goals."""
     meter, stance = world.meter, world.meter.stance(raw, should_stand=True)
-    motion = raw
-    if settings is not None:
-        motion = optimize_motion(raw, world.model.contact_body(world.body), world.scene.distance, settings)
+    motion = raw if settings is None else optimize_motion(raw, meter, world.model.poses, settings)
     before, after = (meter.plausibility(each, stance) for each in (raw, motion))
     largest_seam_m = float(seams(world.body, motion, STEPS).max(initial=0.0))
     return Journey(motion, np.zeros((0, 3)), np.zeros(0), before, after, largest_seam_m)
@@ -87,11 +85,8 @@ def refine_at_rate(
     settings: MotionOptimizationConfig,
 ) -> tuple[BodyMotion, Plausibility, Plausibility]:
     """Optimize motion of any rate; return it at its own times, and plausibility before and after."""
-    raw = resample_motion(timestamp_s, given)
-    meter, stance = world.meter, world.meter.stance(raw, should_stand=True)
-    optimized = optimize_motion(raw, world.model.contact_body(world.body), world.scene.distance, settings)
-    time_s = np.arange(len(optimized)) / RATE_HZ
-    query_s = np.minimum(timestamp_s - timestamp_s[0], time_s[-1])
-    body = optimized.world_from_agent, optimized.agent_from_bone
-    motion = BodyMotion(*rigid.interpolate_body(time_s, *body, query_s))
-    return motion, meter.plausibility(raw, stance), meter.plausibility(optimized, stance)
+    made = refine_motion(world, resample_motion(timestamp_s, given), settings)
+    query_s = np.minimum(timestamp_s - timestamp_s[0], made.timestamp_s[-1])
+    body = made.motion.world_from_agent, made.motion.agent_from_bone
+    motion = BodyMotion(*rigid.interpolate_body(made.timestamp_s, *body, query_s))
+    return motion, made.before, made.after

@@ -13,12 +13,11 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from torch import Tensor
 
-from pipeline.behavior.model import channels_from_bones
 from pipeline.geometry import rigid_torch
 from pipeline.geometry.signed_distance import SignedDistance
 from pipeline.longterm.bodies import PosedSurface, PoseSpace, SkinnedBody
 from pipeline.longterm.config import MotionOptimizationConfig
-from pipeline.longterm.contacts import ContactVertices, motion_tensors
+from pipeline.longterm.contacts import ContactVertices
 from pipeline.longterm.plausibility import SOLID_M, PlausibilityMeter
 from pipeline.longterm.short_motions import BodyMotion
 
@@ -35,7 +34,7 @@ LIFT_STEP_M = 0.02
 NEAR_M = 0.05
 """Feet of a static body within this distance of the scene are in stance."""
 SETTLING_STEPS = 80
-"""Maximum number of steps for static bodies."""
+"""Steps for static bodies."""
 FRAMES_AT_ONCE = 100
 """Frames per batch when the full surface is posed."""
 
@@ -73,24 +72,13 @@ TERMS = MotionTerms()
 """The weights of every optimization."""
 
 
-@dataclass(frozen=True)
-class ContactBody:
-    """A body with its contact vertices and pose space."""
-
-    body: SkinnedBody
-    contacts: ContactVertices
-    poses: PoseSpace
-
-
 class _Correction(torch.nn.Module):
     """A motion with learnable corrections: translation and rotation of the root, and pose code."""
 
     def __init__(self, motion: BodyMotion, poses: PoseSpace):
         super().__init__()
-        self.root, _ = motion_tensors(motion)
-        bones, rest = np.asarray(motion.agent_from_bone, np.float64), poses.rest.double().numpy()
-        self.channels = torch.from_numpy(channels_from_bones(bones, rest)).float()
-        self.poses = poses
+        self.root, _ = motion.tensors()
+        self.channels, self.poses = poses.channels(motion.agent_from_bone), poses
         self.shift = torch.nn.Parameter(torch.zeros(len(motion), 3))
         self.turn = torch.nn.Parameter(torch.zeros(len(motion), 3))
         self.pose = torch.nn.Parameter(torch.zeros(len(motion), poses.components))
@@ -103,35 +91,32 @@ class _Correction(torch.nn.Module):
 
 def optimize_motion(
     motion: BodyMotion,
-    contact_body: ContactBody,
-    scene: SignedDistance,
+    meter: PlausibilityMeter,
+    poses: PoseSpace,
     settings: MotionOptimizationConfig,
     *,
     held: Bool[np.ndarray, "frame"] | None = None,
 ) -> BodyMotion:
-    """Return the motion that minimizes the weighted sum of all terms; ``held`` frames are fixed."""
-    meter = PlausibilityMeter(contact_body.body, contact_body.contacts, scene)
+    """Return the motion that minimizes the weighted sum of all terms in the scene and for the body of
+    ``meter``; ``held`` frames are fixed.
+    """
     stance = meter.stance(motion, should_stand=True)
     free = torch.ones(len(motion)) if held is None else torch.from_numpy(~held).float()
-    return _minimize(motion, contact_body, scene, settings, TERMS, stance, free, reach=LIFT_FRAMES)
+    return _minimize(motion, meter, poses, settings, TERMS, stance, free, reach=LIFT_FRAMES)
 
 
-def settle_bodies(
-    bodies: BodyMotion, contact_body: ContactBody, scene: SignedDistance, settings: MotionOptimizationConfig
-) -> BodyMotion:
+def settle_bodies(bodies: BodyMotion, meter: PlausibilityMeter, poses: PoseSpace) -> BodyMotion:
     """Move static bodies, each independently, out of collision and into contact with the ground."""
-    with torch.no_grad():
-        feet = PosedSurface(contact_body.body, contact_body.contacts.vertices)(*motion_tensors(bodies))
-        near = contact_body.contacts.lowest(scene.at(feet)).numpy() < NEAR_M
-    settings = replace(settings, steps=min(settings.steps, SETTLING_STEPS))
-    terms = replace(TERMS, foot=0.0, smooth=0.0)
-    return _minimize(bodies, contact_body, scene, settings, terms, near, torch.ones(len(bodies)), reach=0)
+    feet = PosedSurface(meter.body, meter.contacts.vertices)(*bodies.tensors())
+    near = meter.contacts.lowest(meter.scene.at(feet)).numpy() < NEAR_M
+    settings, terms = MotionOptimizationConfig(steps=SETTLING_STEPS), replace(TERMS, foot=0.0, smooth=0.0)
+    return _minimize(bodies, meter, poses, settings, terms, near, torch.ones(len(bodies)), reach=0)
 
 
 def _minimize(
     motion: BodyMotion,
-    contact_body: ContactBody,
-    scene: SignedDistance,
+    meter: PlausibilityMeter,
+    poses: PoseSpace,
     settings: MotionOptimizationConfig,
     terms: MotionTerms,
     stance: Bool[np.ndarray, "frame foot"],
@@ -139,11 +124,11 @@ def _minimize(
     *,
     reach: int,
 ) -> BodyMotion:
-    body, contacts = contact_body.body, contact_body.contacts
+    body, contacts, scene = meter.body, meter.contacts, meter.scene
     chosen = body.sample_vertices(settings.vertices)
     sampled = np.concatenate([chosen, contacts.vertices])
     surface, both = PosedSurface(body, sampled), len(sampled)
-    correction = _Correction(motion, contact_body.poses)
+    correction = _Correction(motion, poses)
     with torch.no_grad():
         given = surface(*correction())
         correction.shift[:, 1] += free * lift_out_of_solid(given[:, len(chosen) :], scene, reach=reach)

@@ -18,11 +18,11 @@ from torch import Tensor
 from pipeline.core.errors import other_versions_refused
 from pipeline.geometry import rigid
 from pipeline.longterm.bodies import PoseSpace, SkinnedBody
-from pipeline.longterm.clip_channels import decode_clip, encode_clips, encode_places, pose_channels
-from pipeline.longterm.config import LongTermSizes, MotionOptimizationConfig
+from pipeline.longterm.clip_channels import decode_clip, encode_clips, encode_places
+from pipeline.longterm.config import LongTermSizes
 from pipeline.longterm.contacts import ContactVertices
 from pipeline.longterm.local_scene import LocalScene
-from pipeline.longterm.motion_optimization import ContactBody, settle_bodies
+from pipeline.longterm.motion_optimization import settle_bodies
 from pipeline.longterm.networks import ROOT_CHANNELS, PoseNet, RouteNet, StaticBody
 from pipeline.longterm.plausibility import PlausibilityMeter
 from pipeline.longterm.short_motions import (
@@ -95,29 +95,21 @@ class LongTerm:
     def load(cls, folder: Path) -> "LongTerm":
         """Read a trained model. Raises InputError ART-007 for one of another version."""
         with other_versions_refused("model of long-term motion", str(folder)):
-            return cls._read(folder)
-
-    @classmethod
-    def _read(cls, folder: Path) -> "LongTerm":
-        document = json.loads((folder / "longterm.json").read_text())
-        if other := [name for name, value in CONVENTIONS.items() if document[name] != value]:
-            raise ValueError(f"longterm.json says otherwise about {', '.join(other)}")
-        state, sizes = load_file(folder / "longterm.safetensors"), LongTermSizes(**document["sizes"])
-        poses = PoseSpace(np.tile(np.eye(4), (document["bones"], 1, 1)), sizes.pose)
-        static = StaticBody(sizes)
-        route = RouteNet(sizes, with_scene=document["sees_scene"])
-        pose = PoseNet(sizes, with_scene=document["sees_scene"])
-        for name, module in zip(("poses", *NETWORKS), (poses, static, route, pose), strict=True):
-            own = {key: value for key, value in state.items() if key.startswith(f"{name}.")}
-            module.load_state_dict({key.removeprefix(f"{name}."): value for key, value in own.items()})
-        numbers = (np.array(document[name]) for name in ("contact_vertices", "foot_of_contact_vertex"))
+            document = json.loads((folder / "longterm.json").read_text())
+            if other := [name for name, value in CONVENTIONS.items() if document[name] != value]:
+                raise ValueError(f"longterm.json says otherwise about {', '.join(other)}")
+            state, sizes = load_file(folder / "longterm.safetensors"), LongTermSizes(**document["sizes"])
+            poses = PoseSpace(np.tile(np.eye(4), (document["bones"], 1, 1)), sizes.pose)
+            sees = document["sees_scene"]
+            nets = StaticBody(sizes), RouteNet(sizes, with_scene=sees), PoseNet(sizes, with_scene=sees)
+            for name, module in zip(("poses", *NETWORKS), (poses, *nets), strict=True):
+                own = {key: value for key, value in state.items() if key.startswith(f"{name}.")}
+                module.load_state_dict({key.removeprefix(f"{name}."): value for key, value in own.items()})
+            numbers = (np.array(document[name]) for name in ("contact_vertices", "foot_of_contact_vertex"))
+            motion_prior = MotionPrior(**document["motion_prior"])
+        static, route, pose = nets
         contacts = ContactVertices(*numbers)
-        motion_prior = MotionPrior(**document["motion_prior"])
         return cls(sizes, poses, contacts, motion_prior, static.eval(), route.eval(), pose.eval())
-
-    def contact_body(self, body: SkinnedBody) -> ContactBody:
-        """Return a body with contacts and pose space, for the optimization."""
-        return ContactBody(body, self.contacts, self.poses)
 
     def bodies(
         self,
@@ -136,7 +128,7 @@ class LongTerm:
         places = encode_places(world_from_agent, first, [scene], self.sizes.points, rng)
         shape = torch.from_numpy(body.shape).float().expand(len(world_from_agent), -1)
         meter = PlausibilityMeter(body, self.contacts, scene.distance)
-        best, lowest_cost = None, np.full(len(world_from_agent), np.inf)
+        roots, bones, costs, every = [], [], [], np.arange(len(world_from_agent))
         with torch.no_grad():
             condition = self.static.encode_condition(places.place, shape, places.points)
         for _ in range(candidates):
@@ -146,22 +138,22 @@ class LongTerm:
             local = decode_clip(channels, np.eye(4), self.poses)
             sample = BodyMotion(places.world_from_place @ local.world_from_agent, local.agent_from_bone)
             offset = np.linalg.norm((sample.world_from_agent - world_from_agent)[:, :3, 3], axis=1)
-            cost = sum(meter.gap_and_penetration(sample)) + offset
-            better = (cost < lowest_cost)[:, None, None]
-            best = sample if best is None else _where(better, sample, best)
-            lowest_cost = np.minimum(lowest_cost, cost)
-        assert best is not None, candidates
-        return settle_bodies(best, self.contact_body(body), scene.distance, MotionOptimizationConfig())
+            costs.append(sum(meter.gap_and_penetration(sample)) + offset)
+            roots.append(sample.world_from_agent)
+            bones.append(sample.agent_from_bone)
+        best = np.argmin(costs, axis=0), every
+        return settle_bodies(BodyMotion(np.stack(roots)[best], np.stack(bones)[best]), meter, self.poses)
 
     def short_motions(
         self, start: BodyMotion, end: BodyMotion, scene: MotionScene, rng: np.random.Generator
     ) -> list[BodyMotion]:
         """In-between each start body and its end body: 61 frames, both ends included."""
         root = np.stack([start.world_from_agent, end.world_from_agent], axis=1)
-        p = torch.stack([pose_channels(each.agent_from_bone, self.poses) for each in (start, end)], dim=1)
-        ends = encode_clips(root, p, np.zeros(len(root), int), [scene], self.sizes.points, rng)
-        made = self.between(ends.channels[:, 0], ends.channels[:, 1], ends.seen)
         bones = np.stack([start.agent_from_bone, end.agent_from_bone], axis=1)
+        p = [self.poses.encode(self.poses.channels(each)) for each in (bones[:, 0], bones[:, 1])]
+        where = np.zeros(len(root), int)
+        ends = encode_clips(root, torch.stack(p, dim=1), where, [scene], self.sizes.points, rng)
+        made = self.between(ends.channels[:, 0], ends.channels[:, 1], ends.seen)
         parts = zip(made, ends.world_from_clip, bones, strict=True)
         return [decode_clip(channels, frame, self.poses, given) for channels, frame, given in parts]
 
@@ -244,8 +236,3 @@ def measure_motion_prior(
     clearance_m, pace_m, above_m = medians
     turn_rad = max(float(np.percentile(np.concatenate(turn), TURN_PERCENTILE)), np.pi / RATE_HZ)
     return MotionPrior(clearance_m, max(pace_m, moving_m), above_m, turn_rad)
-
-
-def _where(condition: np.ndarray, one: BodyMotion, other: BodyMotion) -> BodyMotion:
-    roots = np.where(condition, one.world_from_agent, other.world_from_agent)
-    return BodyMotion(roots, np.where(condition[..., None], one.agent_from_bone, other.agent_from_bone))

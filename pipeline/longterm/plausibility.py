@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.geometry.signed_distance import SignedDistance
 from pipeline.longterm.bodies import PosedSurface, SkinnedBody
-from pipeline.longterm.contacts import ContactVertices, detect_stance, motion_tensors
+from pipeline.longterm.contacts import ContactVertices, detect_stance
 from pipeline.longterm.short_motions import RATE_HZ, BodyMotion
 
 FRAMES_AT_ONCE = 200
@@ -57,7 +57,7 @@ class PlausibilityMeter:
 
     def stance(self, motion: BodyMotion, *, should_stand: bool = False) -> Bool[np.ndarray, "frame foot"]:
         """Return the stance of each foot, or with ``should_stand`` which feet should be in stance."""
-        points = PosedSurface(self.body, self.contacts.vertices)(*motion_tensors(motion))
+        points = PosedSurface(self.body, self.contacts.vertices)(*motion.tensors())
         centers, height = self.contacts.centers(points), self.contacts.lowest(self.scene.at(points))
         roots = motion.world_from_agent[:, :3, 3]
         return detect_stance(centers.numpy(), height.numpy(), roots, should_stand=should_stand)
@@ -66,7 +66,7 @@ class PlausibilityMeter:
         self, motion: BodyMotion
     ) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame"]]:
         """Return per frame the gap between contact vertices and scene, and the penetration depth, meters."""
-        distance = self.scene.at(self.surface(*motion_tensors(motion)))
+        distance = self.scene.at(self.surface(*motion.tensors()))
         gap = distance[:, self.contacts.vertices].min(1).values.clamp_min(0)
         return gap.numpy(), (-distance).clamp_min(0).amax(1).numpy()
 
@@ -74,7 +74,7 @@ class PlausibilityMeter:
         """Measure a motion on all vertices of the body."""
         distances, points = [], []
         for start in range(0, len(motion), FRAMES_AT_ONCE):
-            vertices = self.surface(*motion_tensors(motion[start : start + FRAMES_AT_ONCE]))
+            vertices = self.surface(*motion[start : start + FRAMES_AT_ONCE].tensors())
             distances.append(self.scene.at(vertices))
             points.append(vertices[:, self.contacts.vertices])
         distance = torch.cat(distances)
@@ -104,6 +104,6 @@ def seams(
     surface = PosedSurface(body, None if vertices is None else body.sample_vertices(vertices))
     at = np.arange(every, len(motion) - 2, every)
     around = motion[(at[:, None] + np.arange(-2, 3)).reshape(-1)]
-    points = surface(*motion_tensors(around)).unflatten(0, (len(at), 5))
+    points = surface(*around.tensors()).unflatten(0, (len(at), 5))
     step = (points[:, 1:] - points[:, :-1]).norm(dim=-1).numpy()
     return (step[:, 1:3].max(1) - np.maximum(step[:, 0], step[:, 3])).clip(0)

@@ -9,9 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float, Real
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
+from torch import Tensor
 
 from pipeline.behavior.trajectories import Trajectory
 from pipeline.geometry import rigid
@@ -39,6 +41,10 @@ class BodyMotion:
     def __getitem__(self, frames: slice | np.ndarray) -> "BodyMotion":
         """Return some of the frames."""
         return BodyMotion(self.world_from_agent[frames], self.agent_from_bone[frames])
+
+    def tensors(self) -> tuple[Float[Tensor, "frame 4 4"], Float[Tensor, "frame bone 4 4"]]:
+        """Return root and bones in torch, single precision."""
+        return torch.from_numpy(self.world_from_agent).float(), torch.from_numpy(self.agent_from_bone).float()
 
 
 def concatenate_motions(parts: Sequence[BodyMotion]) -> BodyMotion:

@@ -15,7 +15,6 @@ from pipeline.fields.skinning import SkinnedShape
 from pipeline.geometry import rigid, views
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 from pipeline.longterm.bodies import PosedSurface, SkinnedBody
-from pipeline.longterm.contacts import motion_tensors
 from pipeline.longterm.journeys import Journey
 from pipeline.longterm.plausibility import Plausibility
 from pipeline.longterm.short_motions import RATE_HZ, BodyMotion
@@ -85,7 +84,7 @@ def write_frames(
     cameras = follow_camera(motion.world_from_agent[:, :3, 3], np.median(scene.vertices, axis=0))
     chosen = np.arange(0, len(motion), max(1, round(RATE_HZ / rate_hz)))
     for number, frame in enumerate(progress.track(chosen, "frames", total=len(chosen))):
-        posed = surface(*motion_tensors(motion[frame : frame + 1]))[0].numpy()
+        posed = surface(*motion[frame : frame + 1].tensors())[0].numpy()
         animal = Mesh(posed, body.mesh.faces, body.mesh.color)
         picture = render(caster, animal, cameras[frame], intrinsics, height, width)
         images.write_color(folder / "frames" / f"{number:06d}.jpg", picture)

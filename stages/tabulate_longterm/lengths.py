@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.longterm.bodies import PosedSurface
-from pipeline.longterm.contacts import motion_tensors
 from pipeline.longterm.journeys import travel
 from pipeline.longterm.short_motions import RATE_HZ
 from pipeline.longterm.subgoals import sample_visited_subgoals
@@ -35,7 +34,7 @@ def figures(source: MotionSource, config: Config) -> dict[str, float | None]:
     low, high = world.scene.surface.points.min(0), world.scene.surface.points.max(0)
     surface, outside = PosedSurface(world.body, world.body.sample_vertices(SAMPLED_VERTICES)), 0.0
     for start in range(0, len(made.motion), FRAMES_AT_ONCE):
-        points = surface(*motion_tensors(made.motion[start : start + FRAMES_AT_ONCE])).numpy()
+        points = surface(*made.motion[start : start + FRAMES_AT_ONCE].tensors()).numpy()
         beyond = np.maximum(np.maximum(low - points, points - high), 0)[..., [0, 2]]
         outside = max(outside, float(beyond.max()))
     arrival = made.motion.world_from_agent[np.round(made.arrival_s * RATE_HZ).astype(int), :3, 3]

@@ -11,7 +11,6 @@ from pipeline.behavior.model import channels_from_bones
 from pipeline.longterm.bodies import PoseSpace
 from pipeline.longterm.clip_channels import Clips, decode_clip
 from pipeline.longterm.config import MotionOptimizationConfig
-from pipeline.longterm.contacts import motion_tensors
 from pipeline.longterm.examples import MotionDataset
 from pipeline.longterm.motion_optimization import optimize_motion
 from pipeline.longterm.motion_synthesis import LongTerm
@@ -46,7 +45,7 @@ class Reference:
     @cached_property
     def mesh(self) -> Float[Tensor, "frame vertex 3"]:
         """The true vertices."""
-        return self.meter.surface(*motion_tensors(self.truth))
+        return self.meter.surface(*self.truth.tensors())
 
 
 def score(
@@ -56,7 +55,7 @@ def score(
     body, truth = reference.meter.body, reference.truth
     stance = reference.meter.stance(made)
     metrics = reference.meter.plausibility(made, stance)
-    mesh = reference.meter.surface(*motion_tensors(made))
+    mesh = reference.meter.surface(*made.tensors())
     apart = (mesh - reference.mesh).norm(dim=-1)
     next_to_ends = float((mesh[NEXT_TO_ENDS] - reference.mesh[ENDS]).norm(dim=-1).mean())
     turn = np.abs(made.world_from_agent - truth.world_from_agent)[:, :3, :2].mean()
@@ -162,7 +161,7 @@ def _joined(
     if settings is None:
         return joined
     held = np.arange(len(joined)) % STEPS == 0
-    return optimize_motion(joined, model.contact_body(meter.body), meter.scene, settings, held=held)
+    return optimize_motion(joined, meter, model.poses, settings, held=held)
 
 
 def references(

@@ -4,7 +4,6 @@ import torch
 from pipeline.behavior.model import channels_from_bones
 from pipeline.geometry import rigid
 from pipeline.longterm.bodies import PosedSurface, PoseSpace
-from pipeline.longterm.contacts import motion_tensors
 from tests.pipeline.longterm import strider
 
 
@@ -12,7 +11,7 @@ def test_surface_is_linear_blend_skinning():
     body, moving = strider.body(), strider.striding(np.array([[0.8, 0, -1.0], [0.8, 0, 1.0]]), 2.0)
     weights = np.random.default_rng(0).dirichlet(np.ones(5), len(body.mesh.vertices))
     body = type(body)(body.mesh, weights, body.agent_from_bone_rest, body.shape)
-    posed = PosedSurface(body)(*motion_tensors(moving)).numpy()
+    posed = PosedSurface(body)(*moving.tensors()).numpy()
     agent_from_rest = moving.agent_from_bone @ rigid.inverse(body.agent_from_bone_rest)
     for frame in (0, 31):
         each = rigid.apply(agent_from_rest[frame], body.mesh.vertices.astype(float))  # bone vertex 3

@@ -7,7 +7,7 @@ import torch
 from pipeline.baselines import longterm_networks
 from pipeline.core.errors import InputError
 from pipeline.longterm import simulated_lives
-from pipeline.longterm.clip_channels import decode_clip, encode_clips, encode_places, pose_channels
+from pipeline.longterm.clip_channels import decode_clip, encode_clips, encode_places
 from pipeline.longterm.config import LongTermSizes
 from pipeline.longterm.contacts import find_contact_vertices
 from pipeline.longterm.examples import encode_selection, fit_pose_space, sample_static_bodies, select_clips
@@ -52,7 +52,7 @@ def clips(dataset, model):
 
 def test_channel_encoding_is_inverted(dataset, model):
     part = dataset.stretches[0][: STEPS + 1]
-    p = pose_channels(part.agent_from_bone, model.poses)[None]
+    p = model.poses.encode(model.poses.channels(part.agent_from_bone))[None]
     coded = encode_clips(
         part.world_from_agent[None], p, np.zeros(1, int), dataset.scenes, 16, np.random.default_rng(0)
     )

@@ -13,10 +13,8 @@ from pipeline.longterm.contacts import (
     SWING_M_S2,
     enforce_swing_time,
     find_contact_vertices,
-    motion_tensors,
 )
 from pipeline.longterm.motion_optimization import (
-    ContactBody,
     contact_error,
     foot_error,
     lift_out_of_solid,
@@ -38,27 +36,28 @@ def dataset():
 
 
 @pytest.fixture(scope="module")
-def contact_body(dataset):
+def judge(dataset):
     contacts = find_contact_vertices(dataset.body, list(dataset.stretches), dataset.distances)
-    poses = PoseSpace(dataset.body.agent_from_bone_rest, 16).fit(
+    return PlausibilityMeter(dataset.body, contacts, dataset.scenes[0].distance)
+
+
+@pytest.fixture(scope="module")
+def poses(dataset):
+    return PoseSpace(dataset.body.agent_from_bone_rest, 16).fit(
         np.concatenate([s.agent_from_bone for s in dataset.stretches])
     )
-    return ContactBody(dataset.body, contacts, poses)
 
 
-def test_soles_are_found_and_form_four_feet(dataset, contact_body):
+def test_soles_are_found_and_form_four_feet(dataset, judge):
     soles = np.flatnonzero(dataset.body.mesh.vertices[:, 1] < -0.199)
-    assert contact_body.contacts.vertices.tolist() == soles.tolist()
-    assert contact_body.contacts.feet == 4
-    bone = dataset.body.weights[contact_body.contacts.vertices].argmax(1)
-    assert all(len(set(bone[contact_body.contacts.foot == foot])) == 1 for foot in range(4))
+    assert judge.contacts.vertices.tolist() == soles.tolist()
+    assert judge.contacts.feet == 4
+    bone = dataset.body.weights[judge.contacts.vertices].argmax(1)
+    assert all(len(set(bone[judge.contacts.foot == foot])) == 1 for foot in range(4))
 
 
-def test_stance_ratio_and_residuals_of_the_true_motion(dataset, contact_body):
-    judge, moving = (
-        PlausibilityMeter(dataset.body, contact_body.contacts, dataset.scenes[0].distance),
-        dataset.stretches[0],
-    )
+def test_stance_ratio_and_residuals_of_the_true_motion(dataset, judge, poses):
+    moving = dataset.stretches[0]
     stance = judge.stance(moving)
     assert stance.mean(0) == pytest.approx([0.67] * 4, abs=0.12)
     worth = judge.plausibility(moving, stance)
@@ -88,70 +87,63 @@ def test_stances_leave_time_for_swings():
     assert (gaps[0] + 2 >= np.sqrt(6 * away / SWING_M_S2) * 30).all()
 
 
-def test_noisy_motion_becomes_physical_and_stays_close(dataset, contact_body):
+def test_noisy_motion_becomes_physical_and_stays_close(dataset, judge, poses):
     truth = dataset.stretches[0][:120]
     shake = gaussian_filter1d(np.random.default_rng(1).normal(size=(120, 3)), 4, axis=0) * [0.05, 0.05, 0.05]
     root = truth.world_from_agent.copy()
     root[:, :3, 3] += shake
     shaken = BodyMotion(root, truth.agent_from_bone)
-    scene = dataset.scenes[0].distance
-    judge = PlausibilityMeter(dataset.body, contact_body.contacts, scene)
     stance = judge.stance(truth)
-    done = optimize_motion(shaken, contact_body, scene, SETTINGS)
+    done = optimize_motion(shaken, judge, poses, SETTINGS)
     before, after = judge.plausibility(shaken, stance), judge.plausibility(done, stance)
     assert after.penetration_m < 0.2 * before.penetration_m
     assert after.slide_m_s < 0.5 * before.slide_m_s
     surface = PosedSurface(dataset.body)
     error = [
-        float((surface(*motion_tensors(m)) - surface(*motion_tensors(truth))).norm(dim=-1).mean())
-        for m in (shaken, done)
+        float((surface(*m.tensors()) - surface(*truth.tensors())).norm(dim=-1).mean()) for m in (shaken, done)
     ]
     assert error[1] < 1.1 * error[0]
 
 
-def test_gliding_motion_gets_stances(dataset, contact_body):
+def test_gliding_motion_gets_stances(dataset, judge, poses):
     walk = dataset.stretches[0][:90]
     mean = np.repeat(walk.agent_from_bone.mean(0, keepdims=True), len(walk), axis=0)
     mean[..., :3, :3] = walk.agent_from_bone[0, :, :3, :3]
     gliding = BodyMotion(walk.world_from_agent, 0.85 * mean + 0.15 * walk.agent_from_bone)
-    scene = dataset.scenes[0].distance
-    judge = PlausibilityMeter(dataset.body, contact_body.contacts, scene)
-    done = optimize_motion(gliding, contact_body, scene, SETTINGS)
+    done = optimize_motion(gliding, judge, poses, SETTINGS)
     before, after = (judge.plausibility(each, judge.stance(each)).min_slide_m_s for each in (gliding, done))
     assert before > 0.1 and after < 0.3 * before
     assert not judge.stance(gliding).any() and judge.stance(done).any(axis=1).mean() > 0.5
 
 
-def test_fixed_frames_are_unchanged(dataset, contact_body):
+def test_fixed_frames_are_unchanged(dataset, judge, poses):
     moving, held = dataset.stretches[1][:30], np.arange(30) % 29 == 0
     lifted = BodyMotion(moving.world_from_agent + np.eye(4)[:, 3] * 0 + _lift(0.03), moving.agent_from_bone)
-    done = optimize_motion(
-        lifted, contact_body, dataset.scenes[0].distance, replace(SETTINGS, steps=10), held=held
-    )
+    done = optimize_motion(lifted, judge, poses, replace(SETTINGS, steps=10), held=held)
     np.testing.assert_allclose(done.world_from_agent[held], lifted.world_from_agent[held], atol=1e-6)
     assert np.abs(done.world_from_agent[~held] - lifted.world_from_agent[~held]).max() > 1e-3
 
 
-def test_penetrating_motion_is_moved_out_of_the_block(dataset, contact_body):
+def test_penetrating_motion_is_moved_out_of_the_block(dataset, judge, poses):
     walk = strider.striding(np.array([[0.36, 0, -0.2], [0.36, 0, 0.2]]), 1.0)
-    scene = dataset.scenes[0].distance
-    judge = PlausibilityMeter(dataset.body, contact_body.contacts, scene)
     stance = judge.stance(walk)
     assert judge.plausibility(walk, stance).deepest_m > 0.05
-    done = optimize_motion(walk, contact_body, scene, replace(SETTINGS, steps=150))
+    done = optimize_motion(walk, judge, poses, replace(SETTINGS, steps=150))
     assert judge.plausibility(done, stance).deepest_m < 0.02
 
 
-def test_unsampled_vertices_are_moved_out_of_a_board(dataset, contact_body):
+def test_unsampled_vertices_are_moved_out_of_a_board(dataset, judge, poses):
     """Only one vertex of the trunk, on the far side, is sampled for collisions."""
     board = strider.merged(strider.room(), strider.box([0.85, 0.17, -1], [1.3, 0.6, 1]))
     scene = replace(dataset.scenes[0], mesh=board).distance
     walk = strider.striding(np.array([[0.82, 0, -0.3], [0.82, 0, 0.3]]), 1.0)
     deepest = [
-        float(-scene.at(PosedSurface(dataset.body)(*motion_tensors(each))).min())
+        float(-scene.at(PosedSurface(dataset.body)(*each.tensors())).min())
         for each in (
             walk,
-            optimize_motion(walk, contact_body, scene, replace(SETTINGS, steps=100, vertices=1)),
+            optimize_motion(
+                walk, replace(judge, scene=scene), poses, replace(SETTINGS, steps=100, vertices=1)
+            ),
         )
     ]
     assert deepest[0] > 0.03 and deepest[1] < 0.005
@@ -214,12 +206,11 @@ def test_feet_are_lifted_out_of_boards_but_not_out_of_walls(dataset):
     )
 
 
-def test_single_bodies_are_moved_onto_the_floor(dataset, contact_body):
+def test_single_bodies_are_moved_onto_the_floor(dataset, judge, poses):
     still = dataset.stretches[0][np.array([0, 40, 80])]
-    judge = PlausibilityMeter(dataset.body, contact_body.contacts, dataset.scenes[0].distance)
     root = still.world_from_agent.copy()
     root[:, 1, 3] += [-0.06, 0.0, 0.03]
-    done = settle_bodies(BodyMotion(root, still.agent_from_bone), contact_body, judge.scene, SETTINGS)
+    done = settle_bodies(BodyMotion(root, still.agent_from_bone), judge, poses)
     gap, depth = judge.gap_and_penetration(done)
     assert gap.max() < 0.006 and depth.max() < 0.006
-    assert len(settle_bodies(done[:1], contact_body, judge.scene, replace(SETTINGS, steps=2))) == 1
+    assert len(settle_bodies(done[:1], judge, poses)) == 1

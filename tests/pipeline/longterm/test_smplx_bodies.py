@@ -7,7 +7,6 @@ import torch
 from pipeline.core.errors import InputError
 from pipeline.geometry import rigid
 from pipeline.longterm.bodies import PosedSurface
-from pipeline.longterm.contacts import motion_tensors
 from pipeline.longterm.smplx_bodies import motion_from_parameters, smplx_body
 
 VERTICES, JOINTS = 120, 55
@@ -66,9 +65,7 @@ def test_skinning_equals_that_of_smplx(tmp_path):
     pose = rng.normal(0, 0.4, (4, 63))
     person = smplx_body(path, betas)
     assert person.body.agent_from_bone_rest.shape == (JOINTS, 4, 4)
-    posed = PosedSurface(person.body)(
-        *motion_tensors(motion_from_parameters(person, transl, turn, pose))
-    ).numpy()
+    posed = PosedSurface(person.body)(*motion_from_parameters(person, transl, turn, pose).tensors()).numpy()
     layer = smplx.SMPLXLayer(str(path), ext="npz", num_betas=10, use_pca=False)
     layer.vertex_joint_selector.extra_joints_idxs = torch.zeros(
         0, dtype=torch.long
