@@ -40,10 +40,6 @@ class Clips:
     def __len__(self) -> int:
         return len(self.scene)
 
-    def __getitem__(self, index: np.ndarray) -> "Clips":
-        """Return some of the clips."""
-        return Clips(self.world_from_clip[index], self.channels[index], self.seen[index], self.scene[index])
-
 
 def root_channels(a_from_agent: Float[np.ndarray, "*batch 4 4"]) -> Float[Tensor, "*batch 9"]:
     """Return t and r of roots."""

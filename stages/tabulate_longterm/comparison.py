@@ -40,8 +40,8 @@ def figures(prefix: str, source: MotionSource, config: Config) -> dict[str, floa
     known = scores.references(cuts.parts(dataset), clips.scene, dataset, model)
     plain, made = {"truth": scores.score_pairs([each.truth for each in known], known, model)}, {}
     for name, method in methods.methods(source.models, dataset, config.seed).items():
-        made[name] = method(clips)
-        plain[name] = scores.scores(made[name], clips, known, model, None)
+        made[name] = scores.decode_clips(method(clips), clips, known, model)
+        plain[name] = scores.score_pairs(made[name], known, model)
         mpjpe_mm = plain[name][:, scores.METRICS.index("mpjpe_mm")].mean()
         progress.log(f"{prefix}: {name}, MPJPE {mpjpe_mm:.1f} mm")
     plain |= {
@@ -53,8 +53,8 @@ def figures(prefix: str, source: MotionSource, config: Config) -> dict[str, floa
     done = {}
     optimized = methods.OPTIMIZED if source.data is None else ("ours",)
     for name in optimized:
-        true = [known[index] for index in some]
-        done[f"{name}_opt"] = scores.scores(made[name][some], clips[some], true, model, config.optimization)
+        motions, true = ([each[index] for index in some] for each in (made[name], known))
+        done[f"{name}_opt"] = scores.score_pairs(motions, true, model, config.optimization)
         done[f"{name}_same"] = plain[name][some]
         progress.log(f"{prefix}: {name}, optimized")
     episode = episodes(cuts.start, cuts.stretch, EPISODE_FRAMES)

@@ -1,4 +1,4 @@
-"""Read both sources of motion, with the networks trained on each."""
+"""A source of motion with the networks trained on it."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,8 +7,7 @@ import numpy as np
 
 from pipeline.baselines import longterm_networks
 from pipeline.behavior.trajectories import BehaviorData
-from pipeline.longterm import simulated_lives
-from pipeline.longterm.examples import DatasetSplit, encode_selection, reconstructed_split, select_clips
+from pipeline.longterm.examples import DatasetSplit, encode_selection, select_clips
 from pipeline.longterm.journeys import LongTermWorld
 from pipeline.longterm.motion_synthesis import LongTerm
 from stages.tabulate_longterm.methods import ComparedModels
@@ -29,18 +28,8 @@ class MotionSource:
         return LongTermWorld(self.models.ours, self.split.train.body, self.split.train.scenes[0])
 
 
-def simulated(world: Path, study: Path) -> MotionSource:
-    """Read simulated motion and the models trained on it."""
-    return _with_models(simulated_lives.load(world), study, None)
-
-
-def recorded(reconstruction: Path, behavior_data: Path, ablations: Path) -> MotionSource:
-    """Read reconstructed motion and the models trained on it."""
-    data = BehaviorData.load(behavior_data)
-    return _with_models(reconstructed_split(reconstruction, data), ablations, data)
-
-
-def _with_models(split: DatasetSplit, folder: Path, data: BehaviorData | None) -> MotionSource:
+def with_models(split: DatasetSplit, folder: Path, data: BehaviorData | None = None) -> MotionSource:
+    """Read the models in ``folder``, trained on ``split``; ``data`` only of reconstructed motion."""
     ours = LongTerm.load(folder)
     ablated = {
         name: longterm_networks.load(folder / "ablations" / f"{name}.safetensors", kind, ours.sizes)

@@ -5,12 +5,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.baselines.samplers import sampler_of
-from pipeline.behavior import model as behavior
+from pipeline.baselines.predictors import Ats
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
 from pipeline.behavior.perception import world_from_ego
-from pipeline.behavior.planning import TorchNetworks, observe
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import FUTURE, RATE_HZ, TRAIN, BehaviorData
 from pipeline.core import progress
@@ -65,13 +63,10 @@ def rows(
     device: str,
 ) -> Float[np.ndarray, "window 2 4"]:
     """Return `NAMES` of each window's plan before and after optimization."""
-    architecture, nets, scaling, schedule, _ = behavior.load(model)
-    sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
+    ats = Ats.load(model, Scenes.load(behavior_data, data.videos), PlanSamplingConfig(), device=device)
     context, future = data.windows(windows)
-    scenes = Scenes.load(behavior_data, data.videos)
-    observation = observe(context, scenes, data.agent_from_bone_rest, architecture.ego)
-    plan = sampler.plan(observation, PlanSamplingConfig(), np.random.default_rng(config.seed))
-    roots = plan.world_from_agent(world_from_ego(context.world_from_agent[:, -1], architecture.ego))
+    plan = ats.sampler.plan(ats.observe(context), ats.sampling, np.random.default_rng(config.seed))
+    roots = plan.world_from_agent(world_from_ego(context.world_from_agent[:, -1], ats.ego))
     bones = bones_from_channels(plan.body[..., ROOT_CHANNELS:], data.agent_from_bone_rest)
     count = min(roots.shape[1], future.path_world.shape[1])
     time_s, found = np.arange(count) / RATE_HZ, []

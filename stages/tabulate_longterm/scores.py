@@ -86,20 +86,6 @@ def score(
     )
 
 
-def scores(
-    channels: Float[Tensor, "clip frame channel"],
-    clips: Clips,
-    references: list[Reference],
-    model: LongTerm,
-    settings: MotionOptimizationConfig | None,
-) -> Float[np.ndarray, "clip metric"]:
-    """Return the metrics of one method on clips in consecutive pairs, with the seam within each pair.
-
-    With ``settings`` each pair is optimized as one motion, except the given bodies at its ends and middle.
-    """
-    return score_pairs(decode_clips(channels, clips, references, model), references, model, settings)
-
-
 def decode_clips(
     channels: Float[Tensor, "clip frame channel"], clips: Clips, references: list[Reference], model: LongTerm
 ) -> list[BodyMotion]:
@@ -116,7 +102,10 @@ def score_pairs(
     model: LongTerm,
     settings: MotionOptimizationConfig | None = None,
 ) -> Float[np.ndarray, "clip metric"]:
-    """Return the metrics of motions in consecutive pairs."""
+    """Return the metrics of motions in consecutive pairs, with the seam within each pair.
+
+    With ``settings`` each pair is optimized as one motion, except the given bodies at its ends and middle.
+    """
     rows = []
     for start in range(0, len(motions), 2):
         meter = references[start].meter
@@ -156,7 +145,6 @@ def _joined(
     model: LongTerm,
     settings: MotionOptimizationConfig | None,
 ) -> BodyMotion:
-    """Concatenate motions; with ``settings`` optimize them as one, except the bodies at their ends."""
     joined = concatenate_motions(motions)
     if settings is None:
         return joined

@@ -4,8 +4,11 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.behavior.trajectories import BehaviorData
 from pipeline.core import devices, progress
 from pipeline.data import qa
+from pipeline.longterm import simulated_lives
+from pipeline.longterm.examples import reconstructed_split
 from stages.tabulate_longterm import bars, comparison, lengths, reading, samples, tables
 from stages.tabulate_longterm.config import Config
 
@@ -26,8 +29,10 @@ def run(
     inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "cpu"
 ) -> dict[str, float | None]:
     """Write `tables.json` and `tables.txt`; return the figures, None where nothing can be measured."""
-    world = reading.simulated(inputs.longterm_world, inputs.longterm_study)
-    recorded = reading.recorded(inputs.reconstruction, inputs.behavior_data, inputs.longterm_ablations)
+    world = reading.with_models(simulated_lives.load(inputs.longterm_world), inputs.longterm_study)
+    data = BehaviorData.load(inputs.behavior_data)
+    split = reconstructed_split(inputs.reconstruction, data)
+    recorded = reading.with_models(split, inputs.longterm_ablations, data)
     figures: dict[str, float | None] = {}
     for prefix, source in (("longterm", world), ("longterm_recorded", recorded)):
         figures |= comparison.figures(prefix, source, config)

@@ -1,7 +1,5 @@
 """The quality page of long-term motion: losses, routes and bodies on held-out motion."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -36,16 +34,10 @@ CAPTIONS = {
 }
 
 
-@dataclass(frozen=True)
-class ModelReport:
-    """Checks and pictures of a model."""
-
-    checks: list[Check]
-    pictures: list[Picture]
-
-
-def evaluate_held_out(learned: TrainedLongTerm, dataset: DatasetSplit, seed: int) -> ModelReport:
-    """Evaluate a model on held-out motion, or on the training motion if none is held out."""
+def evaluate_held_out(
+    learned: TrainedLongTerm, dataset: DatasetSplit, seed: int
+) -> tuple[list[Check], list[Picture]]:
+    """Return checks and pictures of a model on held-out motion, or on training motion if none is held out."""
     where = dataset.held_out or dataset.train
     rng = np.random.default_rng(seed)
     cuts = select_clips(where, rng, stride=CLIP_STRIDE, most=TRIED)
@@ -66,7 +58,7 @@ def evaluate_held_out(learned: TrainedLongTerm, dataset: DatasetSplit, seed: int
         Check("variance of poses that the pose space explains", explained, "share", 0.9, 0.5, "higher"),
     ]
     losses = plots.loss_curves({name: {"total": record.total()} for name, record in learned.records.items()})
-    return ModelReport(checks, captioned(CAPTIONS, losses=losses, routes=routes(clips, made, where)))
+    return checks, captioned(CAPTIONS, losses=losses, routes=routes(clips, made, where))
 
 
 def _stills(learned: TrainedLongTerm, where: MotionDataset, rng: np.random.Generator) -> tuple[float, float]:

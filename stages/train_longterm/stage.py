@@ -12,8 +12,6 @@ from stages.train_longterm import learning, pictures, sources
 from stages.train_longterm.config import Config
 from stages.train_longterm.learning import TrainedLongTerm
 
-SECONDS_PER_MINUTE = 60
-
 
 @dataclass(frozen=True)
 class Inputs:
@@ -31,21 +29,20 @@ def run(inputs: Inputs, config: Config, out: Path, *, resume: Path | None = None
     """
     distributed.join("cpu")
     split = _read(inputs, config)
-    frames = sum(map(len, split.train.stretches))
-    minutes = frames / RATE_HZ / SECONDS_PER_MINUTE
+    minutes = sum(map(len, split.train.stretches)) / (60 * RATE_HZ)
     progress.log(f"{len(split.train.stretches)} stretches of motion, {minutes:.1f} min at {RATE_HZ} fps")
     trained = learning.train_networks(split.train, config, resume=resume)
     if not distributed.leave():
         return trained
-    report = pictures.evaluate_held_out(trained, split, config.seed)
+    checks, shown = pictures.evaluate_held_out(trained, split, config.seed)
     trained.model.save(out)
     learning.write_ablations(out, trained)
     qa.write(
         out,
         good="routes that turn where the animal's do, bodies that stand on what is beneath them",
         bad="routes through furniture, bodies in the air or in the ground",
-        checks=report.checks,
-        pictures=report.pictures,
+        checks=checks,
+        pictures=shown,
     )
     return trained
 

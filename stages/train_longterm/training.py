@@ -1,6 +1,6 @@
 """Fit the networks of long-term motion in turn: static bodies, routes, then poses along fixed routes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,7 +70,6 @@ class NetworkTrainer:
     weights: LongTermLossWeights
     seed: int
     resume: Path | None = None
-    device: str = "cpu"
 
     def train(
         self,
@@ -118,7 +117,8 @@ def fit_stages(
     def loss(index: Tensor) -> dict[str, Tensor]:
         truth = clips.channels[index]
         made = net.stages(truth[:, 0], truth[:, -1], clips.seen[index])
-        shift, turn = _summed_route_errors(made, truth)
+        errors = zip(*(objectives.route_error(each, truth) for each in made), strict=True)
+        shift, turn = (sum(parts, start=torch.zeros(())) for parts in errors)
         terms = {"translation": w.translation * shift}
         if isinstance(net, BaseNet) or net.predicts_rotation:
             terms["rotation"] = w.rotation * turn
@@ -129,15 +129,6 @@ def fit_stages(
         return terms
 
     return trainer.train(name, net, optimizer_config, loss, len(clips))
-
-
-def _summed_route_errors(
-    made: Sequence[Float[Tensor, "clip frame channel"]], truth: Float[Tensor, "clip frame known"]
-) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """Return translation and rotation errors, summed over the stages."""
-    errors = [objectives.route_error(each, truth) for each in made]
-    shift, turn = (sum(parts, start=torch.zeros(())) for parts in zip(*errors, strict=True))
-    return shift, turn
 
 
 def predicted_routes(net: RouteNet, clips: Clips) -> Float[Tensor, "clip frame 9"]:

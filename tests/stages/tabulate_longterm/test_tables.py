@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from pipeline.baselines import longterm_networks
+from pipeline.longterm.clip_channels import Clips
 from pipeline.longterm.config import LongTermSizes, MotionOptimizationConfig
 from pipeline.longterm.contacts import find_contact_vertices
 from pipeline.longterm.examples import DatasetSplit, encode_selection, fit_pose_space, select_clips
@@ -78,7 +79,8 @@ def test_memory_bank_retrieves_its_own_clips(source):
 
 
 def test_route_and_cvae_keeps_the_route(source):
-    some = source.models.bank[np.arange(2)]
+    bank, pair = source.models.bank, np.arange(2)
+    some = Clips(bank.world_from_clip[pair], bank.channels[pair], bank.seen[pair], bank.scene[pair])
     made = methods.route_cvae(source.models.ours, some, source.split.train, np.random.default_rng(0))
     route = source.models.ours.route(some.channels[:, 0], some.channels[:, -1], some.seen)
     torch.testing.assert_close(made[..., :9], route)
