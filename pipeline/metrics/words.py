@@ -1,8 +1,7 @@
 """Descriptions of the metrics of `metrics.json` for readers."""
 
 import re
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 SUBJECTS = {
     "agent": "animal's root",
@@ -77,8 +76,7 @@ METHODS = {
 """Prefixes of metrics that name the method."""
 
 
-@dataclass(frozen=True)
-class MetricWords:
+class MetricWords(NamedTuple):
     """One metric in words."""
 
     text: str
@@ -102,13 +100,13 @@ def describe(key: str) -> MetricWords:
     name = name.removeprefix(method)
     unit = ""
     if name not in STEMS:
-        for endings, into in ((STATISTICS, tail), (PARTS, tail), (UNITS, None)):
+        for endings in (STATISTICS, PARTS, UNITS):
             found = next((each for each in endings if name.endswith(each)), "")
             name = name.removesuffix(found)
-            if found and into is None:
+            if found and endings is UNITS:
                 unit = endings[found]
-            elif found and into is not None:
-                into.insert(0, endings[found])
+            elif found:
+                tail.insert(0, endings[found])
     unit = unit or ("px" if name.startswith("epe_px") else "dB" if name == "psnr" else "")
     words.append(STEMS.get(name, name.replace("_", " ")))
     return MetricWords(", ".join([": ".join(words), *tail]), unit)
@@ -126,9 +124,4 @@ def number(value: Any) -> str:
 
 
 def _subject(name: str) -> str:
-    ours, _, baseline = name.partition("_minus_")
-    return (
-        f"{SUBJECTS.get(ours, ours)} less {SUBJECTS.get(baseline, baseline)}"
-        if baseline
-        else SUBJECTS.get(name, name)
-    )
+    return " less ".join(SUBJECTS.get(each, each) for each in name.split("_minus_"))

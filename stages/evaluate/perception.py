@@ -49,15 +49,16 @@ def overlaps(masks: Masks, truth: RecordingTruth) -> Overlaps:
 
 def mask_metrics(sessions: Sequence[Overlaps], turnaround: Overlaps | None) -> Metrics:
     """Summarize overlaps of all sessions; the turnaround, which is easier, is separate."""
-    metrics = Metrics()
-    iou = np.concatenate([each.iou for each in sessions]) if sessions else np.zeros(0)
-    resting = np.concatenate([each.resting for each in sessions]) if sessions else np.zeros(0, bool)
+    metrics, none = Metrics(), [Overlaps(np.zeros(0), np.zeros(0, bool), np.zeros(0))]
+    iou, resting, confidence = (
+        np.concatenate([getattr(each, name) for each in sessions or none])
+        for name in ("iou", "resting", "confidence")
+    )
     metrics.put("masks/iou_mean", mean(iou), "the animal is never visible")
     metrics.put("masks/iou_resting", mean(iou[resting]), "the animal never rests in view")
     swapped = [each.swapped for each in sessions if each.swapped is not None]
     if swapped:
         metrics.put("masks/identity_swaps", mean(np.concatenate(swapped)), "no animal is ever visible")
-    confidence = np.concatenate([each.confidence for each in sessions]) if sessions else np.zeros(0)
     metrics.add(reliability_metrics("masks", confidence, iou >= RIGHT_IOU))
     metrics.put("masks/iou_turnaround", mean(turnaround.iou) if turnaround else np.nan, "no turnaround")
     return metrics
@@ -93,39 +94,28 @@ def people_metrics(sessions: Sequence[tuple[RecordingTruth, Float[np.ndarray, "f
     return metrics
 
 
-@dataclass(frozen=True)
-class FlowPair:
-    """Ours and true flow of the same pair of frames, color pixels."""
-
-    ours: Float[np.ndarray, "height width 2"]
-    true: Float[np.ndarray, "height width 2"]
-    agent: Bool[np.ndarray, "height width"]
+ComparedFlow = tuple[Float[np.ndarray, "pair row column 2"], TrueFlow, Bool[np.ndarray, "frame height width"]]
+"""Of a session: our flow of gap 1, the true flow, and the agent's true masks; color pixels"""
 
 
-def flow_pairs(
-    ours: Float[np.ndarray, "pair height width 2"],
-    true: TrueFlow,
-    masks: Bool[np.ndarray, "frame row column"],
-) -> list[FlowPair]:
-    """Pair up flow of gap 1; the agent's cells are those whose center it covers."""
-    stride = masks.shape[1] // ours.shape[1]
-    agent = masks[:, stride // 2 :: stride, stride // 2 :: stride][:, : ours.shape[1], : ours.shape[2]]
-    return [
-        FlowPair(ours[first].astype(np.float32), flow, agent[first])
-        for first, flow in zip(true.first, true.flow, strict=True)
-    ]
+def flow_metrics(sessions: Sequence[ComparedFlow]) -> Metrics:
+    """Return end-point errors, of ours and of predicting no motion at all.
 
-
-def flow_metrics(pairs: Sequence[FlowPair]) -> Metrics:
-    """Return end-point errors, of ours and of predicting no motion at all."""
+    The agent's cells are those whose center it covers.
+    """
     metrics, why = Metrics(), "no truth for neighboring frames"
     ours, zero, agent = [], [], []
-    for pair in pairs:
-        known = np.isfinite(pair.true).all(-1)
-        error = np.linalg.norm(pair.ours - pair.true, axis=-1)
-        ours.append(error[known])
-        agent.append(error[known & pair.agent])
-        zero.append(np.linalg.norm(pair.true, axis=-1)[known])
+    for found, true, masks in sessions:
+        stride = masks.shape[1] // found.shape[1]
+        covered = masks[:, stride // 2 :: stride, stride // 2 :: stride][
+            :, : found.shape[1], : found.shape[2]
+        ]
+        for first, flow in zip(true.first, true.flow, strict=True):
+            known = np.isfinite(flow).all(-1)
+            error = np.linalg.norm(found[first].astype(np.float32) - flow, axis=-1)
+            ours.append(error[known])
+            agent.append(error[known & covered[first]])
+            zero.append(np.linalg.norm(flow, axis=-1)[known])
     for name, parts in (("epe_px_mean", ours), ("epe_px_agent_mean", agent), ("zero_flow_epe_px_mean", zero)):
         metrics.put(f"flow/{name}", mean(np.concatenate(parts) if parts else np.zeros(0)), why)
     return metrics

@@ -141,19 +141,19 @@ def shots_of(
     count: int,
 ) -> list[HeldoutShot]:
     """Return what the held-out phone saw during ``session``, in up to ``count`` frames, depth-sized."""
-    true = read_depth(folders.truth_folder, phone.name, phone.source_index)
+    depth, intrinsics = read_depth(folders.truth_folder, phone.name, phone.source_index)
     cameras = frames.cameras(phone.truth)
     shots = []
     for frame in reading.subsampled(reading.filmed_together(folders, phone.video), count).tolist():
-        size = true.depth[frame].shape[::-1]
+        size = depth[frame].shape[::-1]
         color = cv2.resize(phone.clip.color(frame), size, interpolation=cv2.INTER_AREA)
         mask = phone.truth.masks[frame].astype(np.uint8)
         agent = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0
         time_s = float(phone.clip.timestamp_s[frame] + phone.video.offset_s)
         meanwhile = int(np.abs(session.clip.timestamp_s - time_s).argmin())
         share = float(session.truth.masks[meanwhile].mean())
-        seen = color, true.depth[frame], agent, share
-        shots.append(HeldoutShot(cameras[frame], true.intrinsics[frame], time_s, *seen))
+        seen = color, depth[frame], agent, share
+        shots.append(HeldoutShot(cameras[frame], intrinsics[frame], time_s, *seen))
     return shots
 
 

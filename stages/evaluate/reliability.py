@@ -20,7 +20,11 @@ def reliability_metrics(
     """
     metrics, known = Metrics(), np.isfinite(probability)
     probability, right = probability[known], right[known]
-    confidence, accuracy, count = _curve(probability, right)
+    index = np.clip((probability * BINS).astype(int), 0, BINS - 1)
+    count = np.bincount(index, minlength=BINS)
+    confidence, accuracy = (
+        np.bincount(index, each, BINS) / np.maximum(count, 1) for each in (probability, right)
+    )
     metrics.put(f"{name}/confidence_mean", mean(probability))
     error = float((count * np.abs(confidence - accuracy)).sum() / count.sum()) if count.sum() else np.nan
     metrics.put(f"{name}/calibration_error", error)
@@ -30,16 +34,6 @@ def reliability_metrics(
         )
         metrics.charts[caption] = _chart(confidence, accuracy, count)
     return metrics
-
-
-def _curve(
-    probability: Float[np.ndarray, "frame"], right: Bool[np.ndarray, "frame"]
-) -> tuple[Float[np.ndarray, "bin"], Float[np.ndarray, "bin"], Int[np.ndarray, "bin"]]:
-    """Return per bin the mean confidence, the accuracy, and the number of frames."""
-    index = np.clip((probability * BINS).astype(int), 0, BINS - 1)
-    count = np.bincount(index, minlength=BINS)
-    safe = np.maximum(count, 1)
-    return np.bincount(index, probability, BINS) / safe, np.bincount(index, right, BINS) / safe, count
 
 
 def _chart(

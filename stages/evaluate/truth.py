@@ -56,21 +56,15 @@ class RecordingTruth:
         return self.vertices[frame].astype(np.float64) + self.world_from_agent[frame, :3, 3]
 
 
-@dataclass(frozen=True)
-class TrueDepth:
-    """Noiseless depth of the held-out phone."""
-
-    depth: Float[np.ndarray, "frame height width"]
-    intrinsics: Float[np.ndarray, "frame 3 3"]
-
-
-def read_depth(folder: Path, name: str, source_index: Int[np.ndarray, "frame"]) -> TrueDepth:
-    """Read ``<name>.depth.npz`` for the extracted frames."""
+def read_depth(
+    folder: Path, name: str, source_index: Int[np.ndarray, "frame"]
+) -> tuple[Float[np.ndarray, "frame height width"], Float[np.ndarray, "frame 3 3"]]:
+    """Read noiseless depth (meters) and its intrinsics for the extracted frames: ``<name>.depth.npz``."""
     table = npz.load(folder / f"{name}.depth.npz")
     intrinsics = table["depth_intrinsics"]
     if intrinsics.ndim == 2:
         intrinsics = np.broadcast_to(intrinsics, (len(table["depth"]), 3, 3))
-    return TrueDepth(table["depth"][source_index].astype(np.float32), intrinsics[source_index])
+    return table["depth"][source_index].astype(np.float32), intrinsics[source_index]
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Long rollouts of chained plans beside the observer of a test recording, compared with recorded motion."""
 
+from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
@@ -36,25 +37,26 @@ def figures(
     solid = scenes.inside_solid(position, data.video[chosen]).mean(1)
     recorded = [data.trajectories[data.videos[video]] for video in np.unique(data.video[test])]
     true = [_speeds(t.world_from_agent[:, :3, 3], data.rate_hz)[t.valid[1:] & t.valid[:-1]] for t in recorded]
+    parts = true if len(true) > 1 else np.array_split(true[0], 2)
+    others = [np.concatenate([*parts[:mine], *parts[mine + 1 :]]) for mine in range(len(parts))]
     tilted = np.quantile(
         np.concatenate([_tilts(t.world_from_agent[t.valid]) for t in recorded]), UPRIGHT_QUANTILE
     )
     speeds, whole = [_speeds(life, data.rate_hz) for life in position], np.concatenate(true)
+    every = np.concatenate(speeds)
     return {
         "behavior/ats/chain_rollouts": float(count),
         "behavior/ats/chain_seconds": float(seconds),
         "behavior/ats/chain_solid_share": float(np.mean(solid)),
         "behavior/ats/chain_solid_share_worst": float(np.max(solid)),
-        "behavior/ats/chain_speed_ks": float(np.mean([_ks_distance(each, whole) for each in speeds])),
-        "behavior/ats/chain_speed_ks_pooled": _ks_distance(np.concatenate(speeds), whole),
-        "behavior/ats/chain_moving_speed_ks": float(
-            np.mean([_ks_distance(each, whole, REST_M_S) for each in speeds])
-        ),
-        "behavior/ats/chain_moving_speed_ks_pooled": _ks_distance(np.concatenate(speeds), whole, REST_M_S),
+        "behavior/ats/chain_speed_ks": _mean_ks(speeds, [whole] * count),
+        "behavior/ats/chain_speed_ks_pooled": _mean_ks([every], [whole]),
+        "behavior/ats/chain_moving_speed_ks": _mean_ks(speeds, [whole] * count, REST_M_S),
+        "behavior/ats/chain_moving_speed_ks_pooled": _mean_ks([every], [whole], REST_M_S),
         "behavior/ats/chain_tilted_share": float(np.mean(tilt > tilted)),
-        "behavior/ats/chain_rest_share": float(np.mean(np.concatenate(speeds) < REST_M_S)),
-        "behavior/true/chain_speed_ks": _ks_among_recordings(true),
-        "behavior/true/chain_moving_speed_ks": _ks_among_recordings(true, REST_M_S),
+        "behavior/ats/chain_rest_share": float(np.mean(every < REST_M_S)),
+        "behavior/true/chain_speed_ks": _mean_ks(parts, others),
+        "behavior/true/chain_moving_speed_ks": _mean_ks(parts, others, REST_M_S),
         "behavior/true/chain_rest_share": float(np.mean(whole < REST_M_S)),
     }
 
@@ -100,18 +102,12 @@ def _speeds(path: Float[np.ndarray, "frame 3"], rate_hz: float) -> Float[np.ndar
     return np.linalg.norm(np.diff(path, axis=0), axis=-1) * rate_hz
 
 
-def _ks_distance(
-    mine: Float[np.ndarray, "step"], others: Float[np.ndarray, "other"], min_speed: float = 0.0
+def _mean_ks(
+    mine: Sequence[Float[np.ndarray, "step"]],
+    others: Sequence[Float[np.ndarray, "other"]],
+    min_speed: float = 0.0,
 ) -> float:
-    found = ks_2samp(np.maximum(mine, min_speed), np.maximum(others, min_speed))
-    return cast("tuple[float, float]", found)[0]  # statistic and p-value
-
-
-def _ks_among_recordings(recorded: list[Float[np.ndarray, "step"]], min_speed: float = 0.0) -> float:
-    parts = recorded if len(recorded) > 1 else np.array_split(recorded[0], 2)
-    others = [
-        np.concatenate([part for other, part in enumerate(parts) if other != mine])
-        for mine in range(len(parts))
-    ]
-    pairs = zip(parts, others, strict=True)
-    return float(np.mean([_ks_distance(part, rest, min_speed) for part, rest in pairs]))
+    """Return the mean Kolmogorov-Smirnov distance of pairs; speeds under ``min_speed`` (m/s) are equal."""
+    pairs = zip(mine, others, strict=True)
+    found = (ks_2samp(*(np.maximum(each, min_speed) for each in pair)) for pair in pairs)
+    return float(np.mean([cast("tuple[float, float]", each)[0] for each in found]))  # statistic and p-value

@@ -1,6 +1,6 @@
 """Reading of the scores and losses of every trial."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,9 +22,8 @@ class MethodScores:
     values: dict[str, Float[np.ndarray, "_ _"]]
     """[seed window] of `<protocol>/<score>`, `recorded/solid`; `flees/<condition>`, which is per approach"""
     past: int = PAST
-    """known frames of a window"""
     future: int = FUTURE
-    """predicted frames of a window"""
+    """known and predicted frames of a window"""
 
     def windows_of(self, name: str) -> Int[np.ndarray, "window 2"]:
         """Return the windows that a score belongs to; every approach is an episode of its own."""
@@ -50,12 +49,3 @@ def curves(folders: Sequence[Path]) -> dict[str, Float[np.ndarray, "seed step"]]
     """Read the losses at every step of the trials of one method."""
     read = [npz.load(folder / "losses.npz") for folder in folders]
     return {name.removeprefix("loss/"): np.stack([each[name] for each in read]) for name in read[0]}
-
-
-def windows(found: Mapping[str, MethodScores]) -> dict[str, Int[np.ndarray, "window 2"]]:
-    """Return the windows of every method."""
-    return {
-        f"{method}/{kind}": getattr(scores, kind)
-        for method, scores in found.items()
-        for kind in ("goal_window", "plan_window")
-    }

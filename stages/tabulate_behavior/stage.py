@@ -32,15 +32,11 @@ class Inputs:
 
 def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "cpu") -> None:
     """Gather the scores and write the tables."""
-    trials = {method: [f"{method}-{seed}" for seed in range(config.seeds)] for method in config.methods}
-    scores = {
-        method: reading.stacked([inputs.behavior_scores[trial] for trial in each])
-        for method, each in trials.items()
-    }
-    curves = {
-        method: reading.curves([inputs.behavior_trials[trial] for trial in each])
-        for method, each in trials.items()
-    }
+    scores, curves = {}, {}
+    for method in config.methods:
+        trials = [f"{method}-{seed}" for seed in range(config.seeds)]
+        scores[method] = reading.stacked([inputs.behavior_scores[trial] for trial in trials])
+        curves[method] = reading.curves([inputs.behavior_trials[trial] for trial in trials])
     data = BehaviorData.load(inputs.behavior_data).with_horizon(scores[OURS].future)
     scores |= untrained.scores(data, scores[OURS], trials=config.trials, seed=config.seed)
     figures = tables.figures(scores, OURS, seed=config.seed) | tables.plateaus(curves)
@@ -54,7 +50,9 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
     progress.log(f"\n{text}")
     (out / "tables.json").write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
     (out / "tables.txt").write_text(text + "\n")
-    npz.save(out / "windows.npz", compress=False, **reading.windows(scores))
+    kinds = ("goal_window", "plan_window")
+    windows = {f"{name}/{kind}": getattr(each, kind) for name, each in scores.items() for kind in kinds}
+    npz.save(out / "windows.npz", compress=False, **windows)
     qa.write(
         out,
         good="ours ahead of every baseline, intervals apart",

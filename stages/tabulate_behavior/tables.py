@@ -1,11 +1,12 @@
 """Means over windows and seeds, with bootstrap intervals that resample episodes and trainings."""
 
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.metrics.intervals import Interval, episodes
+from pipeline.metrics.intervals import BOOTSTRAP_DRAWS, Interval, episodes
 from stages.tabulate_behavior.reading import MethodScores
 
 UNPREFIXED = "end_to_end"
@@ -17,21 +18,18 @@ CONTRASTS = (
 )
 """Figures, each the paired difference of two scores per approach or window."""
 
-RESAMPLES = 2000
-"""Bootstrap resamples: bounds of 95 % intervals vary by about 1 % of their width."""
-
 
 def figures(
-    found: Mapping[str, MethodScores], ours: str, *, seed: int, draws: int = RESAMPLES
+    found: Mapping[str, MethodScores], ours: str, *, seed: int, draws: int = BOOTSTRAP_DRAWS
 ) -> dict[str, float | None]:
     """Return all figures with intervals, and paired differences to ours where the windows are the same."""
     table: dict[str, float | None] = {}
     for method, scores in found.items():
         for name, values in scores.values.items():
             window, frames = scores.windows_of(name), scores.past + scores.future
-            table |= interval(values, window, frames, draws, seed).as_figures(
-                f"behavior/{method}/{_figure(name)}"
-            )
+            figure = name.removeprefix(f"{UNPREFIXED}/").replace("/", "_")
+            interval_of = partial(interval, window=window, frames=frames, draws=draws, seed=seed)
+            table |= interval_of(values).as_figures(f"behavior/{method}/{figure}")
             baseline = found[ours].values.get(name)
             if (
                 method != ours
@@ -40,10 +38,8 @@ def figures(
             ):
                 both = min(len(baseline), len(values))
                 paired = slice(both if both > 1 else None)  # one seed alone is paired with all others
-                difference = baseline[paired] - values[paired]
-                table |= interval(difference, window, frames, draws, seed).as_figures(
-                    f"behavior/{ours}_minus_{method}/{_figure(name)}"
-                )
+                difference = interval_of(baseline[paired] - values[paired])
+                table |= difference.as_figures(f"behavior/{ours}_minus_{method}/{figure}")
         _add_contrasts(table, method, scores, draws, seed)
         table[f"behavior/{method}/seeds"] = len(next(iter(scores.values.values())))
     return table
@@ -55,11 +51,9 @@ def _add_contrasts(
     """Add the contrasts within one method: `CONTRASTS`, and paths given the true goal against end to end."""
     for name, first, second in CONTRASTS:
         if first in scores.values and second in scores.values:
-            difference = scores.values[first] - scores.values[second]
-            frames = scores.past + scores.future
-            table |= interval(difference, scores.windows_of(first), frames, draws, seed).as_figures(
-                f"behavior/{method}/{name}"
-            )
+            difference, frames = scores.values[first] - scores.values[second], scores.past + scores.future
+            found = interval(difference, scores.windows_of(first), frames, draws, seed)
+            table |= found.as_figures(f"behavior/{method}/{name}")
     given_goal, end_to_end = (
         scores.values.get(f"{protocol}/path_minade_m") for protocol in ("truth_fed", UNPREFIXED)
     )
@@ -103,7 +97,3 @@ def plateaus(curves: Mapping[str, Mapping[str, Float[np.ndarray, "seed step"]]])
             table[f"behavior/{method}/{name}_loss_last_tenth"] = float(last)
             table[f"behavior/{method}/{name}_loss_still_falls"] = float((before - last) / abs(before))
     return table
-
-
-def _figure(name: str) -> str:
-    return name.removeprefix(f"{UNPREFIXED}/").replace("/", "_")

@@ -34,15 +34,11 @@ def _scores(
         parts = []
         for some in np.array_split(_numbers(data, windows), max(len(windows) // WINDOWS_AT_ONCE, 1)):
             context, future = data.windows(some)
-            drawn = [
-                method.sample(context, samples, rng) for _ in range(trials if names == GOAL_SCORES else 1)
-            ]
+            count = trials if names == GOAL_SCORES else 1
+            drawn = [method.sample(context, samples, rng) for _ in range(count)]
+            known = names if names == GOAL_SCORES or drawn[0].path is not None else ()
             parts.append(
-                {
-                    name: np.mean([SCORES[name](each, future) for each in drawn], axis=0)
-                    for name in names
-                    if name in GOAL_SCORES or drawn[0].path is not None
-                }
+                {name: np.mean([SCORES[name](each, future) for each in drawn], axis=0) for name in known}
             )
         for name in parts[0]:  # no plan is projected or snapped, so two protocols are the same
             values = np.concatenate([part[name] for part in parts])[None]
@@ -52,8 +48,5 @@ def _scores(
 
 def _numbers(data: BehaviorData, windows: np.ndarray) -> np.ndarray:
     """Return the numbers of windows in the data's list."""
-    where = {
-        (int(video), int(start)): number
-        for number, (video, start) in enumerate(zip(data.video, data.start, strict=True))
-    }
-    return np.array([where[int(video), int(start)] for video, start in windows])
+    where = {pair: number for number, pair in enumerate(zip(data.video, data.start, strict=True))}
+    return np.array([where[video, start] for video, start in windows])

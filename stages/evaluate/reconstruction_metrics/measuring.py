@@ -159,7 +159,7 @@ def _perception(
         true = read_flow(folders.truth_folder, each.name, each.source_index)
         if true is not None:
             forward = flow.open_flow(folders.flow[each.video.id], 1)
-            pairs += perception.flow_pairs(forward, true, each.truth.masks)
+            pairs.append((forward, true, each.truth.masks))
     metrics = perception.mask_metrics([seen[each.video.id] for each in sessions], seen[turnaround.video.id])
     metrics.add(perception.flow_metrics(pairs))
     tracks = [(each.truth, folders.masks[each.video.id] / "people.npz") for each in sessions]

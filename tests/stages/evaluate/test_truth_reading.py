@@ -53,9 +53,7 @@ def test_only_flow_between_adjacent_frames_counts(folder):
     true = read_flow(folder, "s", SOURCE)
     assert true.first.tolist() == [0]
     ours = np.zeros((4, 4, 3, 2))
-    metrics = perception.flow_metrics(
-        perception.flow_pairs(ours, true, RecordingTruth.open(folder, "s", SOURCE).masks)
-    )
+    metrics = perception.flow_metrics([(ours, true, RecordingTruth.open(folder, "s", SOURCE).masks)])
     assert metrics.values["flow/epe_px_mean"] == pytest.approx(np.sqrt(8))
     assert metrics.values["flow/zero_flow_epe_px_mean"] == pytest.approx(np.sqrt(8))
     assert read_flow(folder, "other", SOURCE) is None
