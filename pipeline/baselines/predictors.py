@@ -5,7 +5,6 @@ noise fitted to the training windows.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Protocol, Self
 
@@ -16,7 +15,7 @@ from pipeline.baselines.samplers import sampler_of
 from pipeline.behavior import model as behavior
 from pipeline.behavior.config import Ego, PlanSamplingConfig
 from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
-from pipeline.behavior.perception import FeatureVolume, world_from_ego
+from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.planning import Observation, Sampler, TorchNetworks, observe
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import Context, Future
@@ -128,28 +127,34 @@ class Ats:
     """The behavior model: goal, path and body by diffusion from the perception code."""
 
     sampler: Sampler
-    volume: FeatureVolume | Scenes
+    scenes: Scenes
     agent_from_bone_rest: Float[np.ndarray, "bone 4 4"]
     ego: Ego
     sampling: PlanSamplingConfig
 
     @classmethod
-    def load(
-        cls, model: Path, volume: FeatureVolume | Scenes, sampling: PlanSamplingConfig, *, device: str = "cpu"
-    ) -> "Ats":
+    def load(cls, model: Path, scenes: Scenes, sampling: PlanSamplingConfig, *, device: str = "cpu") -> "Ats":
         """Read a trained model (`behavior/`)."""
         architecture, nets, scaling, schedule, rest = behavior.load(model)
         if architecture.scene == "none":
-            volume = (volume if isinstance(volume, Scenes) else Scenes.of(volume)).without_features()
+            scenes = scenes.without_features()
         sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
         uses_scene = architecture.ablated_input != "scene" and architecture.scene != "none"
         sampling = replace(sampling, avoid_solid=sampling.avoid_solid and uses_scene)
-        return cls(sampler, volume, rest, architecture.ego, sampling)
+        return cls(sampler, scenes, rest, architecture.ego, sampling)
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw ``count`` plans for each window."""
-        parts = [self._plans(chunk, count, rng) for chunk in _chunks(context)]
-        return Samples(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+        parts = []
+        for chunk in _chunks(context):
+            plan = self.sampler.plan(self.observe(chunk), self.sampling, rng, count=count)
+            frame = np.repeat(world_from_ego(chunk.world_from_agent[:, -1], self.ego), count, axis=0)
+            root = plan.world_from_agent(frame)
+            bones = bones_from_channels(plan.body[..., ROOT_CHANNELS:], self.agent_from_bone_rest)
+            goal = rigid.apply(frame, plan.goal[:, None])[:, 0]
+            rows = goal, root[..., :3, 3], root[..., :3, :3], bones.astype(np.float32)
+            parts.append([part.reshape(len(chunk), count, *part.shape[1:]) for part in rows])
+        return Samples(*map(np.concatenate, zip(*parts, strict=True)))
 
     def goals(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw goals only, at a hundredth of the cost of plans."""
@@ -175,20 +180,6 @@ class Ats:
             parts.append(path.reshape(len(chunk), count, *path.shape[1:]))
         path = np.concatenate(parts)
         return Samples(path[:, :, -1], path)
-
-    def _plans(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
-        plan = self.sampler.plan(self.observe(context), self.sampling, rng, count=count)
-        frame = np.repeat(world_from_ego(context.world_from_agent[:, -1], self.ego), count, axis=0)
-        root = plan.world_from_agent(frame)
-        bones = bones_from_channels(plan.body[..., ROOT_CHANNELS:], self.agent_from_bone_rest)
-        goal = rigid.apply(frame, plan.goal[:, None])[:, 0]
-        rows = goal, root[..., :3, 3], root[..., :3, :3], bones.astype(np.float32)
-        return Samples(*(part.reshape(len(context), count, *part.shape[1:]) for part in rows))
-
-    @cached_property
-    def scenes(self) -> Scenes:
-        """The scenes; a single map is shared by all recordings."""
-        return self.volume if isinstance(self.volume, Scenes) else Scenes.of(self.volume)
 
     def observe(self, context: Context) -> Observation:
         """Return what the model perceives in each window."""

@@ -107,10 +107,6 @@ class WalkableFloor:
         ends = np.asarray(heights).min() - BEYOND_M, np.asarray(heights).max() + BEYOND_M
         return cls(free, room_m, low[[0, 2]], floor, *ends)
 
-    def cell(self, position: Float[np.ndarray, "3"]) -> tuple[int, int]:
-        """Return the free cell (x, z) nearest to a world position, meters."""
-        return self._nearest(self.free, position)
-
     def nearest_turning_place(self, position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         """Return the nearest position with room to turn, the given one if it has."""
         room = self.room_m > TURN_M
@@ -170,7 +166,7 @@ class WalkableFloor:
     ) -> Float[np.ndarray, "point 2"]:
         """Return a smooth least-cost path between two positions, away from furniture; x and z, meters."""
         cost = np.where(self.free, 1 + 4 * np.exp(-self.room_m / NEAR_FURNITURE_M), BLOCKED_COST)
-        cells, _ = route_through_array(cost, self.cell(start), self.cell(end))
+        cells, _ = route_through_array(cost, *(self._nearest(self.free, each) for each in (start, end)))
         path = self.corner + CELL_M * np.array(cells, float)
         if len(path) <= 2:
             return path

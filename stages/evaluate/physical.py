@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.baselines.predictors import Predictor, Samples
+from pipeline.baselines.predictors import Predictor
 from pipeline.behavior.trajectories import RATE_HZ, TEST, TRAIN, BehaviorData
 from pipeline.geometry import rigid, subsampling
 from pipeline.longterm.bodies import load_body
@@ -47,20 +47,12 @@ def physical_metrics(
     metrics.put("behavior/physical_windows", len(chosen))
     context, future = data.windows(chosen)
     made = ours.sample(context, 1, np.random.default_rng(seed))
-    pairs = zip(future.world_from_agent, future.agent_from_bone, strict=True)
-    _put(metrics, "recorded", meter, [BodyMotion(*pair) for pair in pairs])
-    _put(metrics, "ats", meter, _sampled(made))
-    return metrics
-
-
-def _sampled(made: Samples) -> list[BodyMotion]:
-    """Return the sampled plan of each window as body motion."""
     rotation, path, bones = made.rotation, made.path, made.agent_from_bone
     assert rotation is not None and path is not None and bones is not None, "whole plans are judged"
-    return [
-        BodyMotion(rigid.make(turn[0], way[0]), posed[0])
-        for turn, way, posed in zip(rotation, path, bones, strict=True)
-    ]
+    planned = rigid.make(rotation[:, 0], path[:, 0]), bones[:, 0]
+    for kind, pair in (("recorded", (future.world_from_agent, future.agent_from_bone)), ("ats", planned)):
+        _put(metrics, kind, meter, [BodyMotion(*motion) for motion in zip(*pair, strict=True)])
+    return metrics
 
 
 def _put(metrics: Metrics, kind: str, meter: PlausibilityMeter, motions: Sequence[BodyMotion]) -> None:
@@ -68,9 +60,11 @@ def _put(metrics: Metrics, kind: str, meter: PlausibilityMeter, motions: Sequenc
     found = [meter.plausibility(motion, meter.stance(motion)) for motion in resampled]
     slide = np.array([each.min_slide_m_s for each in found])
     no_foot = "no foot ever comes near the scene"
-    metrics.put(f"behavior/{kind}/penetration_m", float(np.mean([each.penetration_m for each in found])))
     metrics.put(f"behavior/{kind}/foot_slide_m_s", median(slide[np.isfinite(slide)]), no_foot)
-    metrics.put(
-        f"behavior/{kind}/non_collision_share", float(np.mean([each.non_collision for each in found]))
-    )
-    metrics.put(f"behavior/{kind}/contact_share", float(np.mean([each.contact for each in found])))
+    means = {
+        "penetration_m": "penetration_m",
+        "non_collision_share": "non_collision",
+        "contact_share": "contact",
+    }
+    for measure, name in means.items():
+        metrics.put(f"behavior/{kind}/{measure}", float(np.mean([getattr(each, name) for each in found])))

@@ -1,9 +1,8 @@
 """The animal's motions on the body of another build."""
 
 import numpy as np
-from jaxtyping import Float
 
-from pipeline.data.glb import Action, Skin
+from pipeline.data.glb import Action
 from pipeline.fields import retargeting
 from pipeline.fields.skinning import SkinnedShape
 from stages.export.reading import Agent
@@ -27,11 +26,7 @@ def onto(agent: Agent, other: Agent) -> Agent:
 
 
 def _body(agent: Agent) -> SkinnedShape:
-    rest = agent.skin.agent_from_bone_rest.astype(float)
-    return SkinnedShape(agent.mesh.vertices.astype(float), _dense(agent.skin, len(rest)), rest)
-
-
-def _dense(skin: Skin, bones: int) -> Float[np.ndarray, "vertex bone"]:
-    weights = np.zeros((len(skin.joints), bones))
+    skin, rest = agent.skin, agent.skin.agent_from_bone_rest.astype(float)
+    weights = np.zeros((len(skin.joints), len(rest)))
     np.add.at(weights, (np.arange(len(weights))[:, None], skin.joints.astype(int)), skin.weights)
-    return weights
+    return SkinnedShape(agent.mesh.vertices.astype(float), weights, rest)

@@ -57,7 +57,7 @@ def flight_shares(
     ats: Ats, recorded: RecordedApproaches, count: int, seed: int
 ) -> dict[str, Float[np.ndarray, "approach"]]:
     """Return per approach the share of ``count`` plans that flee, and whether the animal fled."""
-    ats = replace(ats, volume=recorded.scene)
+    ats = replace(ats, scenes=recorded.scene)
     unaware = replace(ats.sampling, observer=False)
     conditions = ({"seen": ats.sampling, "unseen": unaware}, {"standing": ats.sampling})
     found, past = {}, recorded.observer.shape[2]

@@ -13,7 +13,6 @@ from jaxtyping import Float, Int, Shaped
 from pipeline.baselines.predictors import Ats, Samples
 from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
 from pipeline.behavior.perception import world_from_ego
-from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import TEST, BehaviorData, Context, Future
 from pipeline.geometry import rigid
 from pipeline.metrics.scores import GOAL_SCORES, PLAN_SCORES, SCORES
@@ -34,8 +33,6 @@ def scores(
     of past and future frames. ``solid``: share of each window's sampled positions inside solid or unmapped
     space, which projection makes zero up to its resolution.
     """
-    scenes = ats.volume
-    assert isinstance(scenes, Scenes), "the model is opened with the windows' own scenes"
     rng, test = np.random.default_rng(scoring.seed), data.indices(TEST)
     many, few = test[:: scoring.stride], test[:: scoring.plan_stride]
     context, future = data.windows(many)
@@ -52,7 +49,7 @@ def scores(
         found["networks/path_minade_m"] = [SCORES["path_minade_m"](paths, future)]
         for protocol, made in (("end_to_end", samples), ("networks", paths)):
             assert made.path is not None, "a behavior model samples paths"
-            found[f"{protocol}/solid"] = [scenes.inside_solid(made.path, context.video).mean((1, 2))]
+            found[f"{protocol}/solid"] = [ats.scenes.inside_solid(made.path, context.video).mean((1, 2))]
         if family != "one_stage":  # has no levels to condition on the truth
             _add(found, "truth_fed", fed_with_truth(alone, context, future, scoring.samples, rng), future)
     listed = {
@@ -61,7 +58,7 @@ def scores(
         "videos": np.array(data.videos, np.str_),
         "window_frames": np.array([data.past, data.future], np.int32),
     }
-    true = scenes.inside_solid(future.path_world, context.video).mean(1)
+    true = ats.scenes.inside_solid(future.path_world, context.video).mean(1)
     return (
         {name: np.mean(values, axis=0) for name, values in found.items()} | {"recorded/solid": true} | listed
     )

@@ -9,6 +9,7 @@ from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import BehaviorNets, Scaling, bones_from_channels, channels_from_bones
 from pipeline.behavior.path_encoding import goal_error
 from pipeline.behavior.planning import SampledPlan, Sampler, TorchNetworks, observe
+from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData
 from pipeline.geometry import rigid
 from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
@@ -30,7 +31,7 @@ def ats():
         np.ones(channels) * 0.1,
     )
     sampler = Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling)
-    return Ats(sampler, room(), REST, "yaw", PlanSamplingConfig(goal_steps=4, sequence_steps=2))
+    return Ats(sampler, Scenes.of(room()), REST, "yaw", PlanSamplingConfig(goal_steps=4, sequence_steps=2))
 
 
 def test_bone_encoding_is_inverted(data):

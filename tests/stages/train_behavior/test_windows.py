@@ -71,7 +71,7 @@ def test_model_with_other_windows_is_trained_loaded_and_sampled(data, tmp_path):
     export.write_contract(tmp_path, fitted.nets, architecture, fitted.scaling, schedule, REST)
     again, _, scaling, *_ = model.load(tmp_path)
     assert again == architecture and scaling.rate_hz == RATE_HZ
-    ats = Ats.load(tmp_path, room(), PlanSamplingConfig(goal_steps=2, sequence_steps=2))
+    ats = Ats.load(tmp_path, Scenes.of(room()), PlanSamplingConfig(goal_steps=2, sequence_steps=2))
     context, _ = data.windows(data.indices(TRAIN)[:2])
     assert ats.sample(context, 3, np.random.default_rng(0)).path.shape == (2, 3, 28, 3)
 
