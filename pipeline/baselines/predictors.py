@@ -51,23 +51,20 @@ class LocationPrior:
     cell: Int[np.ndarray, "cell 3"]
     probability: Float[np.ndarray, "cell"]
     cell_m: float
-    ego: Ego
 
     @classmethod
-    def fit(
-        cls, context: Context, future: Future, *, cell_m: float = 0.1, ego: Ego = "yaw"
-    ) -> "LocationPrior":
+    def fit(cls, context: Context, future: Future, *, cell_m: float = 0.1) -> Self:
         """Fit the histogram to the goals of training windows."""
-        ego_from_world = rigid.inverse(world_from_ego(context.world_from_agent[:, -1], ego))
+        ego_from_world = rigid.inverse(world_from_ego(context.world_from_agent[:, -1], "yaw"))
         goal = rigid.apply(ego_from_world, future.goal_world[:, None])[:, 0]
         cell, count = np.unique(np.floor(goal / cell_m).astype(np.int64), axis=0, return_counts=True)
-        return cls(cell, count / count.sum(), cell_m, ego)
+        return cls(cell, count / count.sum(), cell_m)
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw cells by probability, and points uniformly inside."""
         chosen = rng.choice(len(self.cell), (len(context), count), p=self.probability)
         goal = (self.cell[chosen] + rng.random((*chosen.shape, 3))) * self.cell_m
-        return Samples(rigid.apply(world_from_ego(context.world_from_agent[:, -1], self.ego), goal))
+        return Samples(rigid.apply(world_from_ego(context.world_from_agent[:, -1], "yaw"), goal))
 
 
 @dataclass(frozen=True)

@@ -145,9 +145,8 @@ def encode_selection(
 ) -> Clips:
     """Encode clips as network channels; the poses of each stretch are encoded once."""
     p = [poses.encode(poses.channels(stretch.agent_from_bone)) for stretch in dataset.stretches]
-    pairs = list(zip(selection.stretch, selection.start, strict=True))
-    roots = [stretch.world_from_agent for stretch in dataset.stretches]
-    root = np.stack([roots[stretch][start : start + STEPS + 1] for stretch, start in pairs])
+    pairs = zip(selection.stretch, selection.start, strict=True)
+    root = np.stack([part.world_from_agent for part in selection.parts(dataset)])
     pose = torch.stack([p[stretch][start : start + STEPS + 1] for stretch, start in pairs])
     scene = np.asarray(dataset.scene_of)[selection.stretch]
     return encode_clips(root, pose, scene, dataset.scenes, points, rng)

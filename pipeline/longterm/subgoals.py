@@ -166,7 +166,8 @@ class WalkableFloor:
     ) -> Float[np.ndarray, "point 2"]:
         """Return a smooth least-cost path between two positions, away from furniture; x and z, meters."""
         cost = np.where(self.free, 1 + 4 * np.exp(-self.room_m / NEAR_FURNITURE_M), BLOCKED_COST)
-        cells, _ = route_through_array(cost, *(self._nearest(self.free, each) for each in (start, end)))
+        first, last = (self._nearest(self.free, each) for each in (start, end))
+        cells, _ = route_through_array(cost, first, last)
         path = self.corner + CELL_M * np.array(cells, float)
         if len(path) <= 2:
             return path

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipeline.behavior.perception import FeatureVolume
 from pipeline.data import npz
 from pipeline.geometry import rigid
-from stages.export.reading import Agent, Occupancy
+from stages.export.reading import Agent
 from stages.export.writing import ExportRecord, extra, version
 
 GRAY = 150
@@ -19,7 +20,7 @@ GRAY = 150
 ZUP_FROM_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
-def write(folder: Path, agent: Agent, occupancy: Occupancy) -> ExportRecord:
+def write(folder: Path, agent: Agent, volume: FeatureVolume) -> ExportRecord:
     """Write `agent.xml` (z up, as MuJoCo has it) and `motions.npz`; compile the model and pose it."""
     mujoco = extra("mujoco", "mujoco")
     motions, poses = {}, []
@@ -28,11 +29,11 @@ def write(folder: Path, agent: Agent, occupancy: Occupancy) -> ExportRecord:
         motions[f"{action.name}/time_s"] = action.time_s
         motions[f"{action.name}/mocap_pos"] = poses[-1][..., :3, 3]
         motions[f"{action.name}/mocap_quat"] = rigid.quaternion_from_rotation(poses[-1][..., :3, :3])
-    (folder / "agent.xml").write_text(model(agent, poses[0][0], boxes(occupancy.solid), occupancy))
+    (folder / "agent.xml").write_text(model(agent, poses[0][0], boxes(volume.occupancy == 1), volume))
     npz.save(folder / "motions.npz", **motions)
     loss = agent.loss_mm
     loss["bodies"] = round(1000 * _posed(mujoco, folder / "agent.xml", motions, agent.actions[0].name), 4)
-    loss["room_voxel"] = 1000 * occupancy.voxel_m
+    loss["room_voxel"] = 1000 * volume.voxel_m
     driven = "drive data.mocap_pos and data.mocap_quat with motions.npz"
     remark = f"meters, +z up; {driven}; the room's boxes are as coarse as its voxels"
     return ExportRecord(version("mujoco"), loss, version("mujoco"), remark)
@@ -60,7 +61,7 @@ def model(
     agent: Agent,
     zup_from_bone: Float[np.ndarray, "bone 4 4"],
     room: Int[np.ndarray, "box 2 3"],
-    occupancy: Occupancy,
+    volume: FeatureVolume,
 ) -> str:
     """Return the MJCF text; the skin's bones are bound at rest."""
     bodies, bones = [], []
@@ -87,17 +88,17 @@ def model(
         '<visual><headlight ambient="0.4 0.4 0.4"/></visual>',
         f'<deformable><skin name="agent" rgba="{color} 1" vertex="{vertices}" face="{faces}">',
         *(*bones, "</skin></deformable>"),
-        *("<worldbody>", *_room(room, occupancy), *bodies, "</worldbody>"),
+        *("<worldbody>", *_room(room, volume), *bodies, "</worldbody>"),
         *("</mujoco>", ""),
     ]
     return "\n".join(lines)
 
 
-def _room(room: Int[np.ndarray, "box 2 3"], occupancy: Occupancy) -> list[str]:
+def _room(room: Int[np.ndarray, "box 2 3"], volume: FeatureVolume) -> list[str]:
     lines = []
     for low, high in room:
-        middle = occupancy.origin + (low + high) / 2 * occupancy.voxel_m
-        half = (high - low) / 2 * occupancy.voxel_m
+        middle = volume.origin + (low + high) / 2 * volume.voxel_m
+        half = (high - low) / 2 * volume.voxel_m
         place, size = _row(ZUP_FROM_WORLD[:3, :3] @ middle), _row(half[[0, 2, 1]])
         lines.append(f'<geom type="box" pos="{place}" size="{size}" rgba="0.8 0.78 0.74 1"/>')
     return lines

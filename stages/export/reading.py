@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 
 from pipeline.core.errors import other_versions_refused
 from pipeline.data import gaussian_ply, images, motion, npz
@@ -71,15 +71,6 @@ class CameraFrame:
         return np.where(images.read_gray(self.masks / f"{self.index:06d}.png") > 0, 255, 0).astype(np.uint8)
 
 
-@dataclass(frozen=True)
-class Occupancy:
-    """Which voxels of the room are solid."""
-
-    solid: Bool[np.ndarray, "x y z"]
-    origin: Float[np.ndarray, "3"]
-    voxel_m: float
-
-
 def agent(simulator: Path, take: Path | None, rate_hz: float) -> Agent:
     """Read the animal from `agent.glb`, keys resampled to `rate_hz`; a generated take is one motion more."""
     with other_versions_refused("simulator", str(simulator)):
@@ -120,12 +111,6 @@ def camera_frames(
         chosen, mask = known[evenly(len(known), per_video, rounded=True)], masks.get(video)
         found += [CameraFrame(video, int(i), cameras[i], intrinsics[i], folder, mask) for i in chosen]
     return found
-
-
-def occupancy(behavior_data: Path) -> Occupancy:
-    """Read the room's solid voxels."""
-    volume = npz.load(behavior_data / "volume.npz", ("occupancy", "origin", "voxel_m"))
-    return Occupancy(volume["occupancy"] == 1, volume["origin"], float(volume["voxel_m"]))
 
 
 def gaussians(splats: Path) -> dict[str, Float[np.ndarray, "point 62"]]:

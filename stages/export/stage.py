@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import assert_never
 
+from pipeline.behavior.perception import FeatureVolume
 from stages.export import bvh, cameras, glb, mjcf, neuro, reading, retarget, splats, tables, usd, writing
 from stages.export.config import Config
 
@@ -36,7 +37,9 @@ def run(inputs: Inputs, config: Config, out: Path) -> writing.ExportRecord:
         case "bvh":
             record = bvh.write(out, _agent(inputs, config))
         case "mjcf":
-            record = mjcf.write(out, _agent(inputs, config), reading.occupancy(inputs.behavior_data))
+            record = mjcf.write(
+                out, _agent(inputs, config), FeatureVolume.load(inputs.behavior_data / "volume.npz")
+            )
         case "tables":
             record = tables.write(out, reading.sessions(inputs.reconstruction))
         case "movement":

@@ -8,7 +8,7 @@ miss them. The paper does none of this, so the other two protocols leave it out.
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Int, Shaped
 
 from pipeline.baselines.predictors import Ats, Samples
 from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
@@ -44,14 +44,15 @@ def scores(
     context, future = data.windows(few)
     if len(few):
         samples = ats.sample(context, scoring.samples, rng)
-        _add(found, "end_to_end", samples, future)
+        found |= {f"end_to_end/{name}": [SCORES[name](samples, future)] for name in PLAN_SCORES}
         paths = alone.paths(context, scoring.samples, rng)
         found["networks/path_minade_m"] = [SCORES["path_minade_m"](paths, future)]
         for protocol, made in (("end_to_end", samples), ("networks", paths)):
             assert made.path is not None, "a behavior model samples paths"
             found[f"{protocol}/solid"] = [ats.scenes.inside_solid(made.path, context.video).mean((1, 2))]
         if family != "one_stage":  # has no levels to condition on the truth
-            _add(found, "truth_fed", fed_with_truth(alone, context, future, scoring.samples, rng), future)
+            fed = fed_with_truth(alone, context, future, scoring.samples, rng)
+            found |= {f"truth_fed/{name}": [SCORES[name](fed, future)] for name in PLAN_SCORES}
     listed = {
         "goal_window": _listed(data, many),
         "plan_window": _listed(data, few),
@@ -68,37 +69,21 @@ def fed_with_truth(
     ats: Ats, context: Context, future: Future, count: int, rng: np.random.Generator
 ) -> Samples:
     """Sample paths to the true goals, and bodies along the true paths."""
-    parts = [slice(begin, begin + WINDOWS_AT_ONCE) for begin in range(0, len(context), WINDOWS_AT_ONCE)]
-    fed = [_fed(ats, context[part], future.path_world[part], count, rng) for part in parts]
-    return Samples(*(np.concatenate([getattr(each, name) for each in fed]) for name in vars(fed[0])))
-
-
-def _fed(
-    ats: Ats,
-    context: Context,
-    path_world: Float[np.ndarray, "window frame 3"],
-    count: int,
-    rng: np.random.Generator,
-) -> Samples:
-    frame = world_from_ego(context.world_from_agent[:, -1], ats.ego)
-    true = rigid.apply(rigid.inverse(frame), path_world)
-    codes = ats.sampler.codes(ats.observe(context), ats.sampling, count)
-    world = np.repeat(frame, count, axis=0)
-    paths = ats.sampler.paths(codes, np.repeat(true[:, -1], count, axis=0), ats.sampling, rng)
-    bodies = ats.sampler.bodies(codes, np.repeat(true, count, axis=0), ats.sampling, rng)
-    rotation = world[:, None, :3, :3] @ rigid.rotation_from_6d(bodies[..., :ROOT_CHANNELS])
-    bones = bones_from_channels(bodies[..., ROOT_CHANNELS:], ats.agent_from_bone_rest).astype(np.float32)
-    path = rigid.apply(world, paths)
-    return Samples(
-        *(a.reshape(len(context), count, *a.shape[1:]) for a in (path[:, -1], path, rotation, bones))
-    )
-
-
-def _add(
-    found: dict[str, list[Float[np.ndarray, "window"]]], protocol: str, samples: Samples, future: Future
-) -> None:
-    for name in PLAN_SCORES:
-        found.setdefault(f"{protocol}/{name}", []).append(SCORES[name](samples, future))
+    parts = []
+    for begin in range(0, len(context), WINDOWS_AT_ONCE):
+        some = slice(begin, begin + WINDOWS_AT_ONCE)
+        frame = world_from_ego(context[some].world_from_agent[:, -1], ats.ego)
+        true = rigid.apply(rigid.inverse(frame), future.path_world[some])
+        codes = ats.sampler.codes(ats.observe(context[some]), ats.sampling, count)
+        world = np.repeat(frame, count, axis=0)
+        paths = ats.sampler.paths(codes, np.repeat(true[:, -1], count, axis=0), ats.sampling, rng)
+        bodies = ats.sampler.bodies(codes, np.repeat(true, count, axis=0), ats.sampling, rng)
+        rotation = world[:, None, :3, :3] @ rigid.rotation_from_6d(bodies[..., :ROOT_CHANNELS])
+        bones = bones_from_channels(bodies[..., ROOT_CHANNELS:], ats.agent_from_bone_rest).astype(np.float32)
+        path = rigid.apply(world, paths)
+        rows = path[:, -1], path, rotation, bones
+        parts.append([each.reshape(len(frame), count, *each.shape[1:]) for each in rows])
+    return Samples(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _listed(data: BehaviorData, index: Int[np.ndarray, "window"]) -> Int[np.ndarray, "window 2"]:

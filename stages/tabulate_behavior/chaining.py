@@ -109,5 +109,5 @@ def _mean_ks(
 ) -> float:
     """Return the mean Kolmogorov-Smirnov distance of pairs; speeds under ``min_speed`` (m/s) are equal."""
     pairs = zip(mine, others, strict=True)
-    found = (ks_2samp(*(np.maximum(each, min_speed) for each in pair)) for pair in pairs)
+    found = [ks_2samp(np.maximum(a, min_speed), np.maximum(b, min_speed)) for a, b in pairs]
     return float(np.mean([cast("tuple[float, float]", each)[0] for each in found]))  # statistic and p-value

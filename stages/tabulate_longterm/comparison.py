@@ -28,7 +28,7 @@ BLOCKED_M = 0.06
 
 def figures(prefix: str, source: MotionSource, config: Config) -> dict[str, float | None]:
     """Return the metrics of every method on held-out clips: all, in unseen homes, and around obstacles."""
-    dataset, model = source.split.held_out, source.models.ours
+    dataset, model = source.split.held_out, source.ours
     if dataset is None:
         return {}
     rng = np.random.default_rng(config.seed)
@@ -39,7 +39,7 @@ def figures(prefix: str, source: MotionSource, config: Config) -> dict[str, floa
     clips = encode_selection(dataset, cuts, model.poses, model.sizes.points, rng)
     known = scores.references(cuts.parts(dataset), clips.scene, dataset, model)
     plain, made = {"truth": scores.score_pairs([each.truth for each in known], known, model)}, {}
-    for name, method in methods.methods(source.models, dataset, config.seed).items():
+    for name, method in methods.methods(source, dataset, config.seed).items():
         made[name] = scores.decode_clips(method(clips), clips, known, model)
         plain[name] = scores.score_pairs(made[name], known, model)
         mpjpe_mm = plain[name][:, scores.METRICS.index("mpjpe_mm")].mean()
@@ -72,7 +72,7 @@ def _figures_of_lengths(
     prefix: str, source: MotionSource, cuts: ClipSelection, optimized: tuple[str, ...], config: Config
 ) -> dict[str, float | None]:
     """Return the metrics of optimized motions of several lengths, each as a whole, from the same starts."""
-    dataset, model = source.split.held_out, source.models.ours
+    dataset, model = source.split.held_out, source.ours
     assert dataset is not None
     run = max(LENGTHS_S) * RATE_HZ // STEPS
     cuts = select_runs(cuts, run, run * LENGTH_RUNS)
@@ -82,7 +82,7 @@ def _figures_of_lengths(
         dataset, cuts, model.poses, model.sizes.points, np.random.default_rng(config.seed)
     )
     known = scores.references(cuts.parts(dataset), clips.scene, dataset, model)
-    every = methods.methods(source.models, dataset, config.seed)
+    every = methods.methods(source, dataset, config.seed)
     made = {name: scores.decode_clips(every[name](clips), clips, known, model) for name in optimized}
     episode, found = episodes(cuts.start, cuts.stretch, EPISODE_FRAMES)[::run], {}
     for seconds in LENGTHS_S:

@@ -1,7 +1,6 @@
 """In-betweening between given bodies by every method that the tables compare."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,6 +12,7 @@ from pipeline.longterm.clip_channels import Clips, decode_clip, encode_places
 from pipeline.longterm.examples import MotionDataset
 from pipeline.longterm.motion_synthesis import LongTerm
 from pipeline.longterm.networks import ROOT_CHANNELS
+from stages.tabulate_longterm.reading import MotionSource
 
 Method = Callable[[Clips], Float[Tensor, "clip frame channel"]]
 """Predicts all frames of clips from their first and last frames and the scene alone."""
@@ -26,26 +26,16 @@ COMPARED_WITH = {"base": "ours", "route_cvae": "ours", "nearest": "ours"} | {
 """Pairs of methods whose difference in error per clip is reported with intervals."""
 
 
-@dataclass(frozen=True)
-class ComparedModels:
-    """All models trained on one source of motion."""
-
-    ours: LongTerm
-    ablated: dict[str, AblatedNetworks]
-    bank: Clips
-    """the training clips, without scene points"""
-
-
-def methods(models: ComparedModels, dataset: MotionDataset, seed: int) -> dict[str, Method]:
+def methods(source: MotionSource, dataset: MotionDataset, seed: int) -> dict[str, Method]:
     """Return every method by its name in the tables."""
 
     def by(net: LongTerm | AblatedNetworks) -> Method:
         return lambda clips: net.between(clips.channels[:, 0], clips.channels[:, -1], clips.seen)
 
-    trained = {"ours": by(models.ours)} | {name: by(net) for name, net in models.ablated.items()}
+    trained = {"ours": by(source.ours)} | {name: by(net) for name, net in source.ablated.items()}
     return trained | {
-        "route_cvae": lambda clips: route_cvae(models.ours, clips, dataset, np.random.default_rng(seed)),
-        "nearest": lambda clips: nearest(models.bank, clips),
+        "route_cvae": lambda clips: route_cvae(source.ours, clips, dataset, np.random.default_rng(seed)),
+        "nearest": lambda clips: nearest(source.bank, clips),
     }
 
 

@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.baselines import longterm_networks
+from pipeline.baselines.longterm_networks import AblatedNetworks
 from pipeline.behavior.trajectories import BehaviorData
+from pipeline.longterm.clip_channels import Clips
 from pipeline.longterm.examples import DatasetSplit, encode_selection, select_clips
 from pipeline.longterm.journeys import LongTermWorld
 from pipeline.longterm.motion_synthesis import LongTerm
-from stages.tabulate_longterm.methods import ComparedModels
 
 
 @dataclass(frozen=True)
@@ -18,14 +19,17 @@ class MotionSource:
     """Training and held-out motion, and the models trained on it."""
 
     split: DatasetSplit
-    models: ComparedModels
+    ours: LongTerm
+    ablated: dict[str, AblatedNetworks]
+    bank: Clips
+    """the training clips, without scene points"""
     data: BehaviorData | None = None
     """of reconstructed motion"""
 
     @property
     def world(self) -> LongTermWorld:
         """The model with the training body and the first training scene."""
-        return LongTermWorld(self.models.ours, self.split.train.body, self.split.train.scenes[0])
+        return LongTermWorld(self.ours, self.split.train.body, self.split.train.scenes[0])
 
 
 def with_models(split: DatasetSplit, folder: Path, data: BehaviorData | None = None) -> MotionSource:
@@ -38,4 +42,4 @@ def with_models(split: DatasetSplit, folder: Path, data: BehaviorData | None = N
     }
     rng = np.random.default_rng(0)
     bank = encode_selection(split.train, select_clips(split.train, rng, resting=0.0), ours.poses, 0, rng)
-    return MotionSource(split, ComparedModels(ours, ablated, bank), data)
+    return MotionSource(split, ours, ablated, bank, data)

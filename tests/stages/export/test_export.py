@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.behavior.perception import FeatureVolume
 from pipeline.core.errors import InputError
 from pipeline.data import glb, images, npz
 from pipeline.data.glb import Action, Skin
@@ -213,10 +214,9 @@ def test_usd_joints_have_their_poses(agent: reading.Agent, tmp_path: Path) -> No
 
 def test_mjcf_compiles_and_moves(agent: reading.Agent, tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
-    occupancy = reading.Occupancy(
-        np.pad(np.ones((20, 1, 20), bool), ((0, 0), (0, 5), (0, 0))), np.array([-1.0, -0.1, -1]), 0.1
-    )
-    assert mjcf.write(tmp_path, agent, occupancy).loss_mm["bodies"] < 0.01, "mm"
+    occupancy = np.pad(np.ones((20, 1, 20), np.uint8), ((0, 0), (0, 5), (0, 0)))
+    volume = FeatureVolume(np.zeros((0, *occupancy.shape)), occupancy, np.array([-1.0, -0.1, -1]), 0.1)
+    assert mjcf.write(tmp_path, agent, volume).loss_mm["bodies"] < 0.01, "mm"
 
 
 def test_scientific_formats_round_trip(session: Motion, tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ from pipeline.longterm.networks import PoseNet, RouteNet, StaticBody
 from pipeline.longterm.short_motions import BodyMotion
 from stages.tabulate_longterm import bars, comparison, lengths, methods, scores, tables
 from stages.tabulate_longterm.config import Config
-from stages.tabulate_longterm.methods import ComparedModels
 from stages.tabulate_longterm.reading import MotionSource
 from tests.pipeline.longterm import strider
 
@@ -45,11 +44,11 @@ def source():
         for name, kind in longterm_networks.ABLATIONS.items()
     }
     split = DatasetSplit(train, held, ("held_out", "unseen"))
-    return MotionSource(split, ComparedModels(model, ablated, bank))
+    return MotionSource(split, model, ablated, bank)
 
 
 def test_errors_of_true_and_shifted_motion(source):
-    dataset, model = source.split.held_out, source.models.ours
+    dataset, model = source.split.held_out, source.ours
     part = dataset.stretches[0][:61]
     reference = scores.references([part], np.array([0]), dataset, model)[0]
     metrics = dict(zip(scores.METRICS, scores.score(part, reference, model.poses, np.zeros(1)), strict=True))
@@ -74,15 +73,15 @@ def test_errors_of_true_and_shifted_motion(source):
 
 
 def test_memory_bank_retrieves_its_own_clips(source):
-    found = methods.nearest(source.models.bank, source.models.bank)
-    torch.testing.assert_close(found, source.models.bank.channels)
+    found = methods.nearest(source.bank, source.bank)
+    torch.testing.assert_close(found, source.bank.channels)
 
 
 def test_route_and_cvae_keeps_the_route(source):
-    bank, pair = source.models.bank, np.arange(2)
+    bank, pair = source.bank, np.arange(2)
     some = Clips(bank.world_from_clip[pair], bank.channels[pair], bank.seen[pair], bank.scene[pair])
-    made = methods.route_cvae(source.models.ours, some, source.split.train, np.random.default_rng(0))
-    route = source.models.ours.route(some.channels[:, 0], some.channels[:, -1], some.seen)
+    made = methods.route_cvae(source.ours, some, source.split.train, np.random.default_rng(0))
+    route = source.ours.route(some.channels[:, 0], some.channels[:, -1], some.seen)
     torch.testing.assert_close(made[..., :9], route)
     assert made.shape == some.channels.shape
 
@@ -128,7 +127,7 @@ def test_tables_hold_every_method_with_intervals(source):
 
 
 def test_clips_are_paired_and_the_gap_at_the_joint_is_measured(source):
-    dataset, model = source.split.held_out, source.models.ours
+    dataset, model = source.split.held_out, source.ours
     traveled = select_clips(dataset, np.random.default_rng(0), stride=10, resting=0.0)
     cuts = comparison.select_runs(traveled, 2, 6)
     assert len(cuts.start) == 6 and set(cuts.start[1::2] - cuts.start[::2]) == {60}
@@ -161,7 +160,7 @@ def test_clips_with_an_obstacle_between_their_ends_are_marked(source):
     clips = comparison.encode_selection(
         source.split.held_out,
         select_clips(source.split.held_out, np.random.default_rng(0), stride=5),
-        source.models.ours.poses,
+        source.ours.poses,
         4,
         np.random.default_rng(0),
     )
