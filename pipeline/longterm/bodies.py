@@ -91,18 +91,13 @@ class PoseSpace(nn.Module):
         self.register_buffer("inverse", torch.zeros(channels, components))
         self.register_buffer("explained", torch.zeros(()))
 
-    @property
-    def components(self) -> int:
-        """Length of p."""
-        return len(self.basis)
-
     def fit(self, agent_from_bone: Float[np.ndarray, "frame bone 4 4"]) -> "PoseSpace":
         """Fit mean and components to poses; returns itself."""
         channels = channels_from_bones(agent_from_bone, self.rest.double().numpy())
         scale = np.tile([LEVER_M] * 3 + [1.0] * 3, agent_from_bone.shape[1])
         mean = channels.mean(0)
         _, singular, rows = np.linalg.svd((channels - mean) * scale, full_matrices=False)
-        retained = min(self.components, len(singular))
+        retained = min(len(self.basis), len(singular))
         std = np.maximum(singular[:retained] / np.sqrt(len(channels)), 1e-6)
         rows = rows * np.sign(rows[np.arange(len(rows)), np.abs(rows).argmax(1)])[:, None]
         self.mean[:] = torch.from_numpy(mean)

@@ -57,8 +57,7 @@ def distance_fields(
     axes = [low + VOXEL_M * torch.arange(count) for low, count in zip(LOW_M, SHAPE, strict=True)]
     voxels = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
     frames = torch.from_numpy(np.asarray(world_from_clip)).float()
-    field = torch.zeros(1, *SHAPE, dtype=torch.half)
-    field = field.expand(len(frames), *SHAPE) if not scenes else field.repeat(len(frames), 1, 1, 1)
+    field = torch.zeros(len(frames), *SHAPE, dtype=torch.half)
     for index, each in enumerate(scenes):
         for rows in torch.from_numpy(np.flatnonzero(np.asarray(scene) == index)).split(CLIPS_AT_ONCE):
             points = voxels @ frames[rows, :3, :3].transpose(1, 2) + frames[rows, None, :3, 3]

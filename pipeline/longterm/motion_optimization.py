@@ -81,7 +81,7 @@ class _Correction(torch.nn.Module):
         self.channels, self.poses = poses.channels(motion.agent_from_bone), poses
         self.shift = torch.nn.Parameter(torch.zeros(len(motion), 3))
         self.turn = torch.nn.Parameter(torch.zeros(len(motion), 3))
-        self.pose = torch.nn.Parameter(torch.zeros(len(motion), poses.components))
+        self.pose = torch.nn.Parameter(torch.zeros(len(motion), len(poses.basis)))
 
     def forward(self) -> tuple[Float[Tensor, "frame 4 4"], Float[Tensor, "frame bone 4 4"]]:
         rotation = self.root[:, :3, :3] @ rigid_torch.so3_exp(self.turn)

@@ -29,7 +29,7 @@ EPSILON = 1e-10
 MAX_LETTERS = 200
 """Of what torch says of a damaged file."""
 SMALLEST_PX = 63
-"""Pictures must be at least so high and wide: below, AlexNet's last maps are empty."""
+"""Least height and width of pictures: below, AlexNet's last maps are empty."""
 
 
 class Lpips(nn.Module):
@@ -80,8 +80,7 @@ class Lpips(nn.Module):
     ) -> Float[np.ndarray, "height width"]:
         """Return the distance at every pixel, layers bilinearly enlarged and summed; colors 0 .. 1.
 
-        Its mean over a picture is LPIPS up to the interpolation. Raises no error: pictures under 63 pixels
-        are NaN.
+        Its mean over a picture is LPIPS up to the interpolation; pictures under 63 pixels are NaN.
         """
         if min(true.shape[:2]) < SMALLEST_PX:
             return np.full(true.shape[:2], np.nan)
@@ -93,17 +92,12 @@ class Lpips(nn.Module):
         total = torch.zeros((1, 1, *true.shape[:2]), device=device)
         for a, b, weight in zip(*(self.features(image) for image in pair), self.weights, strict=True):
             squared = ((a - b).square() * weight[:, None, None]).sum(1, keepdim=True)
-            total += functional.interpolate(
-                squared, size=true.shape[:2], mode="bilinear", align_corners=False
-            )
+            total += functional.interpolate(squared, size=true.shape[:2], mode="bilinear")
         return total[0, 0].cpu().numpy().astype(np.float64)
 
 
 def _read(path: Path) -> dict[str, Tensor]:
-    remedy = (
-        "see the module pipeline/metrics/lpips.py for where both files "
-        "come from; name their folder in the recipe"
-    )
+    remedy = "pipeline/metrics/lpips.py says where both files come from; name their folder in the recipe"
     if not path.is_file():
         raise InputError("MOD-001", "the weights of LPIPS are not there", str(path), remedy)
     try:

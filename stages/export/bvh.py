@@ -18,8 +18,7 @@ _END_SITE = ("End Site", "{", "OFFSET 0 0 0.02", "}")
 
 def write(folder: Path, agent: Agent) -> ExportRecord:
     """Write `<motion>.flat.bvh` for every motion."""
-    names = list(agent.skin.bone_names)
-    lost = []
+    names, lost = list(agent.skin.bone_names), []
     for action in agent.actions:
         file = folder / f"{action.name}.flat.bvh"
         file.write_text(flat(action, names))

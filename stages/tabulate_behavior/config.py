@@ -8,17 +8,9 @@ class Config:
     """Methods that are compared, and numbers of trainings and samples."""
 
     methods: tuple[str, ...] = (
-        "ats",
-        "gaussian",
-        "one_stage",
-        "world",
-        "no_observer",
-        "no_scene",
-        "no_past",
-        "concatenation",
-        "horizon_4_0",
-        "horizon_7_2",
-    )
+        "ats", "gaussian", "one_stage", "world", "no_observer", "no_scene", "no_past", "concatenation",
+        "horizon_4_0", "horizon_7_2",
+    )  # fmt: skip
     """Trained methods, which are variants in `agents/variants/`; `ats` is unchanged."""
     seeds: int = 5
     """Trainings of each method."""

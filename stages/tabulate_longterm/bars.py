@@ -12,27 +12,12 @@ BARS: tuple[tuple[str, str | tuple[str, str], str, float, Literal["lower", "high
     ("non-collision, optimized", f"{OPTIMIZED}/non_collision", "share", 0.995, "higher"),
     ("contact, optimized", f"{OPTIMIZED}/contact", "share", 0.97, "higher"),
     ("foot slide, optimized", f"{OPTIMIZED}/slide_m_s", "m/s", 0.01, "lower"),
-    (
-        "MPVPE, optimized against not",
-        (f"{OPTIMIZED}/mpvpe_mm", "longterm/ours_same/mpvpe_mm"),
-        "",
-        1.2,
-        "lower",
-    ),
-    (
-        "distance of the ends from the given bodies, optimized",
-        f"{OPTIMIZED}/end_v2v_share",
-        "of body length",
-        0.006,
-        "lower",
-    ),
-    (
-        "neighbor v2v where two motions join, beyond their own, optimized",
-        f"{OPTIMIZED}/seam_share",
-        "of body length",
-        0.006,
-        "lower",
-    ),
+    ("MPVPE, optimized against not",
+        (f"{OPTIMIZED}/mpvpe_mm", "longterm/ours_same/mpvpe_mm"), "", 1.2, "lower"),
+    ("distance of the ends from the given bodies, optimized",
+        f"{OPTIMIZED}/end_v2v_share", "of body length", 0.006, "lower"),
+    ("neighbor v2v where two motions join, beyond their own, optimized",
+        f"{OPTIMIZED}/seam_share", "of body length", 0.006, "lower"),
     *(
         (f"samples: {words} left", (f"{SAMPLES}/{name}", f"{SAMPLES}/{before}"), "", warn, "lower")
         for words, name, before, warn in (
@@ -45,7 +30,7 @@ BARS: tuple[tuple[str, str | tuple[str, str], str, float, Literal["lower", "high
     ("minutes: largest seam", f"{MINUTES}/largest_seam_m", "m", 0.02, "lower"),
     ("minutes: outside of the room", f"{MINUTES}/outside_room_m", "m", 0.01, "lower"),
     ("minutes: deepest vertex inside something", f"{MINUTES}/deepest_m", "m", 0.02, "lower"),
-)
+)  # fmt: skip
 """Name, metric or pair of metrics, unit, bar, and direction of improvement of each check."""
 
 

@@ -44,11 +44,9 @@ def figures(prefix: str, source: MotionSource, config: Config) -> dict[str, floa
         plain[name] = scores.score_pairs(made[name], known, model)
         mpjpe_mm = plain[name][:, scores.METRICS.index("mpjpe_mm")].mean()
         progress.log(f"{prefix}: {name}, MPJPE {mpjpe_mm:.1f} mm")
-    plain |= {
-        f"{name}_beyond_{than}": plain[name] - plain[than]
-        for name, than in methods.COMPARED_WITH.items()
-        if {name, than} <= set(plain)
-    }
+    for name, than in methods.COMPARED_WITH.items():
+        if {name, than} <= plain.keys():
+            plain[f"{name}_beyond_{than}"] = plain[name] - plain[than]
     some = even_runs(len(clips), 2, config.optimized_clips)
     done = {}
     optimized = methods.OPTIMIZED if source.data is None else ("ours",)
@@ -78,9 +76,8 @@ def _figures_of_lengths(
     cuts = select_runs(cuts, run, run * LENGTH_RUNS)
     if not len(cuts.start):
         return {}
-    clips = encode_selection(
-        dataset, cuts, model.poses, model.sizes.points, np.random.default_rng(config.seed)
-    )
+    rng = np.random.default_rng(config.seed)
+    clips = encode_selection(dataset, cuts, model.poses, model.sizes.points, rng)
     known = scores.references(cuts.parts(dataset), clips.scene, dataset, model)
     every = methods.methods(source, dataset, config.seed)
     made = {name: scores.decode_clips(every[name](clips), clips, known, model) for name in optimized}

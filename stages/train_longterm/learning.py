@@ -113,19 +113,17 @@ def initialized(make: Callable[[], Network], config: Config) -> Network:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         net = make()
-    if config.point_net is not None:
+    path = config.point_net
+    if path is None:
+        return net
+    if not Path(path).is_file():
+        remedy = "give an existing safetensors file, or none"
+        raise InputError("LTM-002", "the weights of PointNet are not there", path, remedy)
+    try:
         for part in net.modules():
             if isinstance(part, PointNet) and part.with_scene:
-                _load_point_net(part, Path(config.point_net))
-    return net
-
-
-def _load_point_net(part: PointNet, path: Path) -> None:
-    if not path.is_file():
-        remedy = "give an existing safetensors file, or none"
-        raise InputError("LTM-002", "the weights of PointNet are not there", str(path), remedy)
-    try:
-        part.load_state_dict(load_file(path))
+                part.load_state_dict(load_file(path))
     except (RuntimeError, ValueError) as error:
         what, remedy = f"these weights do not fit: {error}", "they must have the widths of `sizes`"
-        raise InputError("LTM-002", what, str(path), remedy) from error
+        raise InputError("LTM-002", what, path, remedy) from error
+    return net

@@ -13,6 +13,7 @@ from pipeline.longterm.smplx_bodies import motion_from_parameters, smplx_body
 from pipeline.longterm.surroundings import MotionScene
 from stages.train_longterm import prox
 
+PARAMETERS = ("transl", "global_orient", "body_pose")
 NO_MOTION = "no two seconds of uninterrupted motion to learn from"
 STUDY_REACH_M = 1.5
 """heights of the synthetic study's scene that are used, above and below where bodies have been"""
@@ -42,22 +43,18 @@ def people(model: Path, folder: Path) -> DatasetSplit:
         raise InputError(
             "LTM-001", "no SMPL-X motion to learn from", str(folder), "put *.npz and scene.ply there"
         )
-    loaded = [
-        npz.load(file, ("timestamp_s", "transl", "global_orient", "body_pose", "betas")) for file in files
-    ]
+    loaded = [npz.load(file, ("timestamp_s", *PARAMETERS, "betas")) for file in files]
     person = smplx_body(model, loaded[0]["betas"])
     fitted = [
-        motion_from_parameters(person, each["transl"], each["global_orient"], each["body_pose"], _hands(each))
+        motion_from_parameters(person, *(each[name] for name in PARAMETERS), hands=_hands(each))
         for each in loaded
     ]
-    motions = tuple(
-        resample_motion(each["timestamp_s"], motion) for each, motion in zip(loaded, fitted, strict=True)
-    )
+    motions = tuple(map(resample_motion, (each["timestamp_s"] for each in loaded), fitted))
     roots = np.concatenate([motion.world_from_agent[:, :3, 3] for motion in motions])
     scene = MotionScene.for_motion(ply.read_ply(folder / "scene.ply"), roots, reach_m=STUDY_REACH_M)
     dataset = MotionDataset(person.body, motions, (0,) * len(motions), (scene,))
     last = max(len(motions) - 1, 1)
-    return DatasetSplit.of(dataset, ["train" if index < last else "test" for index in range(len(motions))])
+    return DatasetSplit.of(dataset, ["train"] * last + ["test"] * (len(motions) - last))
 
 
 def _hands(table: dict[str, np.ndarray]) -> np.ndarray | None:
@@ -70,11 +67,10 @@ def _in_scans(model: Path, folder: Path) -> DatasetSplit:
     person, recordings, scenes = prox.read(model, folder)
     names = list(scenes)
     stretches = [(motion, names.index(each.scene)) for each in recordings for motion in each.motions]
-    last = sum(len(each.motions) for each in recordings[:-1])
     if not stretches:
         remedy = "give recordings with two seconds of fits without a gap"
         raise InputError("LTM-001", NO_MOTION, str(folder), remedy)
     motions, places = zip(*stretches, strict=True)
     dataset = MotionDataset(person.body, motions, places, tuple(scenes.values()))
-    last = last or len(motions)
-    return DatasetSplit.of(dataset, ["train" if index < last else "test" for index in range(len(motions))])
+    last = sum(len(each.motions) for each in recordings[:-1]) or len(motions)
+    return DatasetSplit.of(dataset, ["train"] * last + ["test"] * (len(motions) - last))

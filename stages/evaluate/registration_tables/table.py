@@ -99,10 +99,8 @@ def _compare(
     rng: np.random.Generator,
 ) -> None:
     """Put the paired mean differences to ours with 95 % intervals, over all sessions and over each."""
-    chosen = {variant: list(range(len(sessions)))} | {
-        f"{variant}/{session.id}": [index] for index, session in enumerate(sessions)
-    }
-    for name, part in chosen.items():
+    parts = {f"{variant}/{session.id}": [index] for index, session in enumerate(sessions)}
+    for name, part in ({variant: list(range(len(sessions)))} | parts).items():
         start = np.concatenate([(sessions[index].timestamp_s / EPISODE_S).astype(int) for index in part])
         video = np.repeat(part, [len(sessions[index].timestamp_s) for index in part])
         both = [joined([errors[which][index] for index in part]) for which in (variant, "ours")]
