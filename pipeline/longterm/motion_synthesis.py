@@ -100,8 +100,8 @@ class LongTerm:
                 raise ValueError(f"longterm.json says otherwise about {', '.join(other)}")
             state, sizes = load_file(folder / "longterm.safetensors"), LongTermSizes(**document["sizes"])
             poses = PoseSpace(np.tile(np.eye(4), (document["bones"], 1, 1)), sizes.pose)
-            sees = document["sees_scene"]
-            nets = StaticBody(sizes), RouteNet(sizes, with_scene=sees), PoseNet(sizes, with_scene=sees)
+            seen = document["sees_scene"]
+            nets = StaticBody(sizes), RouteNet(sizes, with_scene=seen), PoseNet(sizes, with_scene=seen)
             for name, module in zip(("poses", *NETWORKS), (poses, *nets), strict=True):
                 own = {key: value for key, value in state.items() if key.startswith(f"{name}.")}
                 module.load_state_dict({key.removeprefix(f"{name}."): value for key, value in own.items()})
