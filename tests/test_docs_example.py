@@ -37,7 +37,7 @@ def copy(tmp_path_factory) -> Path:
         (folder / path).write_text(body)
     dag = folder / "pipeline/workflow/dag.py"
     source = dag.read_text()
-    before = '    Node(\n        "splats",'
+    before = '    Node("splats",'
     assert source.count(before) == 1
     dag.write_text(source.replace(before, declaration + before))
     return folder

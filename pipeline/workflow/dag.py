@@ -18,17 +18,16 @@ VIEWED: tuple[Role, ...] = ("walkthrough", "turnaround", "session")
 AGENT: tuple[Role, ...] = ("turnaround", "session")
 """Roles of recordings that show the animal."""
 BOTH: tuple[Flow, ...] = ("recordings", "trajectories")
-REGISTRATION_VARIANTS = ("no_localizer", "no_feature_metric", "no_odometry", "regression_only", "totalrecon")
-"""Variants of an agent that Table 1 compares its registration with."""
-RECONSTRUCTION_VARIANTS = (
-    "no_localizer", "mlp_fields", "paper_small", "no_feature_loss", "no_annealing", "totalrecon",
-    "totalrecon_single",
-)  # fmt: skip
-"""Variants of an agent that Table 3 compares its reconstruction with."""
-VARIANTS = {"registration": REGISTRATION_VARIANTS, "reconstruction": RECONSTRUCTION_VARIANTS}
+VARIANTS = {
+    "registration": ("no_localizer", "no_feature_metric", "no_odometry", "regression_only", "totalrecon"),
+    "reconstruction": (
+        "no_localizer", "mlp_fields", "paper_small", "no_feature_loss", "no_annealing", "totalrecon",
+        "totalrecon_single",
+    ),
+}  # fmt: skip
+"""Variants of an agent that Tables 1 and 3 compare its registration and its reconstruction with."""
 TEMPLATES = ("scene_template", "agent_template")
 LOCALIZERS = ("scene_localizer", "agent_localizer")
-LONGTERM_STUDIES = ("longterm_ablations", "longterm_world", "longterm_study")
 HOME_ARTIFACTS = ("behavior_data", "feature_basis", "scene_template")
 READ_BY_PAGES = ("reconstruction", "splats", "behavior", "behavior_data")
 
@@ -82,10 +81,8 @@ class Node:
     """Format version: raise it when results or the meaning of files change. Readers refuse other versions."""
     threads: int = 1
     gpu: int = 0
-    memory_mb: int = 3000
-    """Memory that a scheduler reserves; not a limit."""
     memory_mb_per_1000_frames: int = 0
-    """Additional memory for the frames of all recordings that the job reads."""
+    """Memory that a scheduler reserves for the frames that the job reads, beside `engine.MEMORY_MB`."""
     seconds_per_frame: float = 0.02
     """Per frame read, on two cores without a GPU; the scheduler's limit is several times as long."""
     resumable: bool = False
@@ -132,233 +129,95 @@ OF_HOMES = (
     *(Need(name, homes="own", flow="recordings") for name in HOME_ARTIFACTS[1:]),
     *(Need(name, option="homes", homes="other", flow="recordings") for name in HOME_ARTIFACTS),
 )
+# fmt: off
 FLOW: tuple[Node, ...] = (
     Node("synthetic_capture", "synthesize_capture", threads=2),
     Node("frames", "extract_frames", (RECORDING,), roles=(*VIEWED, "heldout"), seconds_per_frame=0.006),
-    Node(
-        "pictures",
-        "extract_frames",
-        (RECORDING,),
-        roles=AGENT,
-        table="extract_frames",
-        mapped=True,
-        seconds_per_frame=0.006,
-    ),
+    Node("pictures", "extract_frames", (RECORDING,),
+         roles=AGENT, table="extract_frames", mapped=True, seconds_per_frame=0.006),
     Node("feature_basis", "fit_feature_basis", (Need("frames", VIEWED, ("train", "none"), measured=True),)),
     Node("features", "extract_features", ("frames", "feature_basis"), roles=VIEWED),
     Node("scene_template", "build_scene_template", merging("frames", "features", roles=("walkthrough",))),
-    Node(
-        "scene_localizer",
-        "train_localizer",
-        ("feature_basis", "scene_template", *merging("frames", roles=("walkthrough",))),
-        fixed={"target": "scene"},
-        gpu=1,
-        distributed=True,
-    ),
-    Node(
-        "estimated_frames",
-        "estimate_depth",
-        ("pictures", Need("frames", roles=("walkthrough",)), "scene_template"),
-        roles=AGENT,
-        mapped=True,
-        stands_in_for="frames",
-        seconds_per_frame=0.5,
-    ),
+    Node("scene_localizer", "train_localizer",
+         ("feature_basis", "scene_template", *merging("frames", roles=("walkthrough",))),
+         fixed={"target": "scene"}, gpu=1, distributed=True),
+    Node("estimated_frames", "estimate_depth",
+         ("pictures", Need("frames", roles=("walkthrough",)), "scene_template"),
+         roles=AGENT, mapped=True, stands_in_for="frames", seconds_per_frame=0.5),
     Node("flow", "estimate_flow", ("frames",), roles=AGENT, seconds_per_frame=0.06),
-    Node(
-        "identities",
-        "segment_agent.identities",
-        merging("frames", "flow", roles=("turnaround",)),
-        of_several=True,
-        seconds_per_frame=0.1,
-    ),
-    Node(
-        "masks",
-        "segment_agent",
-        ("frames", "flow", "identities"),
-        roles=AGENT,
-        sidecars=("prompt",),
-        begins_animal=True,
-        seconds_per_frame=0.11,
-    ),
-    Node(
-        "agent_template",
-        "build_agent_template",
-        merging("frames", "masks", "features", roles=("turnaround",)),
-    ),
-    Node(
-        "agent_localizer",
-        "train_localizer",
-        ("feature_basis", "agent_template"),
-        fixed={"target": "agent"},
-        gpu=1,
-        distributed=True,
-    ),
-    Node(
-        "video_poses",
-        "register_videos",
-        ("frames", "masks", "features", *TEMPLATES, *LOCALIZERS, WALK),
-        roles=("session",),
-        gpu=1,
-        seconds_per_frame=0.08,
-    ),
+    Node("identities", "segment_agent.identities", merging("frames", "flow", roles=("turnaround",)),
+         of_several=True, seconds_per_frame=0.1),
+    Node("masks", "segment_agent", ("frames", "flow", "identities"),
+         roles=AGENT, sidecars=("prompt",), begins_animal=True, seconds_per_frame=0.11),
+    Node("agent_template", "build_agent_template",
+         merging("frames", "masks", "features", roles=("turnaround",))),
+    Node("agent_localizer", "train_localizer", ("feature_basis", "agent_template"),
+         fixed={"target": "agent"}, gpu=1, distributed=True),
+    Node("video_poses", "register_videos",
+         ("frames", "masks", "features", *TEMPLATES, *LOCALIZERS, WALK),
+         roles=("session",), gpu=1, seconds_per_frame=0.08),
     Node("registration", "gather_registration", merging("video_poses")),
-    Node(
-        "reconstruction",
-        "reconstruct",
-        ("registration", *merging("frames", roles=VIEWED), *merging("masks", "flow", "features"), *TEMPLATES),
-        role_dependencies=("heldout",),
-        threads=2,
-        gpu=1,
-        memory_mb_per_1000_frames=500,
-        seconds_per_frame=0.1,
-        resumable=True,
-        distributed=True,
-        extra_inputs=("former",),
-    ),
-    Node(
-        "splats",
-        "refine_gaussians",
-        ("reconstruction", *merging("frames", roles=VIEWED), *merging("masks", "flow")),
-        gpu=1,
-        memory_mb_per_1000_frames=300,
-        resumable=True,
-        distributed=True,
-        seconds_per_frame=0.03,
-    ),
+    Node("reconstruction", "reconstruct",
+         ("registration", *merging("frames", roles=VIEWED), *merging("masks", "flow", "features"),
+          *TEMPLATES),
+         role_dependencies=("heldout",), threads=2, gpu=1, memory_mb_per_1000_frames=500,
+         seconds_per_frame=0.1, resumable=True, distributed=True, extra_inputs=("former",)),
+    Node("splats", "refine_gaussians",
+         ("reconstruction", *merging("frames", roles=VIEWED), *merging("masks", "flow")),
+         gpu=1, memory_mb_per_1000_frames=300, resumable=True, distributed=True, seconds_per_frame=0.03),
     Node("synthetic_lives", "synthesize_capture.lives", flows=("trajectories",)),
-    Node(
-        "trajectories",
-        "read_trajectories",
-        (Need("synthetic_lives", part="recordings", option="recording"),),
-        roles=("session",),
-        flows=("trajectories",),
-    ),
-    Node(
-        "behavior_data",
-        "slice_behavior",
-        (
-            Need("reconstruction", flow="recordings"),
-            Need("trajectories", flow="trajectories"),
-            Need("reconstruction", flow="recordings", option="companions", others=True),
-            Need("masks", ("session",), flow="recordings"),
-        ),
-        role_dependencies=("session",),
-        flows=BOTH,
-    ),
-    Node(
-        "behavior",
-        "train_behavior",
-        ("behavior_data", *OF_HOMES),
-        gpu=1,
-        resumable=True,
-        distributed=True,
-        flows=BOTH,
-    ),
+    Node("trajectories", "read_trajectories",
+         (Need("synthetic_lives", part="recordings", option="recording"),),
+         roles=("session",), flows=("trajectories",)),
+    Node("behavior_data", "slice_behavior",
+         (Need("reconstruction", flow="recordings"),
+          Need("trajectories", flow="trajectories"),
+          Need("reconstruction", flow="recordings", option="companions", others=True),
+          Need("masks", ("session",), flow="recordings")),
+         role_dependencies=("session",), flows=BOTH),
+    Node("behavior", "train_behavior", ("behavior_data", *OF_HOMES),
+         gpu=1, resumable=True, distributed=True, flows=BOTH),
     Node("longterm_world", "synthesize_capture.motions", on_demand=True),
-    Node(
-        "longterm_ablations",
-        "train_longterm",
-        ("reconstruction", "behavior_data"),
-        fixed={"ablations": "baselines"},
-        resumable=True,
-        on_demand=True,
-    ),
-    Node(
-        "longterm_study",
-        "train_longterm",
-        ("longterm_world",),
-        fixed={"ablations": "all"},
-        resumable=True,
-        on_demand=True,
-    ),
-    Node(
-        "behavior_trials",
-        "train_behavior",
-        ("behavior_data", *OF_HOMES),
-        table="train_behavior",
-        fixed={"export": False},
-        gpu=1,
-        resumable=True,
-        flows=BOTH,
-        trials="each",
-    ),
-    Node(
-        "behavior_scores",
-        "score_behavior",
-        (
-            "behavior_data",
-            "behavior_trials",
-            Need("synthetic_lives", part="approaches", option="approaches", flow="trajectories"),
-        ),
-        flows=BOTH,
-        trials="each",
-    ),
-    Node(
-        "behavior_tables",
-        "tabulate_behavior",
-        ("behavior_data", "behavior_trials", "behavior_scores"),
-        flows=BOTH,
-        trials="all",
-    ),
-    Node(
-        "longterm_tables",
-        "tabulate_longterm",
-        ("reconstruction", "behavior_data", "behavior", *LONGTERM_STUDIES),
-        on_demand=True,
-    ),
-    Node(
-        "reconstruction_metrics",
-        "evaluate.reconstruction_metrics",
-        (
-            *merging("frames", "masks", "flow"),
-            *(*TEMPLATES, "scene_localizer", "registration", "reconstruction", "splats", TRUTH),
-        ),
-        role_dependencies=("session", "heldout"),
-        table="evaluate",
-        gpu=1,
-        extra_inputs=("clicks.json",),
-    ),
+    Node("longterm_ablations", "train_longterm", ("reconstruction", "behavior_data"),
+         fixed={"ablations": "baselines"}, resumable=True, on_demand=True),
+    Node("longterm_study", "train_longterm", ("longterm_world",),
+         fixed={"ablations": "all"}, resumable=True, on_demand=True),
+    Node("behavior_trials", "train_behavior", ("behavior_data", *OF_HOMES),
+         table="train_behavior", fixed={"export": False}, gpu=1, resumable=True, flows=BOTH, trials="each"),
+    Node("behavior_scores", "score_behavior",
+         ("behavior_data", "behavior_trials",
+          Need("synthetic_lives", part="approaches", option="approaches", flow="trajectories")),
+         flows=BOTH, trials="each"),
+    Node("behavior_tables", "tabulate_behavior", ("behavior_data", "behavior_trials", "behavior_scores"),
+         flows=BOTH, trials="all"),
+    Node("longterm_tables", "tabulate_longterm",
+         ("reconstruction", "behavior_data", "behavior",
+          "longterm_ablations", "longterm_world", "longterm_study"),
+         on_demand=True),
+    Node("reconstruction_metrics", "evaluate.reconstruction_metrics",
+         (*merging("frames", "masks", "flow"),
+          *TEMPLATES, "scene_localizer", "registration", "reconstruction", "splats", TRUTH),
+         role_dependencies=("session", "heldout"), table="evaluate", gpu=1, extra_inputs=("clicks.json",)),
     Node("longterm", "train_longterm", ("reconstruction", "behavior_data"), resumable=True, distributed=True),
     Node("simulator", "export_simulator", READ_BY_PAGES),
-    Node(
-        "home_simulator",
-        "export_simulator.home",
-        tuple(Need(name, others=True) for name in READ_BY_PAGES),
-        table="export_simulator",
-        of_several=True,
-    ),
-    Node(
-        "evaluation",
-        "evaluate",
-        ("reconstruction_metrics", "reconstruction", "behavior_data", "behavior"),
-        gpu=1,
-    ),
-    Node(
-        "registration_tables",
-        "evaluate.registration_tables",
-        (
-            Need("registration", variants=REGISTRATION_VARIANTS),
-            *("scene_template", *merging("frames", roles=("walkthrough", "session")), TRUTH),
-        ),
-        on_demand=True,
-    ),
-    Node(
-        "reconstruction_tables",
-        "evaluate.reconstruction_tables",
-        (Need("reconstruction", variants=RECONSTRUCTION_VARIANTS), *TEMPLATES, *merging("frames"), TRUTH),
-        on_demand=True,
-    ),
-    Node(
-        "report",
-        "report",
-        (
-            *(*merging("frames", "flow", "masks"), "feature_basis", *merging("features")),
-            *(*TEMPLATES, *LOCALIZERS, *merging("video_poses"), "registration"),
-            *(*READ_BY_PAGES, "longterm", "simulator", "reconstruction_metrics", "evaluation"),
-        ),
-    ),
+    Node("home_simulator", "export_simulator.home", tuple(Need(name, others=True) for name in READ_BY_PAGES),
+         table="export_simulator", of_several=True),
+    Node("evaluation", "evaluate",
+         ("reconstruction_metrics", "reconstruction", "behavior_data", "behavior"), gpu=1),
+    Node("registration_tables", "evaluate.registration_tables",
+         (Need("registration", variants=VARIANTS["registration"]),
+          "scene_template", *merging("frames", roles=("walkthrough", "session")), TRUTH),
+         on_demand=True),
+    Node("reconstruction_tables", "evaluate.reconstruction_tables",
+         (Need("reconstruction", variants=VARIANTS["reconstruction"]),
+          *TEMPLATES, *merging("frames"), TRUTH),
+         on_demand=True),
+    Node("report", "report",
+         (*merging("frames", "flow", "masks"), "feature_basis", *merging("features"),
+          *TEMPLATES, *LOCALIZERS, *merging("video_poses"), "registration",
+          *READ_BY_PAGES, "longterm", "simulator", "reconstruction_metrics", "evaluation")),
 )
+# fmt: on
 NODES = {node.artifact: node for node in FLOW}
 
 

@@ -24,6 +24,8 @@ MIN_RUNTIME_MIN = 60
 """Minimum time limit of a job on its first attempt, minutes."""
 RUNTIME_FACTOR = 4
 """How much slower than the measured machine a compute node may be."""
+MEMORY_MB = 3000
+"""Memory that every job reserves on its first attempt; not a limit."""
 MEMORY_GROWTH = 1.5
 """Memory of each attempt, relative to the one before."""
 _known: dict[tuple[str, str], dict[str, Any]] = {}
@@ -97,7 +99,7 @@ def memory_mb(node: dag.Node) -> Callable[..., int]:
 
     def of(wildcards: Any, attempt: int) -> int:
         frames = _frames(wildcards.home, _id(node, wildcards)) if node.memory_mb_per_1000_frames else 0
-        needed = node.memory_mb + node.memory_mb_per_1000_frames * frames / 1000
+        needed = MEMORY_MB + node.memory_mb_per_1000_frames * frames / 1000
         return math.ceil(needed * MEMORY_GROWTH ** (attempt - 1))
 
     return of

@@ -89,8 +89,6 @@ class Job:
     """Files that determine the result together with the inputs."""
     arguments: tuple[str, ...]
     threads: int
-    gpu: int
-    memory_mb: int
     resumable: bool
     distributed: bool
     on_demand: bool
@@ -294,8 +292,6 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
         keys=tuple(keys),
         arguments=tuple(arguments),
         threads=node.threads,
-        gpu=node.gpu,
-        memory_mb=node.memory_mb,
         resumable=node.resumable,
         distributed=node.distributed,
         on_demand=node.on_demand,
