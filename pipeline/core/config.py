@@ -55,9 +55,7 @@ def from_table(config: type[C], table: Mapping[str, Any], *, where: str, base: C
     fields = {field.name: field for field in dataclasses.fields(config)}
     refuse_unknown(table, fields, where=where)
     hints = typing.get_type_hints(config)
-    values = {
-        name: default_of(field) if base is None else getattr(base, name) for name, field in fields.items()
-    }
+    values = {name: _default_of(fields[name]) if base is None else getattr(base, name) for name in fields}
     for key, value in table.items():
         checked = _checked(hints[key], value, f"{where}: {key}", values[key])
         refuse_impossible(value, values[key], where=f"{where}: {key}")
@@ -68,8 +66,7 @@ def from_table(config: type[C], table: Mapping[str, Any], *, where: str, base: C
     return config(**values)
 
 
-def default_of(field: dataclasses.Field) -> Any:
-    """Return a field's default, `MISSING` if it has none."""
+def _default_of(field: dataclasses.Field) -> Any:
     factory = field.default_factory
     return field.default if factory is dataclasses.MISSING else factory()
 

@@ -19,6 +19,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from pipeline.core.config import from_table
 from pipeline.core.errors import MAKE_AGAIN, InputError
 from pipeline.workflow import dag
 
@@ -40,7 +41,7 @@ class Manifest:
     """Hash of the names and bytes of its files."""
     inputs: dict[str, str]
     """`content` of every artifact that was read, by name."""
-    config: dict[str, Any]
+    config: dict
     """The stage's full configuration, defaults included."""
     versions: dict[str, str]
     """Versions of Python and of the libraries that affect numerical results."""
@@ -52,24 +53,11 @@ class Manifest:
 
 def read_manifest(folder: Path) -> Manifest | None:
     """Return the manifest of `folder`, or None if there is no finished artifact."""
+    path = folder / MANIFEST
     try:
-        manifest = Manifest(**json.loads((folder / MANIFEST).read_bytes()))
-    except (FileNotFoundError, NotADirectoryError, ValueError, TypeError, RecursionError):
+        return from_table(Manifest, dict(json.loads(path.read_bytes())), where=str(path))
+    except (FileNotFoundError, NotADirectoryError, ValueError, TypeError, RecursionError, InputError):
         return None
-    return manifest if _is_sound(manifest) else None
-
-
-def _is_sound(manifest: Manifest) -> bool:
-    """Return whether every field has the right type."""
-    texts, tables = (manifest.stage, manifest.content), (manifest.inputs, manifest.versions, manifest.files)
-    return (
-        all(isinstance(text, str) for text in texts)
-        and isinstance(manifest.key, str | None)
-        and isinstance(manifest.config, dict)
-        and isinstance(manifest.version, int)
-        and all(isinstance(table, dict) for table in tables)
-        and all(isinstance(value, str) for table in tables for value in table.values())
-    )
 
 
 def opened(folder: Path, name: str) -> Manifest:
@@ -78,7 +66,7 @@ def opened(folder: Path, name: str) -> Manifest:
     if manifest is None:
         what = f"{name} is missing or unfinished"
         raise InputError("ART-001", what, str(folder), "build it first with `make`")
-    refuse_other_version(folder)
+    _refuse_other_version(manifest, folder)
     return manifest
 
 
@@ -87,10 +75,8 @@ def version_of(stage: str) -> int:
     return max((node.version for node in dag.FLOW if node.stage.rpartition(".")[2] == stage), default=1)
 
 
-def refuse_other_version(folder: Path) -> None:
-    """Raise `InputError` ART-007 if `folder` is a finished artifact of another version."""
-    made = read_manifest(folder)
-    if made is not None and made.version != version_of(made.stage):
+def _refuse_other_version(made: Manifest, folder: Path) -> None:
+    if made.version != version_of(made.stage):
         what = f"{made.stage} wrote it in version {made.version}; this is version {version_of(made.stage)}"
         raise InputError("ART-007", what, str(folder), MAKE_AGAIN)
 
@@ -100,7 +86,8 @@ def require(build: Path, *names: str, remedy: str) -> None:
     for name in names:
         if not (build / name).is_dir():
             raise InputError("ART-003", f"has no {name}", str(build), remedy)
-        refuse_other_version(build / name)
+        if made := read_manifest(build / name):
+            _refuse_other_version(made, build / name)
 
 
 @contextlib.contextmanager
@@ -121,7 +108,7 @@ def create(
         if not files:
             remedy = "this is a fault of the stage: report it"
             raise InputError("ART-002", f"{stage} wrote nothing", str(out), remedy)
-        content, ordered = content_of(files), dict(sorted(inputs.items()))
+        content, ordered = digest_of(files), dict(sorted(inputs.items()))
         manifest = Manifest(stage, key, content, ordered, dict(config), versions(), files, version_of(stage))
         (temporary / MANIFEST).write_text(json.dumps(asdict(manifest), indent=1, sort_keys=True) + "\n")
         sync_disk(temporary)
@@ -147,11 +134,6 @@ def digest_of_file(path: Path) -> str:
     """Return the sha256 of one file's bytes."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def content_of(files: Mapping[str, str]) -> str:
-    """Hash an artifact's files, given their digests."""
-    return digest_of(dict(files))
 
 
 def digest_of(value: Any) -> str:

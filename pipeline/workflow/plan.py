@@ -272,7 +272,7 @@ def _load_cache(path: Path) -> dict[str, Any]:
         known = json.loads(path.read_text())
     except (FileNotFoundError, ValueError):
         return {}
-    return known if sources.is_valid_cache(known) else {}
+    return known if isinstance(known, dict) else {}
 
 
 def _input_fingerprint(home: Home, code: sources.Cache) -> str:

@@ -6,7 +6,7 @@ before any stage runs. Standard library only.
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +74,11 @@ def _checked(recipe: dict[str, Any], path: Path) -> dict[str, Any]:
             raise InputError("REC-002", f"{name!r} is no table", str(path), f"write [{name}]")
         if name == VIDEOS_TABLE:
             for recording, remarks in table.items():
-                _remarks(recording, remarks, f"{path}: [{name}]")
+                at = f"{path}: [{name}]"
+                if not isinstance(remarks, dict):
+                    what = f"{recording!r}: {config.shown(remarks)} is no table"
+                    raise InputError("REC-002", what, at, f"write [{name}.{recording!r}]")
+                config.from_table(captures.Remarks, remarks, where=f"{at}: {recording!r}")
         if name not in stages:
             continue
         declared = sources.config_of(stages[name].stage)
@@ -82,14 +86,6 @@ def _checked(recipe: dict[str, Any], path: Path) -> dict[str, Any]:
         config.refuse_unknown(table, keys, where=f"{path}: [{name}]")
         config.from_table(declared, table, where=f"{path}: [{name}]")
     return recipe
-
-
-def _remarks(recording: str, table: Any, where: str) -> captures.Remarks:
-    """Return the remarks on a recording. Raises REC-001 and REC-002 for unknown keys and wrong types."""
-    if not isinstance(table, dict):
-        what = f"{recording!r}: {config.shown(table)} is no table"
-        raise InputError("REC-002", what, where, f"write [{VIDEOS_TABLE}.{recording!r}]")
-    return config.from_table(captures.Remarks, table, where=f"{where}: {recording!r}")
 
 
 def flow(table: Mapping[str, Any], where: str) -> Flow:
@@ -114,11 +110,8 @@ def refuse_homes(agent: str, table: Mapping[str, Any], where: str) -> None:
 
 def trials(table: Mapping[str, Any]) -> Iterator[Trial]:
     """Yield every trained method of the tables with every seed; a method is the variant of that name."""
-    settings = {**_defaults(TABLES_STAGE), **table}
-    count, methods = _count(settings, "seeds", TABLES_STAGE), settings.get("methods", ())
-    if not isinstance(methods, list | tuple) or not all(isinstance(method, str) for method in methods):
-        what, remedy = f"{methods!r} is no list of methods", 'write ["ats", ...]'
-        raise InputError("REC-002", what, f"[{TABLES_STAGE}]: methods", remedy)
+    settings = {**vars(sources.config_of(TABLES_STAGE)()), **table}
+    count, methods = settings["seeds"], settings["methods"]
     if OURS not in methods or not count:
         what = f"{count} trainings of {', '.join(methods) or 'no method'} make no tables"
         remedy = f"one seed at least, and {OURS!r} among the methods"
@@ -149,31 +142,19 @@ def merged(table: Mapping[str, Any], overlay: Mapping[str, Any]) -> dict[str, An
 def builtin_remarks(begins: Flow, recipe: Mapping[str, Any], where: str) -> dict[str, captures.Remarks]:
     """Return the remarks on the built-in recordings, with overrides as for a user's recordings."""
     node, overrides = dag.NODES[dag.BUILTIN[begins]], recipe.get(VIDEOS_TABLE, {})
-    settings = {**_defaults(node.stage), **recipe.get(dag.table_of(node), {})}
+    settings = {**vars(sources.config_of(node.stage)()), **recipe.get(dag.table_of(node), {})}
     if begins == "recordings":
-        counts = (_count(settings, key, where) for key in ("session_count", "heldout_of", "foreign_sessions"))
-        said = captures.builtin(*counts, companion=settings["companion"])
+        keys = ("session_count", "heldout_of", "foreign_sessions", "companion")
+        builtin = captures.builtin(*(settings[key] for key in keys))
     else:
         keys = ("homes", "sessions_per_home", "test_homes", "test_sessions")
-        said = captures.builtin_lives(*(_count(settings, key, where) for key in keys))
-    for name in (name for name in overrides if name not in said):
-        known = ", ".join(said)
+        builtin = captures.builtin_lives(*(settings[key] for key in keys))
+    for name in (name for name in overrides if name not in builtin):
+        known = ", ".join(builtin)
         remedy = f"copy it into captures/, beside the others; without any, the built-in capture has {known}"
         raise InputError("REC-001", f"unknown recording {name!r}", f"{where}: [videos]", remedy)
-
-    def changed(name: str, remark: captures.Remarks) -> captures.Remarks:
-        given = {key: value for key, value in asdict(remark).items() if value is not None}
-        return _remarks(name, {**given, **overrides.get(name, {})}, f"{where}: [videos]")
-
-    return {name: changed(name, remark) for name, remark in said.items()}
-
-
-def _defaults(stage: str) -> dict[str, Any]:
-    return {field.name: config.default_of(field) for field in fields(sources.config_of(stage))}
-
-
-def _count(settings: Mapping[str, Any], key: str, where: str) -> int:
-    if type(settings[key]) is not int or settings[key] < 0:
-        what = f"{settings[key]!r} is no count"
-        raise InputError("REC-002", what, f"{where}: {key}", "give a whole number")
-    return settings[key]
+    at = f"{where}: [videos]"
+    return {
+        name: config.from_table(captures.Remarks, overrides.get(name, {}), where=f"{at}: {name!r}", base=said)
+        for name, said in builtin.items()
+    }

@@ -117,7 +117,7 @@ def recipe(crate: Crate) -> str:
 
 def differing(crate: Crate, build: Path) -> list[str]:
     """Return the names of artifacts that are missing or differ from the crate's, in flow order."""
-    contents = {name: artifact.content_of(artifact.digests(build / name)) for name in crate.artifacts}
+    contents = {name: artifact.digest_of(artifact.digests(build / name)) for name in crate.artifacts}
     return [name for name, each in crate.artifacts.items() if each.content != contents[name]]
 
 

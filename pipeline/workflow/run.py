@@ -134,7 +134,7 @@ def _key(job: dict[str, Any]) -> str:
         if part := entry["part"]:
             files = manifest.files.items()
             chosen = {name: digest for name, digest in files if f"{name}/".startswith(f"{part}/")}
-            contents[entry["name"]] = artifact.content_of(chosen)
+            contents[entry["name"]] = artifact.digest_of(chosen)
     return artifact.digest_of([contents, [json.loads(Path(path).read_text()) for path in job["keys"]]])
 
 

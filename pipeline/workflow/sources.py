@@ -9,7 +9,7 @@ import functools
 import importlib
 import os
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -57,23 +57,10 @@ class Cache:
         """Return `read(path)`, a value of plain JSON types, from the cache if the file is unchanged."""
         current = [CACHE_VERSION, *stat_fingerprint(path)]
         entry = self.fresh.get(str(path)) or self.known.get(str(path))
-        if entry is None or entry["mark"] != current:
+        if not isinstance(entry, dict) or entry.get("mark") != current:
             entry = {"mark": current, "value": read(path)}
         self.fresh[str(path)] = entry
         return entry["value"]
-
-
-def is_valid_cache(known: Any) -> bool:
-    """Return whether a value read from JSON has the structure of a `Cache`."""
-    entries = known.values() if isinstance(known, dict) else [None]
-    values = [
-        entry["value"] if isinstance(entry, dict) and entry.keys() == {"mark", "value"} else None
-        for entry in entries
-    ]
-    names = {field.name for field in fields(Source)}
-    return all(
-        isinstance(value, str) or (isinstance(value, dict) and value.keys() == names) for value in values
-    )
 
 
 def digest(stage: str, cache: Cache) -> str:

@@ -9,7 +9,7 @@ import contextlib
 import functools
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from pipeline.workflow import artifact, dag
@@ -21,7 +21,7 @@ TICK_NS = 1_000_000
 
 def put(stamp: Path, keys: Sequence[str]) -> None:
     """Write the stamp of an up-to-date artifact; `keys` are its job's key files."""
-    stamp.write_text(text(keys))
+    stamp.write_text(text(artifact.digest_of_file(Path(key)) for key in keys))
     clock = _clock(Home(stamp.parts[1]))
     with artifact.locked(clock):
         later_ns = max(time.time_ns(), clock.stat().st_mtime_ns + TICK_NS)
@@ -29,9 +29,9 @@ def put(stamp: Path, keys: Sequence[str]) -> None:
     os.utime(stamp, ns=(later_ns, later_ns))
 
 
-def text(keys: Sequence[str]) -> str:
-    """Return the content of the stamp of a job with these key files."""
-    return artifact.digest_of([artifact.digest_of_file(Path(key)) for key in keys]) + "\n"
+def text(digests: Iterable[str]) -> str:
+    """Return the content of the stamp of a job whose key files have these digests."""
+    return artifact.digest_of(list(digests)) + "\n"
 
 
 def remove_outdated(jobs: Sequence[Job]) -> None:
@@ -39,8 +39,7 @@ def remove_outdated(jobs: Sequence[Job]) -> None:
     digest_of = functools.cache(lambda key: artifact.digest_of_file(Path(key)))
     for job in jobs:
         with contextlib.suppress(FileNotFoundError):
-            stamped = Path(job.stamp).read_text(errors="replace")
-            if stamped != artifact.digest_of(list(map(digest_of, job.keys))) + "\n":
+            if Path(job.stamp).read_text(errors="replace") != text(map(digest_of, job.keys)):
                 Path(job.stamp).unlink()
 
 

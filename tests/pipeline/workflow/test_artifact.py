@@ -26,7 +26,7 @@ def test_manifest_describes_the_files(tmp_path):
     manifest = artifact.opened(tmp_path / "x", "x")
     assert manifest.key == "k"
     assert manifest.files == artifact.digests(tmp_path / "x")
-    assert manifest.content == artifact.content_of(manifest.files)
+    assert manifest.content == artifact.digest_of(manifest.files)
     assert [path.name for path in tmp_path.iterdir()] == ["x"]
 
 
