@@ -17,7 +17,6 @@ import textwrap
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -41,31 +40,17 @@ class InputField:
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """One run of one stage: its inputs, its configuration and the artifact it is to make."""
+    """What one run of a stage is given, and the artifacts that it has opened."""
 
     stage: str
     config: Any
     """The stage's own `Config`."""
-    out: Path
-    """Path of the artifact."""
-    video: str | None
-    """Id of the recording, for stages that process one at a time."""
     videos: tuple[Video, ...]
     """All recordings of the agent; empty when run by hand without `--videos`."""
-    resume: Path | None
-    """Folder for checkpoints; None: a killed run starts over."""
-    threads: int
-    key: str | None
     paths: dict[str, Path]
     """Inputs as given."""
-    requested_device: str
     contents: dict[str, str] = dataclasses.field(default_factory=dict)
     """Hash of every artifact opened so far, for the manifest."""
-
-    @property
-    def device(self) -> str:
-        """`cpu` or `cuda`; raises DEP-002 as `devices.choose` does."""
-        return devices.choose(self.requested_device)
 
     def input(self, name: str) -> Path:
         """Return the folder of the finished artifact `name`, or a plain file or folder as it is."""
@@ -99,15 +84,15 @@ class Task:
             return {id: self._opened(folder / id, f"{field.name}/{id}") for id in trials}
         return self._per_video(need)
 
-    def recording(self) -> Video | None:
+    def recording(self, id: str | None) -> Video | None:
         """Return the recording to process; None if the stage was run by hand without `--video`."""
-        if self.video is None:
+        if id is None:
             return None
         for video in self.videos:
-            if video.id == self.video:
+            if video.id == id:
                 return video
         remedy = "give --videos build/<agent>/plan/videos.json that lists it"
-        raise InputError("ART-004", f"which recording is {self.video!r}?", self.stage, remedy)
+        raise InputError("ART-004", f"which recording is {id!r}?", self.stage, remedy)
 
     def _per_video(self, need: Need) -> dict[str, Path]:
         """Return the folder of an artifact for every recording of its need's roles and splits, in id order.
@@ -128,14 +113,6 @@ class Task:
     def _below(self, folder: Path, names: Sequence[str], artifact: str) -> dict[str, Path]:
         """Return the folder of `artifact` in every one of these variants or animals, by its name."""
         return {name: self._opened(folder / name / artifact, f"{name}/{artifact}") for name in names}
-
-    @contextmanager
-    def create(self) -> Iterator[Path]:
-        """Yield the folder to fill; it becomes the artifact if, and only if, the block succeeds."""
-        stage, settings = self.stage.rpartition(".")[2], dataclasses.asdict(self.config)
-        made = artifact.create(self.out, stage=stage, config=settings, inputs=self.contents, key=self.key)
-        with made as folder:
-            yield folder
 
     def _opened(self, path: Path, name: str) -> Path:
         made, kind = artifact.opened(path, name), name.partition("/")[0]
@@ -164,16 +141,16 @@ def main(
     helping = not {"-h", "--help"}.isdisjoint(sys.argv)
     settings = ["settings of the stage's table, with their defaults:"] if helping else []
     settings += _settings(config()) if helping else []
-    required = tuple(field.name for field in fields if field.required)
-    optional = tuple(field.name for field in fields if not field.required)
-    parser = _parser(_program(run), doc, "\n".join(settings) or None, required, optional)
+    parser = _parser(_program(run), doc, "\n".join(settings) or None, fields)
     for name in options:
         _add_option(parser, name, typing.get_type_hints(config)[name])
 
     def program() -> int:
         given = parser.parse_args()
+        _limit_threads(given.threads)
         with coded_disk_errors(str(given.out)):
-            _run(run, inputs, fields, _task(given, _program(run), config, required + optional, options))
+            task = _task(given, _program(run), config, fields, options)
+            _run(run, inputs(**{field.name: task.field(field) for field in fields}), task, given)
         return 0
 
     if code := exit_code(program):
@@ -198,21 +175,22 @@ def _program(run: Callable[..., object]) -> str:
     return ".".join(parts[1:-1]) if parts[0] == "stages" else Path(sys.argv[0]).parent.name
 
 
-def _run(run: Callable[..., object], inputs: type, fields: Sequence[InputField], task: Task) -> None:
-    given = inputs(**{field.name: task.field(field) for field in fields})
-    accepted = inspect.signature(run).parameters
+def _run(run: Callable[..., object], inputs: object, task: Task, given: argparse.Namespace) -> None:
     offered: dict[str, Callable[[], object]] = {
-        "device": lambda: task.device,
-        "threads": lambda: task.threads,
-        "resume": lambda: task.resume,
+        "device": lambda: devices.choose(given.device),
+        "threads": lambda: given.threads,
+        "resume": lambda: given.resume,
         "videos": lambda: task.videos,
-        "video": task.recording,
+        "video": lambda: task.recording(given.video),
     }
+    accepted = inspect.signature(run).parameters
     known = {name: offer() for name, offer in offered.items() if name in accepted}
+    stage, settings = task.stage.rpartition(".")[2], dataclasses.asdict(task.config)
+    made = artifact.create(given.out, stage=stage, config=settings, inputs=task.contents, key=given.key)
     # of the processes that torchrun started, only rank 0 publishes the artifact
     leads = os.environ.get("RANK", "0") == "0" or "TORCHELASTIC_RUN_ID" not in os.environ
-    with task.create() if leads else tempfile.TemporaryDirectory() as folder:
-        run(given, task.config, Path(folder), **known)
+    with made if leads else tempfile.TemporaryDirectory() as folder:
+        run(inputs, task.config, Path(folder), **known)
 
 
 def _settings(defaults: Any, table: str = "") -> Iterator[str]:
@@ -233,7 +211,7 @@ def _settings(defaults: Any, table: str = "") -> Iterator[str]:
 
 
 def _parser(
-    stage: str, doc: str | None, epilog: str | None, reads: tuple[str, ...], optional: tuple[str, ...]
+    stage: str, doc: str | None, epilog: str | None, fields: Sequence[InputField]
 ) -> argparse.ArgumentParser:
     prog, layout = f"python -m stages.{stage}", argparse.RawDescriptionHelpFormatter
     parser = _Parser(prog=prog, description=doc, epilog=epilog, formatter_class=layout)
@@ -242,8 +220,8 @@ def _parser(
         option = f"--{name.replace('_', '-')}"
         parser.add_argument(option, dest=name, type=Path, required=required, metavar=metavar, help=text)
 
-    for name in reads + optional:
-        path(name, "PATH", _what(name), required=name in reads)
+    for field in fields:
+        path(field.name, "PATH", _what(field.name), required=field.required)
     path("config", "FILE", "this stage's table, JSON or TOML (default: all defaults)")
     path("out", "DIR", "artifact to write; appears when complete", required=True)
     parser.add_argument("--video", metavar="ID", help="the recording to treat, for example v002")
@@ -284,23 +262,14 @@ def _what(name: str) -> str:
 
 
 def _task(
-    given: argparse.Namespace, stage: str, config: type, names: tuple[str, ...], options: tuple[str, ...]
+    given: argparse.Namespace, stage: str, config: type, fields: Sequence[InputField], options: Sequence[str]
 ) -> Task:
-    _limit_threads(given.threads)
     table = configuration.read_table(given.config) if given.config else {}
     table |= {name: value for name in options if (value := getattr(given, name)) is not None}
-    return Task(
-        stage=stage,
-        config=configuration.from_table(config, table, where=str(given.config or stage)),
-        out=given.out,
-        video=given.video,
-        videos=videos.read(given.videos) if given.videos else (),
-        resume=given.resume,
-        threads=given.threads,
-        key=given.key,
-        paths={name: path for name in names if (path := getattr(given, name)) is not None},
-        requested_device=given.device,
-    )
+    checked = configuration.from_table(config, table, where=str(given.config or stage))
+    recordings = videos.read(given.videos) if given.videos else ()
+    paths = {field.name: getattr(given, field.name) for field in fields}
+    return Task(stage, checked, recordings, {name: path for name, path in paths.items() if path is not None})
 
 
 def _limit_threads(threads: int) -> None:

@@ -8,18 +8,12 @@
 In a checkout `make` calls the same modules.
 """
 
-import importlib.util
 import runpy
 import sys
 from collections.abc import Sequence
 
 from pipeline.core.errors import InputError, exit_code
-
-MODULES = {
-    "plan": "pipeline.workflow.plan",
-    "run": "pipeline.workflow.run",
-    "doctor": "pipeline.workflow.doctor",
-}
+from pipeline.workflow import sources
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,25 +35,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _module(given: list[str]) -> tuple[str, list[str]]:
     """Return the module that a command line means, and the arguments that are left for it."""
     match given:
-        case ["stage", name, *rest] if _is_stage(name):
+        case ["stage", name, *rest] if sources.is_stage(name):
             return f"stages.{name}", rest
         case ["stage", *_]:
             named = f"there is no stage {given[1]!r}" if given[1:] else "which stage?"
             raise InputError("RUN-002", named, "agent-to-sim stage", "names: the folders of stages/")
-        case [command, *rest] if command in MODULES:
-            return MODULES[command], rest
-    what, remedy = f"there is no command {given[0]!r}", f"one of: stage, {', '.join(MODULES)}"
-    raise InputError("RUN-003", what, "agent-to-sim", remedy)
-
-
-def _is_stage(name: str) -> bool:
-    """Return whether `name` is a stage program, without importing it."""
-    if not all(part.isidentifier() for part in name.split(".")):
-        return False
-    try:
-        return importlib.util.find_spec(f"stages.{name}.__main__") is not None
-    except ModuleNotFoundError:
-        return False
+        case ["plan" | "run" | "doctor" as command, *rest]:
+            return f"pipeline.workflow.{command}", rest
+    what = f"there is no command {given[0]!r}"
+    raise InputError("RUN-003", what, "agent-to-sim", "one of: stage, plan, run, doctor")
 
 
 if __name__ == "__main__":

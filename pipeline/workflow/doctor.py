@@ -55,20 +55,14 @@ def libraries() -> Finding:
     return Finding("libraries", "fail" if missing else "ok", text)
 
 
-def opengl() -> Finding:
-    """Check the system libraries for meshes."""
-    missing = [name for name in ("GL", "OpenGL") if ctypes.util.find_library(name) is None]
-    text = f"missing lib{', lib'.join(missing)}" if missing else "found"
-    return Finding("OpenGL", "fail" if missing else "ok", text)
-
-
 def meshes() -> Finding:
-    """Import pymeshlab in a separate process, as the stage that uses it does."""
+    """Look for OpenGL and import pymeshlab in a separate process, as the stage that uses it does."""
+    missing = [f"lib{name}" for name in ("GL", "OpenGL") if ctypes.util.find_library(name) is None]
     found = subprocess.run([sys.executable, "-c", "import pymeshlab"], capture_output=True, text=True)
-    if found.returncode == 0:
+    if found.returncode == 0 and not missing:
         return Finding("pymeshlab", "ok", "imports")
-    remedy = "missing system libraries; remedy: apt-get install libgl1 libopengl0"
-    return Finding("pymeshlab", "fail", remedy)
+    named = ", ".join(missing) or "system libraries"
+    return Finding("pymeshlab", "fail", f"missing {named}; remedy: apt-get install libgl1 libopengl0")
 
 
 def processors() -> Finding:
@@ -132,7 +126,7 @@ def recordings() -> Finding:
 
 
 CHECKS: tuple[Callable[[], Finding], ...] = (
-    python, libraries, opengl, meshes, processors, lock, memory, disk, browser, recordings,
+    python, libraries, meshes, processors, lock, memory, disk, browser, recordings,
 )  # fmt: skip
 
 

@@ -148,7 +148,7 @@ def _other_key(resume: Path, key: str) -> bool:
 
 def _do(job: dict[str, Any], key: str, resume: Path, engine: Engine) -> int:
     """Run the stage program with its arguments and log; return its exit code."""
-    if not sources.CODE.joinpath("stages", *job["stage"].split("."), "__main__.py").is_file():
+    if not sources.is_stage(job["stage"]):
         what = f"there is no stage program {job['stage']!r}"
         raise InputError("RUN-002", what, "stages/", "this build is incomplete")
     free = shutil.disk_usage("build").free

@@ -103,6 +103,12 @@ def folder_fingerprint(folder: str, *, follow: bool = True) -> list[list[Any]]:
     return found
 
 
+def is_stage(name: str) -> bool:
+    """Return whether there is a stage program of this name, such as `segment_agent.identities`."""
+    parts = name.split(".")
+    return all(map(str.isidentifier, parts)) and CODE.joinpath("stages", *parts, "__main__.py").is_file()
+
+
 def config_of(stage: str) -> type:
     """Return the `Config` of a stage, from `stages/<stage>/config.py`."""
     return importlib.import_module(f"stages.{stage}.config").Config

@@ -194,17 +194,7 @@ def test_fields_receive_recordings_and_trials_of_the_flow(tmp_path, stage, field
         ("heldout", "none"),
     ]
     videos = tuple(Video(f"v{i:03d}", f"{i}", role, split, None) for i, (role, split) in enumerate(roles))
-    task = cli.Task(
-        stage,
-        SimpleNamespace(methods=("ats", "world"), seeds=2),
-        tmp_path / "out",
-        None,
-        videos,
-        None,
-        1,
-        None,
-        {field: tmp_path / field},
-        "cpu",
-    )
+    settings = SimpleNamespace(methods=("ats", "world"), seeds=2)
+    task = cli.Task(stage, settings, videos, {field: tmp_path / field})
     found = task.field(cli.InputField(field, required=True, several=True))
     assert found == {name: tmp_path / field / name for name in expected}
