@@ -1,5 +1,5 @@
 """Click correspondences between a session and the walk-through, to evaluate a real capture's registration.
 
-`frame_choice` picks frames worth clicking, `serving` hands the page (`page.html`) its pictures on 127.0.0.1,
+`stage` picks frames worth clicking, `serving` hands the page (`page.html`) its pictures on 127.0.0.1,
 fits what was clicked and keeps it in `captures/<agent>/clicks.json`, which `evaluate` reads.
 """

@@ -14,7 +14,6 @@ from pipeline.core import loopback, videos
 from pipeline.core.errors import InputError
 from pipeline.workflow import artifact
 from stages.annotate import serving, stage
-from stages.annotate.config import Config
 
 ROLES = ("walkthrough", "session", "heldout")
 PORT = 8765
@@ -32,8 +31,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--port", type=int, default=PORT, help=f"port on 127.0.0.1 (default: {PORT}; 0: any)")
     given = parser.parse_args(arguments)
     try:
-        session = stage.run(_inputs(given.build), Config(), given.clicks)
-        server = serving.server(session, given.port)
+        server = serving.ClickServer(_session(given.build, given.clicks), given.port)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -46,17 +44,15 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def _inputs(build: Path) -> stage.Inputs:
+def _session(build: Path, clicks: Path) -> serving.ClickSession:
     """Find frames and template of a build. Raises ART-001 if they are not finished."""
     artifact.opened(build / "scene_template", "scene_template")
     shown = [video for video in videos.read(build / "plan" / "videos.json") if video.role in ROLES]
     for video in shown:
         artifact.opened(build / "frames" / video.id, f"frames/{video.id}")
-    return stage.Inputs(
-        frames={video.file: build / "frames" / video.id for video in shown},
-        scene_template=build / "scene_template",
-        walkthrough=next(video.file for video in shown if video.role == "walkthrough"),
-    )
+    frames = {video.file: build / "frames" / video.id for video in shown}
+    walkthrough = next(video.file for video in shown if video.role == "walkthrough")
+    return stage.run(frames, build / "scene_template", walkthrough, clicks)
 
 
 if __name__ == "__main__":

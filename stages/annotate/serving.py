@@ -89,8 +89,12 @@ class ClickServer(ThreadingHTTPServer):
     """Server of one session of clicking; bound, but not yet running."""
 
     def __init__(self, desk: ClickSession, port: int) -> None:
-        """Bind to a local port; 0 takes any free one."""
-        super().__init__((loopback.HOST, port), Handler)
+        """Bind to a local port; 0 takes any free one. Raises InputError SYS-002 for a port in use."""
+        try:
+            super().__init__((loopback.HOST, port), Handler)
+        except OSError as error:
+            what = f"port {port}: {error.strerror}"
+            raise InputError("SYS-002", what, loopback.HOST, "give another with --port") from error
         self.desk = desk
         self.keeping = threading.Lock()  # each request has its own thread, and all write one file
 
@@ -155,15 +159,3 @@ class Handler(BaseHTTPRequestHandler):
         self.send_header("Cache-Control", "no-store")
         self.end_headers()
         self.wfile.write(body)
-
-
-def server(desk: ClickSession, port: int) -> ClickServer:
-    """Return a server that is bound but not yet running; port 0 takes any free one.
-
-    Raises InputError SYS-002 for a port in use.
-    """
-    try:
-        return ClickServer(desk, port)
-    except OSError as error:
-        what = f"port {port}: {error.strerror}"
-        raise InputError("SYS-002", what, loopback.HOST, "give another with --port") from error

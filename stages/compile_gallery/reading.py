@@ -21,6 +21,7 @@ METRICS = (
 )
 """Keys of `metrics.json` that are easy to interpret."""
 _CHECKS = ("sessions to replay", "size of the page")
+"""Names of the simulator's own checks that are shown."""
 _QUALITY = 82
 _THUMBNAIL_PX = 480
 """Longer side; twice the width of a card."""
@@ -55,8 +56,8 @@ class Card:
     status: qa.Status | Literal["none"]
     """worst of its artifacts' checks and of the report's thresholds; "none" without any check"""
     figures: tuple[Figure, ...]
-    page: Link
     links: tuple[Link, ...]
+    """the first one to its simulator"""
 
 
 def card(folder: Path, root: Path) -> Card:
@@ -67,34 +68,21 @@ def card(folder: Path, root: Path) -> Card:
     file = folder / "evaluation/metrics.json"
     metrics = json.loads(file.read_bytes()) if file.is_file() else {}
     pictures = [folder / name for name in PICTURES if (folder / name).is_file()]
+    pages = [("walk with it", folder / "simulator/index.html"), ("report", folder / "report/index.html")]
     homes = sorted(folder.glob("homes/*/simulator/index.html"))
-    pages = [("report", folder / "report/index.html")]
     pages += [(f"in the home of {home.parents[1].name}", home) for home in homes]
-
-    def link(words: str, page: Path) -> Link:
-        return Link(words, page.relative_to(root).as_posix())
-
+    checks = json.loads((folder / "simulator/qa.json").read_bytes())["checks"]
+    figures = [Figure(one["name"], one["value"], one["unit"]) for one in checks if one["name"] in _CHECKS]
+    measured = [(words.describe(key), value) for key in METRICS if (value := metrics.get(key)) is not None]
+    figures += [Figure(found.text, value, found.unit) for found, value in measured]
     return Card(
         name=str(contract["name"]),
         folder=folder.relative_to(root).as_posix(),
         thumbnail=_thumbnail(pictures[0]) if pictures else None,
         status=qa.worst([*states, bars.worst(bars.judge(metrics, {}))]) if states else "none",
-        figures=(*_checked(folder), *_measured(metrics)),
-        page=link("walk with it", folder / "simulator/index.html"),
-        links=tuple(link(words, page) for words, page in pages if page.is_file()),
+        figures=tuple(figures),
+        links=tuple(Link(to, page.relative_to(root).as_posix()) for to, page in pages if page.is_file()),
     )
-
-
-def _checked(folder: Path) -> list[Figure]:
-    """Return figures from the simulator's own checks."""
-    checks = json.loads((folder / "simulator/qa.json").read_bytes())["checks"]
-    return [Figure(each["name"], each["value"], each["unit"]) for each in checks if each["name"] in _CHECKS]
-
-
-def _measured(metrics: dict[str, float | None]) -> list[Figure]:
-    """Return figures that the evaluation measured."""
-    known = [(words.describe(key), value) for key in METRICS if (value := metrics.get(key)) is not None]
-    return [Figure(found.text, value, found.unit) for found, value in known]
 
 
 def _thumbnail(file: Path) -> str:

@@ -36,7 +36,7 @@ class SessionOutcome:
         return f"{self.file or self.video}: {self.status['reason']}{view}"
 
 
-def summarise(outcomes: list[SessionOutcome]) -> dict:
+def summarize(outcomes: list[SessionOutcome]) -> dict:
     """Return the content of ``summary.json``."""
     return {
         "registered": sum(outcome.poses is not None for outcome in outcomes),

@@ -31,7 +31,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
         status = json.loads((folder / "status.json").read_text())
         poses = RegisteredPoses.open(folder) if status["registered"] else None
         outcomes.append(gather.SessionOutcome(video, status, poses, names.get(video, "")))
-    summary = gather.summarise(outcomes)
+    summary = gather.summarize(outcomes)
     rejected = [outcome.description for outcome in outcomes if outcome.poses is None]
     if summary["registered"] < config.min_registered:
         raise InputError(

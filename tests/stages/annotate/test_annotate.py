@@ -16,8 +16,7 @@ from pipeline.data import clicks
 from pipeline.data.poses import RegisteredPoses
 from pipeline.geometry import rigid
 from stages.annotate import __main__ as front
-from stages.annotate import frame_choice, serving, stage
-from stages.annotate.config import Config
+from stages.annotate import serving, stage
 from stages.evaluate import clicked, real_phone
 from stages.evaluate.reading import BuildFolders
 from tests.stages.annotate import clicked_room
@@ -32,7 +31,7 @@ def room(tmp_path_factory):
 
 @contextmanager
 def running(room, path):
-    server = serving.server(stage.run(front._inputs(room.build), Config(), path), 0)
+    server = serving.ClickServer(front._session(room.build, path), 0)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
     thread.start()
     try:
@@ -223,7 +222,7 @@ def test_invalid_click_files_are_refused(tmp_path):
 
 
 def test_sharpest_frame_of_each_segment_is_shown():
-    assert frame_choice.sharpest_per_stretch(np.array([0, 3, 1, 5, 4, 2.0]), 2) == [1, 3]
-    assert frame_choice.sharpest_per_stretch(
+    assert stage.sharpest_per_stretch(np.array([0, 3, 1, 5, 4, 2.0]), 2) == [1, 3]
+    assert stage.sharpest_per_stretch(
         np.array([0, 3, 1, 5, 4, 2.0]), 2, np.array([1, 0, 1, 0, 0, 0], bool)
     ) == [2]

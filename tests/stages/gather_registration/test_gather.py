@@ -27,7 +27,7 @@ def _poses() -> RegisteredPoses:
 def test_summary_has_counts_and_checks():
     poses = _poses()
     outcomes = [gather.SessionOutcome("v002", STATUS, poses), gather.SessionOutcome("v003", REFUSED, None)]
-    summary = gather.summarise(outcomes)
+    summary = gather.summarize(outcomes)
     assert (summary["registered"], summary["total"]) == (1, 2)
     assert summary["videos"]["v003"]["reason"] == "no overlap"
     assert {check.name: check.value for check in gather.checks(outcomes)}["recordings registered"] == 0.5
@@ -56,7 +56,7 @@ def test_rejection_is_reported_with_its_nearest_view():
         "v003", {**REFUSED, "nearest_view": {"walkthrough_s": 12.34}}, None, "b.r3d"
     )
     assert refused.description == "b.r3d: no overlap; its nearest view is the walk-through at 12.3 s"
-    assert gather.summarise([refused])["videos"]["v003"]["file"] == "b.r3d"
+    assert gather.summarize([refused])["videos"]["v003"]["file"] == "b.r3d"
 
 
 def test_stage_copies_poses_and_fails_if_too_few_are_registered(tmp_path):
