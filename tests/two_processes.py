@@ -13,7 +13,8 @@ import pytest
 import torch
 
 from pipeline.core import distributed
-from pipeline.core.training import FitRecord, Loss, generator_for
+from pipeline.core.distributed import NamedLoss
+from pipeline.core.training import FitRecord, generator_for
 
 TORCHRUN = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT", "TORCHELASTIC_RUN_ID")
 
@@ -44,14 +45,13 @@ def started(module: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
 def fit_both(fit: Callable[..., FitRecord]) -> Callable[..., FitRecord]:
     """Return a `training.fit` for one process that averages the losses of the batches of both."""
 
-    def fit_mean(*, loss: Loss, seed: int, **rest: Any) -> FitRecord:
+    def fit_mean(*, loss: NamedLoss, seed: int, **rest: Any) -> FitRecord:
         def mean_loss(step: int, _: torch.Generator) -> dict[str, torch.Tensor]:
             parts = []
             for rank in range(2):
                 generator = generator_for(seed, step, rank)
                 torch.manual_seed(generator.initial_seed())
-                terms = loss(step, generator)
-                parts.append({"loss": terms} if isinstance(terms, torch.Tensor) else terms)
+                parts.append(loss(step, generator))
             names = dict.fromkeys([*parts[0], *parts[1]])
             return {name: sum(part.get(name, torch.zeros(())) for part in parts) / 2 for name in names}
 

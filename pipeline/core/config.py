@@ -13,9 +13,12 @@ import types
 import typing
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pipeline.core.errors import InputError
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 LARGEST_INTEGER = (1 << 63) - 1
 """64 bits, as TOML guarantees; larger ones may not fit a float either."""
@@ -25,13 +28,7 @@ _SHORT.maxtuple = _SHORT.maxlist = _SHORT.maxdict = 20
 """Limits of a value in a message: files may hold numbers of thousands of digits and deeply nested tables."""
 
 
-class Dataclass(Protocol):
-    """Protocol of dataclass instances."""
-
-    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
-
-
-C = TypeVar("C", bound=Dataclass)
+C = TypeVar("C", bound="DataclassInstance")
 
 
 def read_table(path: Path) -> dict[str, Any]:

@@ -29,8 +29,6 @@ CHECKPOINTS_KEPT = 3
 MAX_BROKEN_STEPS = 3
 EXIT_SAVED = 75
 EXIT_DIVERGED = 76
-Loss = Callable[[int, torch.Generator], Float[Tensor, ""] | Mapping[str, Float[Tensor, ""]]]
-"""maps a step and its random generator to weighted terms by name, or to their sum"""
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ def fit(
     *,
     modules: Mapping[str, torch.nn.Module],
     optimizer: torch.optim.Optimizer,
-    loss: Loss,
+    loss: NamedLoss,
     steps: int,
     seed: int,
     resume: Path | None = None,
@@ -66,8 +64,8 @@ def fit(
     """Minimize ``loss(step, generator)`` for ``steps`` steps, from the newest checkpoint in ``resume`` if
     there is one.
 
-    ``modules`` hold all state to checkpoint (including averaged weights). The loss returns a scalar or named,
-    weighted, scalar terms. ``schedule`` maps progress 0..1 to a factor on each group's learning rate.
+    ``modules`` hold all state to checkpoint (including averaged weights). ``schedule`` maps progress 0..1 to
+    a factor on each group's learning rate.
     Steps whose loss or gradient is not finite are skipped; three in a row roll back to the last checkpoint at
     half the rate, and a second rollback ends the run (exit 76, ``diagnosis.json`` in ``resume``).
     ``asked_to_stop`` replaces the signal handlers: several fits in threads share one `termination`.
@@ -77,11 +75,10 @@ def fit(
     shared = shared and distributed.size() > 1
     loop = _Loop(dict(modules), optimizer, resume, shared)
     loop.restore()
-    terms_of = _named(loss)
-    terms_of = distributed.shared(modules, terms_of) if shared else terms_of
+    loss = distributed.shared(modules, loss) if shared else loss
     with contextlib.nullcontext(asked_to_stop) if asked_to_stop else termination() as asked_to_stop:
         for _ in progress.track(loop.until(steps), label, total=steps - loop.step):
-            if not loop.advance(terms_of, steps, seed, schedule, clip_norm):
+            if not loop.advance(loss, steps, seed, schedule, clip_norm):
                 continue
             if after_step:
                 after_step(loop.step - 1)
@@ -257,16 +254,6 @@ class _Loop:
 
 def _checkpoints(folder: Path) -> list[Path]:
     return sorted(folder.glob("step*.pt"), reverse=True)
-
-
-def _named(loss: Loss) -> NamedLoss:
-    """Return the loss as named terms."""
-
-    def terms(step: int, generator: torch.Generator) -> Mapping[str, Tensor]:
-        value = loss(step, generator)
-        return {"loss": value} if isinstance(value, Tensor) else value
-
-    return terms
 
 
 @contextlib.contextmanager

@@ -44,12 +44,6 @@ MASKS = FileSchema.of("masks/masks.npz", "visible [frame] bool", "confidence [fr
 PEOPLE = FileSchema.of(
     "masks/people.npz", "timestamp_s [frame] f8", "feet_camera [frame person 3] f4", "height_m [person] f4"
 )
-CLIP_KEYS = (
-    "timestamp_s", "intrinsics", "depth_intrinsics", "odometry_from_camera",
-    "gravity_known", "scale", "quality",
-)  # fmt: skip
-"""what `Clip` holds of `frames.npz`"""
-
 MIN_CONFIDENCE = 1
 """minimum confidence of usable depth: 0 is what phones report as low"""
 STEP_SHARE = 0.25
@@ -84,7 +78,8 @@ class Clip:
     @classmethod
     def open(cls, folder: Path) -> "Clip":
         """Open a finished ``frames/<id>`` artifact."""
-        table: dict = FRAMES.load(folder / "frames.npz", *CLIP_KEYS)
+        stored = [key for key in FRAMES.arrays if key in cls.__dataclass_fields__]
+        table: dict = FRAMES.load(folder / "frames.npz", *stored)
         table["odometry_from_camera"] = table.get("odometry_from_camera")
         table["gravity_known"] = bool(table["gravity_known"])
         table["scale"] = str(table.get("scale", "measured"))

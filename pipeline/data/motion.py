@@ -26,6 +26,13 @@ MOTION = FileSchema.of(
     "agent_visible [frame] bool",
 )
 TRACKS = FileSchema.of("reconstruction/tracks.npz", "vertex_index [point] i8", "rest_agent [point 3] f4")
+FEATURE_VOLUME = FileSchema.of(
+    "reconstruction/feature_volume.npz",
+    "features [channel x y z] f2",
+    "occupancy [x y z] u1",
+    "origin [3] f8",
+    "voxel_m [] f8",
+)
 DOUBTFUL = 0.1
 """frames with lower confidence are not used"""
 INTERPOLATED = 0.05

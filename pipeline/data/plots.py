@@ -90,21 +90,18 @@ def histograms(
 
 
 def time_series(
-    values: Mapping[str, Num[np.ndarray, "frame"]],
+    label: str,
+    values: Num[np.ndarray, "frame"],
     time_s: Num[np.ndarray, "frame"],
-    *,
-    absent: Bool[np.ndarray, "frame"] | None = None,
+    absent: Bool[np.ndarray, "frame"],
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw a panel of values over seconds per label; ``absent`` frames are red."""
-    figure, axes = panels(len(values), 1, width_in=9.0, height_in=1.6 * len(values))
-    for axis, (label, curve) in zip(axes[:, 0], values.items(), strict=True):
-        axis.fill_between(time_s, curve, color=GREEN, step="mid", linewidth=0)
-        if absent is not None:
-            frame = axis.get_xaxis_transform()
-            axis.fill_between(time_s, 0, 1, where=absent, color=RED, alpha=0.3, step="mid", transform=frame)
-        axis.set(ylabel=label, ylim=(0, None))
-        axis.margins(x=0)
-    axes[-1, 0].set_xlabel("time [s]")
+    """Draw values over seconds; ``absent`` frames are red."""
+    figure, ((axis,),) = panels(1, 1, width_in=9.0, height_in=1.6)
+    axis.fill_between(time_s, values, color=GREEN, step="mid", linewidth=0)
+    frame = axis.get_xaxis_transform()
+    axis.fill_between(time_s, 0, 1, where=absent, color=RED, alpha=0.3, step="mid", transform=frame)
+    axis.set(xlabel="time [s]", ylabel=label, ylim=(0, None))
+    axis.margins(x=0)
     return pixels(figure)
 
 

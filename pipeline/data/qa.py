@@ -38,9 +38,10 @@ class Check:
         """Compare the value with its thresholds; one that was not measured (None, NaN) warns."""
         if self.value is None or not math.isfinite(self.value):
             return "warn"
-        if _beyond(self.value, self.fail, self.better):
+        sign = 1 if self.better == "lower" else -1
+        if self.fail is not None and sign * self.value > sign * self.fail:
             return "fail"
-        return "warn" if _beyond(self.value, self.warn, self.better) else "ok"
+        return "warn" if self.warn is not None and sign * self.value > sign * self.warn else "ok"
 
 
 @dataclass(frozen=True)
@@ -88,12 +89,6 @@ def failures(folder: Path) -> list[str]:
 def worst(statuses: Sequence[Status]) -> Status:
     """Return the most severe of several statuses; ok if there are none."""
     return max(("ok", *statuses), key=("ok", "warn", "fail").index)
-
-
-def _beyond(value: float, limit: float | None, better: Literal["lower", "higher"]) -> bool:
-    if limit is None:
-        return False
-    return value > limit if better == "lower" else value < limit
 
 
 def _plain(check: Check) -> dict[str, Any]:

@@ -11,9 +11,8 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from pipeline.data import motion, ply
-from pipeline.data.motion import INTERPOLATED, TRACKS, Motion, gaps_s
+from pipeline.data.motion import FEATURE_VOLUME, INTERPOLATED, TRACKS, Motion, gaps_s
 from pipeline.data.templates import SkinTable
-from pipeline.data.volumes import FEATURE_VOLUME
 from pipeline.fields import fields, marching_cubes
 from pipeline.fields.fields import Reconstruction
 from pipeline.geometry import cameras, rigid

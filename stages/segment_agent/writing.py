@@ -118,7 +118,7 @@ def report_quality(
     if found.unknown_animals is not None:
         checks.append(Check("frames with a stranger", 100 * found.unknown_animals, "%", warn=5))
     area, visible = np.array(summary.area), np.array(summary.visible)
-    over_time = plots.time_series({"share": area}, clip.timestamp_s, absent=~visible)
+    over_time = plots.time_series("share", area, clip.timestamp_s, ~visible)
     size = (round(WIDTH_PX * clip.color_size[0] / clip.color_size[1]), WIDTH_PX)
     tiles = [plots.resized(overlay(clip.color(frame), mask), size) for frame, mask in summary.shown.items()]
     qa.write(

@@ -120,7 +120,7 @@ try:
         match sys.argv[2]:
             case "checkpoint":
                 training.fit(modules={"m": module}, optimizer=torch.optim.SGD(module.parameters(), 0.1),
-                             loss=lambda step, generator: module["a"].square().sum(), steps=2, seed=0, resume=folder)
+                             loss=lambda step, generator: {"a": module["a"].square().sum()}, steps=2, seed=0, resume=folder)
             case "tensors":
                 save_file(dict(module.state_dict()), folder / "a.safetensors")
 except InputError as error:

@@ -68,6 +68,6 @@ def test_charts_have_the_requested_size_and_curves():
     )
     assert green and orange
     absent = np.arange(50) < 25
-    shown = plots.time_series({"area": np.ones(50) * ~absent}, np.arange(50) / 10, absent=absent).astype(int)
+    shown = plots.time_series("area", np.ones(50) * ~absent, np.arange(50) / 10, absent).astype(int)
     red = (shown[..., 0] > shown[..., 2] + 20).mean(0)
     assert red[: len(red) // 2].max() > 0.5 > 0.1 > red[-len(red) // 3 :].max()
