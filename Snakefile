@@ -9,6 +9,7 @@
 import gc
 import shlex
 import sys
+from functools import partial
 
 sys.path.insert(0, workflow.basedir)
 from pipeline.workflow import dag, engine
@@ -40,13 +41,13 @@ rule all:
 for node in dag.FLOW:
     rule:
         name: node.artifact
-        input: engine.inputs(node)
+        input: partial(engine.inputs, node)
         output: engine.output(node)
         benchmark: engine.benchmark(node)
         threads: node.threads
         resources:
-            mem_mb=engine.memory_mb(node),
-            runtime=engine.runtime_min(node),
+            mem_mb=partial(engine.memory_mb, node),
+            runtime=partial(engine.runtime_min, node),
             gpu=GPUS if node.gpu else 0,
             attempt=lambda wildcards, attempt: attempt,
         params:

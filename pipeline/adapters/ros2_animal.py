@@ -27,12 +27,6 @@ FAR_M = 1000.0
 """An observer of whom nothing has been heard stands so far away that nobody perceives it."""
 
 
-def seven(zup_from_body: Float[np.ndarray, "4 4"]) -> tuple[list[float], list[float]]:
-    """Return position and quaternion in ROS's order, x y z w."""
-    w, x, y, z = rigid.quaternion_from_rotation(zup_from_body[:3, :3]).tolist()
-    return zup_from_body[:3, 3].tolist(), [x, y, z, w]
-
-
 class AnimalNode:
     """Owns a ROS 2 node; the messages' module is given, so that it is known without ROS too."""
 
@@ -65,9 +59,10 @@ class AnimalNode:
         self.bones.publish(bones)
 
     def _pose(self, zup_from_body: Float[np.ndarray, "4 4"]) -> Any:
-        position, (x, y, z, w) = seven(zup_from_body)
-        place = self.messages.Point(x=position[0], y=position[1], z=position[2])
-        return self.messages.Pose(position=place, orientation=self.messages.Quaternion(x=x, y=y, z=z, w=w))
+        place = self.messages.Point(**dict(zip("xyz", zup_from_body[:3, 3].tolist(), strict=True)))
+        turn = rigid.quaternion_from_rotation(zup_from_body[:3, :3]).tolist()
+        turn = self.messages.Quaternion(**dict(zip("wxyz", turn, strict=True)))
+        return self.messages.Pose(position=place, orientation=turn)
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -85,34 +85,22 @@ def job_pattern(node: dag.Node) -> str:
     return f"{node.artifact}.{{part}}" if node.several else node.artifact
 
 
-def inputs(node: dag.Node) -> Callable[[Any], list[str]]:
-    """Return a function from a rule's wildcards to the stamps that its job depends on."""
-
-    def of(wildcards: Any) -> list[str]:
-        return _job(wildcards.home, _id(node, wildcards))["after"]
-
-    return of
+def inputs(node: dag.Node, wildcards: Any) -> list[str]:
+    """Return the stamps that a node's job depends on."""
+    return _job(wildcards.home, _id(node, wildcards))["after"]
 
 
-def memory_mb(node: dag.Node) -> Callable[..., int]:
-    """Return a function from wildcards and attempt to the memory that the job reserves."""
-
-    def of(wildcards: Any, attempt: int) -> int:
-        frames = _frames(wildcards.home, _id(node, wildcards)) if node.memory_mb_per_1000_frames else 0
-        needed = MEMORY_MB + node.memory_mb_per_1000_frames * frames / 1000
-        return math.ceil(needed * MEMORY_GROWTH ** (attempt - 1))
-
-    return of
+def memory_mb(node: dag.Node, wildcards: Any, attempt: int) -> int:
+    """Return the memory that a node's job reserves."""
+    frames = _frames(wildcards.home, _id(node, wildcards)) if node.memory_mb_per_1000_frames else 0
+    needed = MEMORY_MB + node.memory_mb_per_1000_frames * frames / 1000
+    return math.ceil(needed * MEMORY_GROWTH ** (attempt - 1))
 
 
-def runtime_min(node: dag.Node) -> Callable[..., int]:
-    """Return a function from wildcards and attempt to the time limit of the job, minutes."""
-
-    def of(wildcards: Any, attempt: int) -> int:
-        seconds = RUNTIME_FACTOR * node.seconds_per_frame * _frames(wildcards.home, _id(node, wildcards))
-        return math.ceil((MIN_RUNTIME_MIN + seconds / 60) * attempt)
-
-    return of
+def runtime_min(node: dag.Node, wildcards: Any, attempt: int) -> int:
+    """Return the time limit of a node's job, minutes."""
+    seconds = RUNTIME_FACTOR * node.seconds_per_frame * _frames(wildcards.home, _id(node, wildcards))
+    return math.ceil((MIN_RUNTIME_MIN + seconds / 60) * attempt)
 
 
 def _id(node: dag.Node, wildcards: Any) -> str:

@@ -98,10 +98,6 @@ class Job:
         """Return the stamp file, Make's target."""
         return f"{self.out}/{artifact.STAMP}"
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the job as plain JSON types, with its stamp."""
-        return {**vars(self), "inputs": [vars(each) for each in self.inputs], "stamp": self.stamp}
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -185,7 +181,7 @@ def with_animals(plan: Plan) -> Plan:
     return replace(plan, animals=tuple(map(own, names)), others=tuple(names), tables=tables(names))
 
 
-def jobs(plan: Plan) -> list[Job]:
+def expand(plan: Plan) -> list[Job]:
     """Expand the DAG for the plan's recordings and trials, in flow order."""
 
     def parts(node: Node) -> list[Video | Trial | None]:
@@ -199,7 +195,7 @@ def jobs(plan: Plan) -> list[Job]:
         return [video for video in shown if dag.folder_of(node.artifact, video) == node.artifact]
 
     shared = [_job(plan, node, part) for node in plan.nodes for part in parts(node)]
-    return shared + [job for each in plan.animals for job in jobs(each) if job.home == str(each.home)]
+    return shared + [job for each in plan.animals for job in expand(each) if job.home == str(each.home)]
 
 
 def direct_dependencies(all_jobs: Sequence[Job]) -> dict[str, list[str]]:
@@ -252,11 +248,6 @@ def read_job(home: Home, job_id: str) -> dict[str, Any]:
 def redo_mark(home: str, job_id: str) -> Path:
     """Return the marker file that makes `run` repeat a job although its key is unchanged."""
     return Path("build", home, "plan", "redo", job_id)
-
-
-def lock_file(home: str, job_id: str) -> Path:
-    """Return the lock file of a job, held by the runner."""
-    return Path("build", home, "plan", "locks", job_id)
 
 
 def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:

@@ -22,19 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.core.errors import InputError, exit_code
-from pipeline.workflow import artifact, captures, dag, recipes, sources, stamps
-from pipeline.workflow.jobs import (
-    Home,
-    Job,
-    Plan,
-    deciding_videos,
-    direct_dependencies,
-    jobs,
-    jobs_file,
-    redo_mark,
-    touched_by,
-    with_animals,
-)
+from pipeline.workflow import artifact, captures, dag, jobs, recipes, sources, stamps
+from pipeline.workflow.jobs import Home, Job, Plan, jobs_file
 
 CODE_CACHE = Path("build", "code-cache.json")
 """Cache of the parsed source code, shared by all homes; safe to delete."""
@@ -67,16 +56,16 @@ def read(home: Home, cache: sources.Cache) -> Plan:
     if names and flow == "recordings":
         videos = tuple(replace(video, mapped=captures.is_mapped(folder, video)) for video in videos)
     mapped = any(video.mapped for video in videos)
-    touched = touched_by(tables, changed, mapped) if home.variant else frozenset(dag.NODES)
+    touched = jobs.touched_by(tables, changed, mapped) if home.variant else frozenset(dag.NODES)
     if home.tables:
         touched = frozenset(n.artifact for n in dag.FLOW if n.trials != "none")
     trials = tuple(recipes.trials(recipe.get(recipes.TABLES_STAGE, {}))) if home.tables else ()
-    return with_animals(Plan(home, videos, not names, changed, touched, flow, trials))
+    return jobs.with_animals(Plan(home, videos, not names, changed, touched, flow, trials))
 
 
 def write(plan: Plan, cache: sources.Cache, code: sources.Cache) -> None:
     """Write the plan's files that have changed."""
-    all_jobs = jobs(plan)
+    all_jobs = jobs.expand(plan)
     base = plan.home.base.plan
     ids = _known_ids(plan.home.base) | {video.file: video.id for video in plan.videos}
     _write(base / "ids.json", _json(ids))
@@ -90,10 +79,11 @@ def write(plan: Plan, cache: sources.Cache, code: sources.Cache) -> None:
     for each in (plan, *plan.animals):
         for name, trial in {(job.artifact, job.trial) for job in all_jobs if job.home == str(each.home)}:
             _write_key(each, code, name, trial)
-    after, lines = direct_dependencies(all_jobs), []
+    after, lines = jobs.direct_dependencies(all_jobs), []
     for number, job in enumerate(all_jobs, start=1):
         place = {"place": f"{number} of {len(all_jobs)}", "after": after[job.stamp]}
-        lines.append((job.home, json.dumps(job.as_dict() | place)))
+        plain = {**vars(job), "inputs": [vars(each) for each in job.inputs], "stamp": job.stamp}
+        lines.append((job.home, json.dumps(plain | place)))
     for each in (plan, *plan.animals):
         homes = {home for home, _ in lines} if each is plan else {str(plan.home), str(each.home)}
         own_lines = ",\n".join(line for home, line in lines if home in homes)
@@ -135,7 +125,7 @@ def _write_key(plan: Plan, code: sources.Cache, name: str, trial: str | None) ->
         "table": table,
         "videos": [
             [v.id, v.role, v.split, v.synchronized_with, v.offset_s, *([v.animal] if v.animal else [])]
-            for v in deciding_videos(plan, node)
+            for v in jobs.deciding_videos(plan, node)
         ],
     }
     if plan.home.animal:
@@ -150,7 +140,7 @@ def mark_redo(home: Home, name: str) -> None:
     if not marked:
         raise InputError("REC-007", f"no artifact {name!r}", str(home), f"artifacts: {', '.join(dag.NODES)}")
     for job in marked:
-        artifact.write_if_changed(redo_mark(job["home"], job["id"]), "made again by the next build\n")
+        artifact.write_if_changed(jobs.redo_mark(job["home"], job["id"]), "made again by the next build\n")
         Path(job["stamp"]).unlink(missing_ok=True)
 
 

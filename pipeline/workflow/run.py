@@ -76,7 +76,7 @@ def _run(home: str, job_id: str, engine: Engine) -> int | None:
     resume = Path("build", job["home"], "resume", job_id)
     redo = jobs.redo_mark(job["home"], job_id)
     waiting = f"[{job_id}] is being made by another build; waiting for it"
-    with artifact.locked(jobs.lock_file(job["home"], job_id), waiting):
+    with artifact.locked(Path("build", job["home"], "plan", "locks", job_id), waiting):
         artifact.clean(out, _record(job), _failure(job))
         key = _key(job)
         made = artifact.read_manifest(out)

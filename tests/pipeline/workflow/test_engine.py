@@ -44,7 +44,7 @@ def test_invalid_table_of_homes_is_refused(tmp_path, text):
 def test_resources_grow_with_frames_and_attempts(small_checkout):
     small_checkout.python("pipeline.workflow.plan", "plan", "toy")
     node, home = dag.NODES["reconstruction"], SimpleNamespace(home="toy")
-    unknown = engine.memory_mb(node)(home, 1)
+    unknown = engine.memory_mb(node, home, 1)
     for cached in (engine._frames, engine._frames_in):
         cached.cache_clear()
     for video in ("v000", "v001", "v002", "v003"):
@@ -52,10 +52,10 @@ def test_resources_grow_with_frames_and_attempts(small_checkout):
         color.mkdir(parents=True)
         for frame in range(10):
             (color / f"{frame:06d}.jpg").touch()
-    known = engine.memory_mb(node)(home, 1)
+    known = engine.memory_mb(node, home, 1)
     assert engine.MEMORY_MB < known < unknown
-    assert engine.memory_mb(node)(home, 2) == pytest.approx(engine.MEMORY_GROWTH * known, abs=1)
-    assert engine.runtime_min(node)(home, 2) > 1.9 * engine.runtime_min(node)(home, 1) - 2
+    assert engine.memory_mb(node, home, 2) == pytest.approx(engine.MEMORY_GROWTH * known, abs=1)
+    assert engine.runtime_min(node, home, 2) > 1.9 * engine.runtime_min(node, home, 1) - 2
 
 
 @pytest.mark.slow
