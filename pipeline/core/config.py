@@ -52,7 +52,14 @@ def from_table(config: type[C], table: Mapping[str, Any], *, where: str, base: C
     fields = {field.name: field for field in dataclasses.fields(config)}
     refuse_unknown(table, fields, where=where)
     hints = typing.get_type_hints(config)
-    values = {name: _default_of(fields[name]) if base is None else getattr(base, name) for name in fields}
+    values = (
+        vars(base).copy()
+        if base is not None
+        else {
+            name: field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+            for name, field in fields.items()
+        }
+    )
     for key, value in table.items():
         checked = _checked(hints[key], value, f"{where}: {key}", values[key])
         refuse_impossible(value, values[key], where=f"{where}: {key}")
@@ -61,11 +68,6 @@ def from_table(config: type[C], table: Mapping[str, Any], *, where: str, base: C
         if value is dataclasses.MISSING:
             raise InputError("REC-002", f"{key!r} is missing", where, f"give a value of type {hints[key]}")
     return config(**values)
-
-
-def _default_of(field: dataclasses.Field) -> Any:
-    factory = field.default_factory
-    return field.default if factory is dataclasses.MISSING else factory()
 
 
 def refuse_unknown(

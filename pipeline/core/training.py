@@ -82,7 +82,8 @@ def fit(
                 continue
             if after_step:
                 after_step(loop.step - 1)
-            stop = loop.in_any_process(asked_to_stop())
+            stop = asked_to_stop()
+            stop = bool(distributed.total(torch.tensor(float(stop)))) if shared else stop
             if resume and (loop.step % save_every == 0 or stop):
                 loop.save()
             if stop:
@@ -163,10 +164,6 @@ class _Loop:
         values = torch.stack([value.detach().float() for value in terms.values()])
         values = distributed.total(values) / distributed.size() if self.shared else values
         return dict(zip(terms, values.tolist(), strict=True))
-
-    def in_any_process(self, here: bool) -> bool:
-        """Return whether ``here`` is true in any process."""
-        return bool(distributed.total(torch.tensor(float(here)))) if self.shared else here
 
     def _roll_back(self, values: Mapping[str, float], norm: float) -> None:
         diagnosis = {

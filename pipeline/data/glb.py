@@ -106,7 +106,9 @@ class _Document:
             NORMAL=self.add(_unit_normals(mesh), "VEC3", _FLOAT, target=target),
         )
         if mesh.color is not None:
-            attributes.COLOR_0 = self.add(_linear_rgba(mesh.color), "VEC4", _FLOAT, target=target)
+            linear = images.linear_from_srgb(mesh.color.astype(np.float32) / 255).astype(np.float32)
+            rgba = np.pad(linear, ((0, 0), (0, 1)), constant_values=1)
+            attributes.COLOR_0 = self.add(rgba, "VEC4", _FLOAT, target=target)
         if skin is not None:
             attributes.JOINTS_0 = self.add(skin.joints, "VEC4", _U8, target=target)
             attributes.WEIGHTS_0 = self.add(skin.weights, "VEC4", _FLOAT, target=target)
@@ -159,13 +161,6 @@ def _unit_normals(mesh: Mesh) -> Float32[np.ndarray, "vertex 3"]:
     normals = mesh.vertex_normals().astype(np.float64)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.where(length < 1e-6, [0.0, 1.0, 0.0], normals / np.maximum(length, 1e-6)).astype(np.float32)
-
-
-def _linear_rgba(color: UInt8[np.ndarray, "vertex 3"]) -> Float32[np.ndarray, "vertex 4"]:
-    """Convert sRGB to linear RGBA, as in glTF's vertex colors."""
-    srgb = color.astype(np.float32) / 255
-    linear = images.linear_from_srgb(srgb)
-    return np.concatenate([linear, np.ones_like(linear[:, :1])], 1).astype(np.float32)
 
 
 def read_static(data: bytes) -> Mesh:

@@ -69,13 +69,12 @@ class Rows:
         return self
 
     def __exit__(self, failed: type | None, *_: object) -> None:
-        if not failed:
-            self._finish()
-        for part in self._parts.values():
-            part.close()
-
-    def _finish(self) -> None:
-        with zipfile.ZipFile(self._path, "w") as archive:
+        with contextlib.ExitStack() as parts:
+            for part in self._parts.values():
+                parts.enter_context(part)
+            if failed:
+                return
+            archive = parts.enter_context(zipfile.ZipFile(self._path, "w"))
             for name, (shape, dtype) in self._kinds.items():
                 part = self._parts[name]
                 assert part.tell() == int(np.prod(shape)) * dtype.itemsize, (name, part.tell(), shape)

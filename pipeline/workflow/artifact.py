@@ -115,7 +115,12 @@ def create(
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
-    _replace(temporary, out)
+    old = out.with_name(f".{out.name}.old.{os.getpid()}")
+    if out.exists():  # a reader sees the old artifact, none, or the new one, never a mixture
+        out.rename(old)
+    temporary.rename(out)
+    _sync_folder(out.parent)
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -195,16 +200,6 @@ def write_if_changed(path: Path, text: str, *, sync: bool = True) -> bool:
             os.fsync(file.fileno())
     temporary.replace(path)
     return True
-
-
-def _replace(temporary: Path, out: Path) -> None:
-    """Rename `temporary` to `out`; a reader sees the old artifact, none, or the new one, never a mixture."""
-    old = out.with_name(f".{out.name}.old.{os.getpid()}")
-    if out.exists():
-        out.rename(old)
-    temporary.rename(out)
-    _sync_folder(out.parent)
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def sync_disk(path: Path) -> None:

@@ -67,7 +67,8 @@ class Task:
             return None
         if not field.several:
             return self.input(field.name)
-        folder, needs = self.paths[field.name], dag.needs_of_stage(self.stage)
+        folder, nodes = self.paths[field.name], [node for node in dag.FLOW if node.stage == self.stage]
+        needs = [need for node in nodes for need in dag.needs_of(node)]
         named = [need for need in needs if field.name == (need.option or need.artifact)]
         if field.name == "variants":
             need = next(need for need in needs if need.variants)

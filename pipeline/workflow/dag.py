@@ -246,8 +246,3 @@ def needs_of(node: Node, flow: Flow | None = None) -> tuple[Need, ...]:
     """Return the node's inputs in declared order, only those of ``flow`` if given."""
     needs = tuple(Need(need) if isinstance(need, str) else need for need in node.needs)
     return tuple(need for need in needs if flow is None or need.flow in (None, flow))
-
-
-def needs_of_stage(stage: str) -> list[Need]:
-    """Return the inputs of all nodes of one program."""
-    return [need for node in FLOW if node.stage == stage for need in needs_of(node)]

@@ -84,7 +84,8 @@ def _run(home: str, job_id: str, engine: Engine) -> int | None:
             if engine.attempt > 1 and (code := _failed_before(job, key)):
                 _say(job_id, f"not tried again: it ended with exit code {code}, and nothing has changed")
                 return code
-            if redo.exists() or _other_key(resume, key):
+            mark = resume / "key"  # checkpoints of another key must never be resumed
+            if redo.exists() or not mark.is_file() or mark.read_text() != key:
                 shutil.rmtree(resume, ignore_errors=True)
             code = _do(job, key, resume, engine)
             if code:
@@ -93,19 +94,15 @@ def _run(home: str, job_id: str, engine: Engine) -> int | None:
         _failure(job).unlink(missing_ok=True)
         redo.unlink(missing_ok=True)
         stamps.put(stamp, job["keys"])
-        if _key_now(home, job_id) != key:  # after the stamp: a planner reads stamps after keys
+        try:  # after the stamp: a planner reads stamps after keys
+            now = _key(jobs.read_job(jobs.Home.parse(home), job_id))
+        except (InputError, FileNotFoundError):  # plan or inputs have become invalid
+            now = None
+        if now != key:
             stamp.unlink(missing_ok=True)
             return None
         shutil.rmtree(resume, ignore_errors=True)
     return 0
-
-
-def _key_now(home: str, job_id: str) -> str | None:
-    """Return the key of a job by its current plan and inputs; None if they are invalid."""
-    try:
-        return _key(jobs.read_job(jobs.Home.parse(home), job_id))
-    except (InputError, FileNotFoundError):
-        return None
 
 
 def _record(job: dict[str, Any]) -> Path:
@@ -136,14 +133,6 @@ def _key(job: dict[str, Any]) -> str:
             chosen = {name: digest for name, digest in files if f"{name}/".startswith(f"{part}/")}
             contents[entry["name"]] = artifact.digest_of(chosen)
     return artifact.digest_of([contents, [json.loads(Path(path).read_text()) for path in job["keys"]]])
-
-
-def _other_key(resume: Path, key: str) -> bool:
-    """Return whether checkpoints, if any, belong to another key; those must never be resumed."""
-    try:
-        return (resume / "key").read_text() != key
-    except FileNotFoundError:
-        return True
 
 
 def _do(job: dict[str, Any], key: str, resume: Path, engine: Engine) -> int:

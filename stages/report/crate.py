@@ -31,7 +31,10 @@ def describe(
     times: bool = True,
 ) -> Entity:
     """Return the content of `ro-crate-metadata.json`; `safe` leaves out names of files."""
-    recordings = [_recording(video, safe) for video in videos]
+    recordings = []
+    for video in videos:
+        named, planned = video.id if safe else video.file, {key: getattr(video, key) for key in PLANNED}
+        recordings.append(_entity(f"#recording/{video.id}", "CreativeWork", named, planned))
     artifacts = list(_artifacts(folders, times))
     root = {
         "@id": "./",
@@ -52,11 +55,6 @@ def describe(
     }
     graph = [about, root, *recordings, *artifacts]
     return {"@context": "https://w3id.org/ro/crate/1.1/context", "@graph": graph}
-
-
-def _recording(video: Video, safe: bool) -> Entity:
-    planned = {key: getattr(video, key) for key in PLANNED}
-    return _entity(f"#recording/{video.id}", "CreativeWork", video.id if safe else video.file, planned)
 
 
 def _artifacts(folders: Mapping[str, Mapping[str | None, Path]], times: bool) -> Iterator[Entity]:

@@ -1,5 +1,7 @@
 """The methods section of a build, with BibTeX entries, from the settings in its manifests."""
 
+import math
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
@@ -59,15 +61,9 @@ def bibliography(folders: Folders) -> str:
 
 
 def _used(folders: Folders) -> Iterator[tuple[Method, Mapping[str, Any]]]:
+    """Yield the methods that apply, with their settings; those missing in older artifacts are NaN."""
     for method in METHODS:
         made = map(read_manifest, folders.get(method.artifact, {}).values())
         manifest = next(filter(None, made), None)
         if manifest is not None and method.holds(manifest["config"]):
-            yield method, _Settings(manifest["config"])
-
-
-class _Settings(dict[str, Any]):
-    """Settings for formatting a sentence; those missing in older artifacts are allowed."""
-
-    def __missing__(self, key: str) -> float:
-        return float("nan")
+            yield method, defaultdict(lambda: math.nan, manifest["config"])
