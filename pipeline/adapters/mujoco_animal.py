@@ -20,9 +20,7 @@ class MujocoAnimal:
     """Moves the mocap bodies of one animal in a MuJoCo simulation, which it lets pass."""
 
     def __init__(self, model: Any, data: Any, animal: LiveAnimal, *, observer: str, prefix: str = ""):
-        """Take over the bones ``<prefix>bone_00`` and on of an `MjModel`; the animal perceives the body
-        ``observer``.
-        """
+        """Take over the bones ``<prefix>bone_00``... of an `MjModel`; the animal perceives ``observer``."""
         self.model, self.data, self.animal = model, data, animal
         self.observer = model.body(observer).id
         count = len(animal.pose.agent_from_bone)

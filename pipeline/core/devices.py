@@ -12,10 +12,7 @@ Device = Literal["cpu", "cuda"]
 
 
 def choose(requested: Literal["auto", "cpu", "cuda"] | str) -> Device:
-    """Return the device to compute on; `auto` chooses CUDA if torch can use it.
-
-    Raises `InputError` DEP-002 if CUDA is requested but unavailable.
-    """
+    """Return the device to compute on; `auto`: CUDA if torch can use it. Raises DEP-002 without CUDA."""
     if requested == "cpu":
         return "cpu"
     if "torch" in sys.modules or _built_with_cuda():

@@ -22,10 +22,7 @@ MAKE_AGAIN = "build it again with this version: make <agent>.<artifact>.redo"
 
 
 class InputError(Exception):
-    """A user's input is wrong: says what, where, and one thing to do about it.
-
-    `code` is stable (`CAP-003`), so that it can be searched for and tested.
-    """
+    """A user's input is wrong: says what, where, and one thing to do; `code` is stable (`CAP-003`)."""
 
     def __init__(self, code: str, what: str, where: str = "", remedy: str = "") -> None:
         super().__init__(code, what, where, remedy)
@@ -77,10 +74,7 @@ def exit_code(program: Callable[[], int], where: str = "build") -> int:
 
 @contextlib.contextmanager
 def other_versions_refused(what: str, where: str) -> Iterator[None]:
-    """Turn any exception from reading a file of another version into an `InputError` ART-007.
-
-    ``what`` is the expected kind of file (`behavior model`), ``where`` its path.
-    """
+    """Turn any exception from reading a `what` (`behavior model`) of another version into ART-007."""
     try:
         yield
     except (InputError, PermissionError):

@@ -6,7 +6,6 @@ builds.
 """
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipeline.core.config import from_table
 from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip, read_source_index
 from pipeline.geometry import align, cameras, rigid
@@ -46,6 +46,13 @@ class ClickedPair:
 
     seen: ClickedPixel
     reference: ClickedPixel
+
+
+@dataclass(frozen=True)
+class ClickedFile:
+    """The content of a file of clicks."""
+
+    pairs: tuple[ClickedPair, ...]
 
 
 @dataclass(frozen=True)
@@ -129,33 +136,25 @@ def read(path: Path) -> list[ClickedPair]:
     try:
         data = path.read_bytes()
         return parse(json.loads(data) if len(data) <= MAX_BYTES else None)
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError, RecursionError, InputError) as error:
         remedy = "click again with `make annotate`, or remove the file"
         raise InputError("EVA-001", f"not a file of clicks: {error}", str(path), remedy) from error
 
 
 def parse(table: Any) -> list[ClickedPair]:
-    """Validate clicks from a file or a page; raises ValueError."""
-    if not isinstance(table, Mapping) or not isinstance(table.get("pairs"), list):
+    """Validate clicks from a file or a page; raises ValueError or InputError REC-001, REC-002."""
+    if not isinstance(table, Mapping):
         raise ValueError("it holds no list of pairs")
-    return [ClickedPair(_spot(pair, "seen"), _spot(pair, "reference")) for pair in table["pairs"]]
+    pairs = from_table(ClickedFile, table, where="clicks").pairs
+    for spot in (spot for pair in pairs for spot in (pair.seen, pair.reference)):
+        if not all(0 <= share <= 1 for share in spot.pixel):
+            raise ValueError(f"a pixel lies outside of its picture: {spot.pixel}")
+        if not 0 <= spot.source_index < MAX_FRAMES:
+            raise ValueError("a source_index is no number of a recorded frame")
+    return list(pairs)
 
 
 def text(pairs: Sequence[ClickedPair]) -> str:
     """Return the file's content."""
     rows = [json.dumps(asdict(pair), sort_keys=True) for pair in pairs]
     return '{"pairs": [\n' + ",\n".join(rows) + "\n]}\n"
-
-
-def _spot(pair: Any, name: str) -> ClickedPixel:
-    try:
-        entry = pair[name]
-        x, y = (float(share) for share in entry["pixel"])
-        spot = ClickedPixel(str(entry["recording"]), int(entry["source_index"]), (x, y))
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"a pair is not complete ({error!r})") from error
-    if not all(math.isfinite(share) and 0 <= share <= 1 for share in spot.pixel):
-        raise ValueError(f"a pixel lies outside of its picture: {spot.pixel}")
-    if not 0 <= spot.source_index < MAX_FRAMES:
-        raise ValueError("a source_index is no number of a recorded frame")
-    return spot

@@ -100,10 +100,7 @@ def write_depth(path: Path, depth: Float[np.ndarray, "height width"]) -> None:
 
 
 def decoded(data: bytes, flags: int) -> Shaped[np.ndarray, "height width *channel"] | None:
-    """Decode with OpenCV; None for unreadable files, including PNG with a wrong checksum.
-
-    PNG and JPEG whose header declares too many pixels are not decoded.
-    """
+    """Decode with OpenCV; None for unreadable files, PNG with wrong checksums and more than `MAX_PIXELS`."""
     try:
         if _declared_pixels(data) > MAX_PIXELS:
             return None

@@ -127,10 +127,7 @@ def load(
 
 
 def open_lazily(path: Path, name: str) -> Shaped[np.ndarray, "..."]:
-    """Memory-map one uncompressed member read-only, so that only what is indexed is read.
-
-    Raises InputError ART-010 for damaged files and missing names.
-    """
+    """Memory-map one uncompressed member, read-only. Raises ART-010 for damaged files and missing names."""
     with _readable(path) as archive:
         info = archive.getinfo(f"{name}.npy")
         if info.compress_type != zipfile.ZIP_STORED:

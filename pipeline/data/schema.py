@@ -58,10 +58,7 @@ class FileSchema:
         npz.save(path, compress=compress, **known)
 
     def load(self, path: Path, *keys: str) -> dict[str, Shaped[np.ndarray, "..."]]:
-        """Read the named arrays (default: all) in the schema's dtypes.
-
-        Raises InputError ART-010 for damaged files, missing keys, and arrays of other axes or kinds.
-        """
+        """Read arrays (default: all) in the schema's dtypes. Raises ART-010 if they are not as declared."""
         wanted = keys or tuple(self.arrays)
         required = tuple(key for key in wanted if not self.arrays[key].optional)
         stored = npz.load(path, required, optional=wanted)

@@ -94,10 +94,7 @@ def require(build: Path, *names: str, remedy: str) -> None:
 def create(
     out: Path, *, stage: str, config: Mapping[str, Any], inputs: Mapping[str, str], key: str | None = None
 ) -> Iterator[Path]:
-    """Yield a folder to fill and publish it as `out` if, and only if, the block ends well.
-
-    Whatever happens, an artifact that stood at `out` before stays until the new one is complete.
-    """
+    """Yield a folder to fill; it replaces the artifact at `out` if, and only if, the block ends well."""
     out.parent.mkdir(parents=True, exist_ok=True)
     temporary = out.with_name(f".{out.name}.tmp.{os.getpid()}")
     shutil.rmtree(temporary, ignore_errors=True)

@@ -96,10 +96,7 @@ class Task:
         raise InputError("ART-004", f"which recording is {id!r}?", self.stage, remedy)
 
     def _per_video(self, need: Need) -> dict[str, Path]:
-        """Return the folder of an artifact for every recording of its need's roles and splits, in id order.
-
-        Roles are by default those of recordings for which the flow makes it.
-        """
+        """Return an artifact's folder by recording, for the need's roles (default: the artifact's own)."""
         if not self.videos:
             remedy = "give --videos build/<agent>/plan/videos.json"
             raise InputError("ART-004", f"which recordings of {need.artifact}?", self.stage, remedy)

@@ -13,10 +13,7 @@ _WORDS = {"ok": "all checks fine", "warn": "checks to look at", "fail": "checks 
 
 
 def run(root: Path) -> str:
-    """Return the page for all builds in `root` (`build/`); variants, and animals of one home, have cards too.
-
-    Raises InputError ART-003 if no simulator is finished.
-    """
+    """Return the page for all builds in `root`, variants and animals of homes too. Raises ART-003 without."""
     folders = [
         folder
         for pattern in ("*", "*/animals/*", "*/variants/*")

@@ -22,10 +22,7 @@ class Inputs:
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] = ()) -> dict:
-    """Copy the poses of registered recordings, write the summary and return it.
-
-    Raises InputError REG-001 when too few are registered.
-    """
+    """Copy poses of registered recordings, write and return the summary. Raises REG-001 for too few."""
     outcomes, names = [], {video.id: video.file for video in videos}
     for video, folder in inputs.video_poses.items():
         status = json.loads((folder / "status.json").read_text())
