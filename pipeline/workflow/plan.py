@@ -188,10 +188,7 @@ def new_agent(name: str, taken: Sequence[str] = ()) -> None:
 
 def _known_ids(base: Home) -> dict[str, str]:
     """Return the ids assigned so far by file name; none if the file is missing or invalid."""
-    try:
-        known = json.loads((base.plan / "ids.json").read_text())
-    except (FileNotFoundError, ValueError):
-        return {}
+    known = artifact.read_json(base.plan / "ids.json")
     ids = list(known.values()) if isinstance(known, dict) else [None]
     sound = all(isinstance(id, str) and re.fullmatch(r"v[0-9]{3,}", id) for id in ids)
     return known if sound and len(set(ids)) == len(ids) else {}
@@ -258,10 +255,7 @@ def _json(value: Any) -> str:
 
 def _load_cache(path: Path) -> dict[str, Any]:
     """Return the cache of earlier runs of the planner; empty if it is missing or invalid."""
-    try:
-        known = json.loads(path.read_text())
-    except (FileNotFoundError, ValueError):
-        return {}
+    known = artifact.read_json(path)
     return known if isinstance(known, dict) else {}
 
 
@@ -296,13 +290,11 @@ def _plan(home: Home, code: sources.Cache) -> None:
     for each in dict.fromkeys((home.base, home, *_animal_homes(home.base))):
         stamps.remove_impossible(each)
     fingerprint, state = _input_fingerprint(home, code), home.plan / "state.json"
-    try:
-        before = json.loads(state.read_text())
-        if before["read"] == fingerprint and before["written"] == _output_fingerprint(home):
-            print(*before["messages"], sep="\n", end="\n" if before["messages"] else "")
-            return
-    except (FileNotFoundError, ValueError, KeyError, TypeError):
-        pass
+    match artifact.read_json(state):
+        case {"read": inputs_before, "written": outputs_before, "messages": list(messages)}:
+            if inputs_before == fingerprint and outputs_before == _output_fingerprint(home):
+                print(*messages, sep="\n", end="\n" if messages else "")
+                return
     code.known = code.known or _load_cache(CODE_CACHE)
     cache = sources.Cache(_load_cache(home.plan / "cache.json"))
     planned = [read(each, cache) for each in dict.fromkeys((home.base, home))]

@@ -115,11 +115,8 @@ def _failure(job: dict[str, Any]) -> Path:
 
 def _failed_before(job: dict[str, Any], key: str) -> int:
     """Return the exit code of the job's last failure if it is deterministic and the key the same, else 0."""
-    try:
-        last = json.loads(_failure(job).read_text())
-    except (FileNotFoundError, ValueError, RecursionError):
-        return 0
-    return last["code"] if last["key"] == key and last["code"] in FINAL_CODES else 0
+    last = artifact.read_json(_failure(job))
+    return last["code"] if last and last["key"] == key and last["code"] in FINAL_CODES else 0
 
 
 def _key(job: dict[str, Any]) -> str:
@@ -288,9 +285,8 @@ def _say(job_id: str, text: str, log: TextIO | None = None) -> None:
 
 def _quality(out: Path) -> str:
     """Return the artifact's own quality verdict for the last line of the log."""
-    try:
-        report = json.loads((out / "qa.json").read_text())
-    except (FileNotFoundError, ValueError):
+    report = artifact.read_json(out / "qa.json")
+    if report is None:
         return ""
     warnings = []
     for check in (check for check in report["checks"] if check["status"] != "ok"):

@@ -7,11 +7,12 @@ make annotate AGENT=luna        or: python -m stages.annotate build/luna --click
 """
 
 import argparse
+import contextlib
 import sys
 from pathlib import Path
 
 from pipeline.core import loopback, videos
-from pipeline.core.errors import InputError
+from pipeline.core.errors import exit_code
 from pipeline.workflow import artifact
 from stages.annotate import serving, stage
 
@@ -30,18 +31,16 @@ def main(arguments: list[str]) -> int:
     )
     parser.add_argument("--port", type=int, default=PORT, help=f"port on 127.0.0.1 (default: {PORT}; 0: any)")
     given = parser.parse_args(arguments)
-    try:
+
+    def program() -> int:
         server = serving.ClickServer(_session(given.build, given.clicks), given.port)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    address = f"http://{loopback.HOST}:{server.server_address[1]}"
-    print(f"open {address} ; clicks go to {given.clicks}; Ctrl-C ends", flush=True)
-    try:
-        server.serve_forever()
-    except KeyboardInterrupt:
-        pass
-    return 0
+        address = f"http://{loopback.HOST}:{server.server_address[1]}"
+        print(f"open {address} ; clicks go to {given.clicks}; Ctrl-C ends", flush=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            server.serve_forever()
+        return 0
+
+    return exit_code(program)
 
 
 def _session(build: Path, clicks: Path) -> serving.ClickSession:

@@ -1,15 +1,66 @@
 """The stage: all finished builds -> one page that links to their simulators and reports."""
 
+import base64
+import io
+import json
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import jinja2
+from PIL import Image
 
 from pipeline.core.errors import InputError
 from pipeline.data import qa
-from pipeline.metrics import words
-from stages.compile_gallery import reading
+from pipeline.metrics import bars, words
 
 _WORDS = {"ok": "all checks fine", "warn": "checks to look at", "fail": "checks failed", "none": "no checks"}
+PICTURES = ("simulator/qa/visits.webp", "simulator/qa/heat_maps.webp", "splats/qa/frames.webp")
+"""Candidate pictures for a build's card, the best first; all of them are in its report."""
+METRICS = (
+    "behavior/ats/goal_minde_m",
+    "reconstruction/agent_root_m_median",
+    "registration/translation_m_median",
+)
+"""Keys of `metrics.json` that are easy to interpret."""
+_CHECKS = ("sessions to replay", "size of the page")
+"""Names of the simulator's own checks that are shown."""
+_QUALITY = 82
+_THUMBNAIL_PX = 480
+"""Longer side; twice the width of a card."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A number with its label."""
+
+    words: str
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Link:
+    """A page beside the gallery."""
+
+    words: str
+    address: str
+    """relative to the gallery"""
+
+
+@dataclass(frozen=True)
+class Card:
+    """One animal."""
+
+    name: str
+    folder: str
+    thumbnail: str | None
+    """WebP as a data address"""
+    status: qa.Status | Literal["none"]
+    """worst of its artifacts' checks and of the report's thresholds; "none" without any check"""
+    figures: tuple[Figure, ...]
+    links: tuple[Link, ...]
+    """the first one to its simulator"""
 
 
 def run(root: Path) -> str:
@@ -22,10 +73,44 @@ def run(root: Path) -> str:
     ]
     if not folders:
         raise InputError("ART-003", "has no finished simulator", str(root), "build one: make cat")
-    cards = [reading.card(folder, root) for folder in sorted(folders)]
+    cards = [card(folder, root) for folder in sorted(folders)]
     loader, undefined = jinja2.PackageLoader("stages.compile_gallery", "."), jinja2.StrictUndefined
     environment = jinja2.Environment(
         loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=undefined
     )
     environment.filters["number"] = words.number
     return environment.get_template("gallery.html").render(cards=cards, marks=qa.MARKS, words=_WORDS)
+
+
+def card(folder: Path, root: Path) -> Card:
+    """Read the build in `folder`, whose simulator is finished, for a gallery in `root`."""
+    contract = json.loads((folder / "simulator/simulator.json").read_bytes())
+    files = [*folder.glob("*/qa.json"), *folder.glob("*/*/qa.json")]
+    states = [check["status"] for file in files for check in json.loads(file.read_bytes())["checks"]]
+    file = folder / "evaluation/metrics.json"
+    metrics = json.loads(file.read_bytes()) if file.is_file() else {}
+    pictures = [folder / name for name in PICTURES if (folder / name).is_file()]
+    pages = [("walk with it", folder / "simulator/index.html"), ("report", folder / "report/index.html")]
+    homes = sorted(folder.glob("homes/*/simulator/index.html"))
+    pages += [(f"in the home of {home.parents[1].name}", home) for home in homes]
+    checks = json.loads((folder / "simulator/qa.json").read_bytes())["checks"]
+    figures = [Figure(one["name"], one["value"], one["unit"]) for one in checks if one["name"] in _CHECKS]
+    measured = [(words.describe(key), value) for key in METRICS if (value := metrics.get(key)) is not None]
+    figures += [Figure(found.text, value, found.unit) for found, value in measured]
+    return Card(
+        name=str(contract["name"]),
+        folder=folder.relative_to(root).as_posix(),
+        thumbnail=_thumbnail(pictures[0]) if pictures else None,
+        status=qa.worst([*states, bars.worst(bars.judge(metrics, {}))]) if states else "none",
+        figures=tuple(figures),
+        links=tuple(Link(to, page.relative_to(root).as_posix()) for to, page in pages if page.is_file()),
+    )
+
+
+def _thumbnail(file: Path) -> str:
+    with Image.open(file) as picture:
+        small = picture.convert("RGB")
+        small.thumbnail((_THUMBNAIL_PX, _THUMBNAIL_PX))
+        buffer = io.BytesIO()
+        small.save(buffer, "WEBP", quality=_QUALITY)
+    return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}"
