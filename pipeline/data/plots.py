@@ -1,8 +1,8 @@
 """Plots and contact sheets for the quality pages of all stages.
 
 Charts: `panels` makes axes, `floor_plan`, `loss_curves`, `histograms` and `time_series` draw on them,
-`pixels` returns the picture; no display, no global state. Pictures: `sample` chooses frames, `resized`,
-`outlined`, `depth_colors` and `labeled` change one, `grid` lays several out.
+`pixels` returns the picture; no display, no global state. Pictures: `resized`, `outlined`,
+`depth_colors` and `labeled` change one, `grid` lays several out.
 """
 
 from collections.abc import Mapping, Sequence

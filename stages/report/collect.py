@@ -5,9 +5,11 @@
 
 import base64
 import json
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +19,11 @@ from jaxtyping import UInt8
 
 from pipeline.core.videos import Video
 from pipeline.data import images
-from stages.report.chapters import Chapter
 
+WORDS: Mapping[str, Any] = tomllib.loads(
+    resources.files("stages.report").joinpath("templates", "words.toml").read_text("utf-8")
+)
+"""The texts of the report: chapters in flow order, methods, remedies for checks."""
 LIGHTS = ("none", "ok", "warn", "fail")
 _PICTURE_BYTES = 10_000_000
 _SMALLEST_PX = 160
@@ -27,6 +32,31 @@ _BLUR_PX = 24
 """size of blocks that become one color"""
 _STRIP = 2.4
 """minimum aspect ratio of a strip"""
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """One page of the report."""
+
+    artifact: str
+    title: str
+    sentence: str
+    """what this step does, in plain words"""
+    per_video: bool = False
+    nobody_in: tuple[str, ...] = ()
+    """its pictures (names with *) that are drawn from numbers or show the animal alone: nobody, and no more
+    of the home than its outline, can be in them"""
+
+
+CHAPTERS = tuple(
+    Chapter(**entry | {"nobody_in": tuple(entry.get("nobody_in", ()))}) for entry in WORDS["chapters"]
+)
+
+
+def remedy(artifact: str, check: str) -> str:
+    """Return the remedy for a check that warns or fails; empty if there is none."""
+    known = WORDS["remedies"].get(artifact, {})
+    return next((words for begin, words in known.items() if check.lower().startswith(begin)), "")
 
 
 @dataclass(frozen=True)

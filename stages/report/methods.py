@@ -8,8 +8,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from stages.report.chapters import WORDS
-from stages.report.collect import read_manifest
+from stages.report.collect import WORDS, read_manifest
 
 Folders = Mapping[str, Mapping[str | None, Path]]
 """Folders of every artifact by recording; the key None if there is only one."""

@@ -8,8 +8,7 @@ import jinja2
 from pipeline.data import qa
 from pipeline.metrics import words as metric_words
 from pipeline.metrics.bars import Judged
-from stages.report.chapters import remedy
-from stages.report.collect import ChapterReport
+from stages.report.collect import ChapterReport, remedy
 
 WORDS = {"ok": "fine", "warn": "to look at", "fail": "not good", "none": "without a note"}
 

@@ -10,7 +10,7 @@ from pipeline.data import qa
 from pipeline.metrics import bars
 from pipeline.metrics.metrics import Metrics
 from stages.report import collect, crate, methods, pages
-from stages.report.chapters import CHAPTERS
+from stages.report.collect import CHAPTERS
 from stages.report.config import Config
 
 WARN_PAGE_MB = 15.0

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.core.errors import InputError
 from pipeline.data.poses import RegisteredPoses
-from stages.gather_registration import gather, stage
+from stages.gather_registration import stage
 from stages.gather_registration.config import Config
 
 STATUS = {"registered": True, "reason": None, "figures": {"depth_gap_m": 0.01, "confidence": 0.9}}
@@ -26,37 +26,37 @@ def _poses() -> RegisteredPoses:
 
 def test_summary_has_counts_and_checks():
     poses = _poses()
-    outcomes = [gather.SessionOutcome("v002", STATUS, poses), gather.SessionOutcome("v003", REFUSED, None)]
-    summary = gather.summarize(outcomes)
+    outcomes = [stage.SessionOutcome("v002", STATUS, poses), stage.SessionOutcome("v003", REFUSED, None)]
+    summary = stage.summarize(outcomes)
     assert (summary["registered"], summary["total"]) == (1, 2)
     assert summary["videos"]["v003"]["reason"] == "no overlap"
-    assert {check.name: check.value for check in gather.checks(outcomes)}["recordings registered"] == 0.5
-    assert gather.paths(outcomes).shape == (560, 560, 3)
+    assert {check.name: check.value for check in stage.checks(outcomes)}["recordings registered"] == 0.5
+    assert stage.paths(outcomes).shape == (560, 560, 3)
 
 
 def test_unmeasured_gaps_are_ignored():
-    measured = gather.SessionOutcome("v002", STATUS, _poses())
-    unmeasured = gather.SessionOutcome(
+    measured = stage.SessionOutcome("v002", STATUS, _poses())
+    unmeasured = stage.SessionOutcome(
         "v003", {**STATUS, "figures": {"depth_gap_m": None, "confidence": 0.9}}, _poses()
     )
-    assert [gather.checks(outcomes)[1].value for outcomes in ([measured, unmeasured], [unmeasured])] == [
+    assert [stage.checks(outcomes)[1].value for outcomes in ([measured, unmeasured], [unmeasured])] == [
         1.0,
         None,
     ]
 
 
 def test_no_registered_recording_is_reported():
-    outcomes = [gather.SessionOutcome("v002", REFUSED, None)]
-    assert gather.checks(outcomes)[0].status == "fail"
-    assert gather.paths(outcomes).shape == (560, 560, 3)
+    outcomes = [stage.SessionOutcome("v002", REFUSED, None)]
+    assert stage.checks(outcomes)[0].status == "fail"
+    assert stage.paths(outcomes).shape == (560, 560, 3)
 
 
 def test_rejection_is_reported_with_its_nearest_view():
-    refused = gather.SessionOutcome(
+    refused = stage.SessionOutcome(
         "v003", {**REFUSED, "nearest_view": {"walkthrough_s": 12.34}}, None, "b.r3d"
     )
     assert refused.description == "b.r3d: no overlap; its nearest view is the walk-through at 12.3 s"
-    assert gather.summarize([refused])["videos"]["v003"]["file"] == "b.r3d"
+    assert stage.summarize([refused])["videos"]["v003"]["file"] == "b.r3d"
 
 
 def test_stage_copies_poses_and_fails_if_too_few_are_registered(tmp_path):

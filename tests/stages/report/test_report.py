@@ -15,7 +15,7 @@ from pipeline.data import images, qa
 from pipeline.metrics import bars, words
 from pipeline.workflow import artifact, dag
 from stages.report import collect, stage
-from stages.report.chapters import CHAPTERS, WORDS, remedy
+from stages.report.collect import CHAPTERS, WORDS, remedy
 from stages.report.config import Config
 from tests.stages.export_simulator import browser
 
