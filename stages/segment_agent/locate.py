@@ -72,7 +72,8 @@ def fill_gaps(spheres: list[Sphere | None], timestamp_s: Float[np.ndarray, "fram
         return spheres
     centers = np.stack([spheres[frame].center_world for frame in seen])
     guess = np.stack([np.interp(timestamp_s, timestamp_s[seen], axis) for axis in centers.T], axis=1)
-    wait = np.abs(timestamp_s[:, None] - timestamp_s[seen]).min(1)
+    after = np.minimum(np.searchsorted(seen, np.arange(len(spheres))), len(seen) - 1)
+    wait = np.abs(timestamp_s - timestamp_s[seen[[np.maximum(after - 1, 0), after]]]).min(0)
     radius = spheres[seen[0]].radius_m
     return [
         sphere or (Sphere(guess[frame], radius, presumed=True) if wait[frame] < movers.PRESUMED_S else None)
