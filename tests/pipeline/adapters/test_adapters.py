@@ -10,6 +10,7 @@ import pytest
 
 from pipeline.adapters.live_animal import ZUP_FROM_WORLD, LiveAnimal
 from pipeline.adapters.ros2_animal import AnimalNode
+from pipeline.behavior.perception import FeatureVolume
 from pipeline.core.errors import InputError
 from pipeline.data.glb import Action, Skin
 from pipeline.geometry import rigid
@@ -63,8 +64,9 @@ def test_mujoco_moves_the_animal_with_a_robot_as_observer(animal, tmp_path):
     mujoco = pytest.importorskip("mujoco")
     from pipeline.adapters.mujoco_animal import MujocoAnimal
 
-    occupancy = reading.Occupancy(np.pad(np.ones((40, 1, 40), bool), ((0, 0), (0, 5), (0, 0))), np.array([-2.0, -0.1, -2]), 0.1)  # fmt: skip
-    mjcf.write(tmp_path, exported_agent(), occupancy)
+    floor = np.pad(np.ones((40, 1, 40), np.uint8), ((0, 0), (0, 5), (0, 0)))
+    volume = FeatureVolume(np.zeros((0, *floor.shape)), floor, np.array([-2.0, -0.1, -2]), 0.1)
+    mjcf.write(tmp_path, exported_agent(), volume)
     home = mujoco.MjSpec.from_file(str(tmp_path / "agent.xml"))
     ball = home.worldbody.add_body(name="robot", pos=[1.0, 0.5, 0.4])
     ball.add_freejoint()
