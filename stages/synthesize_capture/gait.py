@@ -126,7 +126,7 @@ def footfalls(
 ) -> Float[np.ndarray, "frame foot 3"]:
     """Return the feet's world positions (bone heads of hands and toes) from the rhythm of the gait alone."""
     phase, duty, offset, lift = _rhythm(course, anatomy.gait)
-    neutral = _neutral(anatomy)
+    neutral, contact = _neutral(anatomy), _ground_contact(course, timestamp_s)
     neutral[:, 1] = anatomy.gait.sole_m
     placed = np.zeros((len(timestamp_s), 4, 3))
     for foot in range(4):
@@ -137,7 +137,7 @@ def footfalls(
         share = np.clip((now - index - carry) / (1 - carry), 0, 1)
         share = share * share * (3 - 2 * share)
         half = 0.5 * np.median(duty)
-        here, there = (_planted(course, cycle, index + k, half, neutral[foot]) for k in (0, 1))
+        here, there = (_planted(course, cycle, index + k, half, neutral[foot], contact) for k in (0, 1))
         placed[:, foot] = here + share[:, None] * (there - here)
         placed[:, foot, 1] += 4 * share * (1 - share) * np.interp(timestamp_s, course.timestamp_s, lift)
     return placed
@@ -157,12 +157,31 @@ def _rhythm(course: AnimalCourse, gait: Gait) -> tuple[np.ndarray, np.ndarray, n
     return phase, duty, offset, np.clip(0.03 + 0.025 * speed, 0.03, 0.07) * np.clip(drive / 0.15, 0, 1)
 
 
+def _ground_contact(
+    course: AnimalCourse, timestamp_s: Float[np.ndarray, "frame"]
+) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame"]]:
+    """Return when the last jump before each time ended and when the next one begins, seconds."""
+    times, flying = course.timestamp_s, course.airborne > 0.5
+    landed = np.maximum.accumulate(np.where(flying, times, times[0]))
+    leaves = np.minimum.accumulate(np.where(flying, times, times[-1])[::-1])[::-1]
+    nearest = np.clip(np.searchsorted(times, timestamp_s), 0, len(times) - 1)
+    return landed[nearest], leaves[nearest]
+
+
 def _planted(
-    course: AnimalCourse, cycle: np.ndarray, index: np.ndarray, half_duty: float, neutral: np.ndarray
+    course: AnimalCourse,
+    cycle: np.ndarray,
+    index: np.ndarray,
+    half_duty: float,
+    neutral: np.ndarray,
+    contact: tuple[np.ndarray, np.ndarray],
 ) -> Float[np.ndarray, "frame 3"]:
-    """Return where a foot is planted in a stride: its neutral position at mid-stance."""
+    """Return where a foot is planted in a stride: its neutral position at mid-stance.
+
+    A stride that a jump interrupts ends at take-off, and the next one begins where the animal lands.
+    """
     rising = cycle + 1e-9 * np.arange(len(cycle))
-    when = np.interp(index + half_duty, rising, course.timestamp_s)
+    when = np.clip(np.interp(index + half_duty, rising, course.timestamp_s), *contact)
     yaw = np.interp(when, course.timestamp_s, course.yaw)
     x, y, z = (np.interp(when, course.timestamp_s, course.position[:, axis]) for axis in range(3))
     side, sole, forward = neutral

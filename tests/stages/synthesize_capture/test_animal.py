@@ -3,8 +3,8 @@
 import numpy as np
 
 from pipeline.geometry import rigid
-from stages.synthesize_capture import animal, gait
-from stages.synthesize_capture.session import AnimalCourse
+from stages.synthesize_capture import animal, gait, room
+from stages.synthesize_capture.session import AnimalCourse, simulate_session
 
 CREATURE = animal.grow(np.random.default_rng(0), cell_m=0.02)
 FEET = [animal.INDEX[name] for name in gait.FEET]
@@ -45,6 +45,23 @@ def test_bones_are_rigid_and_legs_keep_their_length():
             np.linalg.norm(animal.HEADS[animal.INDEX[upper]] - animal.HEADS[animal.INDEX[lower]]),
             atol=2e-3,
         )
+
+
+def test_legs_reach_their_paws_after_jumps():
+    home = room.furnish(np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    course = simulate_session(home.arranged(rng), rng, 60.0).animal
+    assert course.airborne.any()
+    motion = gait.poses(course, np.arange(0, 60, 0.1))
+    for upper, lower, paw in (
+        ("left upper arm", "left forearm", "left hand"),
+        ("right thigh", "right shank", "right foot"),
+    ):
+        first, second, last = (
+            motion.agent_from_bone[:, animal.INDEX[name], :3, 3] for name in (upper, lower, paw)
+        )
+        length = np.linalg.norm(second - first, axis=-1).max() + 1e-3
+        assert (np.linalg.norm(last - second, axis=-1) < length + 0.02).all(), "meters"
 
 
 def test_normals_point_outwards():
