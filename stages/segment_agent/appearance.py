@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
@@ -38,8 +38,10 @@ ANIMAL_CROP_SHARE = 0.7
 """share of the other crops that are centered near the animal"""
 HARD_NEGATIVE_SHARE = 0.2
 """share of crops around false positives, after a third of the steps"""
-RESCALED_SHARE, SCALE_RANGE = 0.5, (0.5, 1.5)
+RESCALED_SHARE, SCALE_RANGE = 0.5, (0.25, 1.5)
 """share of rescaled crops, and the range of scales"""
+ANIMAL_SHARE, MAX_GAIN = 0.05, 8.0
+"""smaller animals are weighted up to this share of a crop's loss, by at most this factor"""
 MIN_PX = 60
 """minimum animal pixels of an example"""
 CONTRAST, BRIGHTNESS = 0.2, 0.15
@@ -140,12 +142,21 @@ def learn(
         loss = F.binary_cross_entropy_with_logits(found, (labels == 255).float(), reduction="none")
         contradicted = torch.where(labels == 255, -found, found) > CONTRADICTION_LOG_ODDS
         counted = (labels != 128) & ~(contradicted & (step > LABEL_TRUST_SHARE * options.steps))
-        weight = counted.float()
+        weight = _balanced(counted, labels == 255)
         optimizer.zero_grad()
         ((loss * weight).sum() / weight.sum().clamp(min=1)).backward()
         optimizer.step()
         schedule.step()
     return fold_batch_norms(network.eval())
+
+
+def _balanced(
+    counted: Bool[Tensor, "batch height width"], animal: Bool[Tensor, "batch height width"]
+) -> Float[Tensor, "batch height width"]:
+    """Return pixel weights: those of a small animal are raised, since the rest of a crop outnumbers them."""
+    area, own = counted.sum((1, 2), keepdim=True), (counted & animal).sum((1, 2), keepdim=True)
+    gain = (ANIMAL_SHARE * area / own.clamp(min=1)).clamp(1, MAX_GAIN)
+    return counted * torch.where(animal, gain, 1.0)
 
 
 def fold_batch_norms(network: Appearance) -> Appearance:

@@ -40,8 +40,8 @@ MOTION_LOG_ODDS = 3.0
 """prior log-odds that a moving pixel is an animal rather than background"""
 PASTE_SHARE = 0.6
 """share of crops into which another animal is pasted"""
-SCALE_RANGE = (0.35, 1.4)
-"""range of scales of crops relative to the turnaround"""
+SCALE_RANGE = (0.12, 1.4)
+"""range of scales of crops relative to the turnaround, which is filmed from nearby"""
 WHITE_BALANCE, EXPOSURE, CONTRAST, BRIGHTNESS = 0.08, 0.4, 0.25, 0.2
 """standard deviations of the augmentation of white balance (share, per channel), exposure (log), contrast
 (share) and brightness (of -1..1): sessions are filmed in other light than turnarounds"""

@@ -47,7 +47,7 @@ def find_mover(
         chosen = movers.track(found, clip.timestamp_s, animal, prompt)
         seen = np.array([candidate is not None for candidate in chosen])
         if appearance is not None:
-            reliable = seen
+            reliable = movers.plausible(chosen, clip.timestamp_s, animal)
         elif prompt is None:
             reliable = movers.self_moving(chosen, clip.timestamp_s, animal)
         else:
@@ -118,7 +118,7 @@ def _candidates(
     if margin_of is not None:
         both += np.minimum(resample_nearest(margin_of(frame), clip.depth_size, chosen), 0)
     both[area == 0] = -movers.APPEARANCE_LIMIT
-    return movers.candidates(both > 0, 1 / (1 + np.exp(-both)), points, area, animal)
+    return movers.candidates(both > 0, 1 / (1 + np.exp(-both)), points, area, animal, motion > 0)
 
 
 def opened_motion(votes: Votes, share: float) -> Bool[np.ndarray, "row column"]:

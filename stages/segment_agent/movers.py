@@ -38,6 +38,8 @@ CANDIDATES = 6
 """groups kept per frame"""
 PRESUMED_S = 3.0
 """time for which the animal is presumed near its last or next known place"""
+MIN_MOVING = 0.1
+"""mean share of moving points of a segment below which it may be furniture that looks like the animal"""
 ABSENT_S = 0.5
 """absence that splits a track"""
 MOTION, CLEAR_MOTION = 2.0, 3.0
@@ -61,6 +63,8 @@ class Candidate:
     """95th percentile of the points' distances from the center"""
     probability: float = 1.0
     """mean probability of its points"""
+    moving: float = 1.0
+    """share of its points in space that is free at other times"""
 
 
 AnyCandidate = TypeVar("AnyCandidate", bound=Candidate)
@@ -107,15 +111,19 @@ def components(is_moving: Bool[np.ndarray, "height width"]) -> Iterator[Bool[np.
 
 
 def candidates(
-    is_moving: Bool[np.ndarray, "height width"],
+    chosen: Bool[np.ndarray, "height width"],
     probability: Float[np.ndarray, "height width"],
     points_world: Float[np.ndarray, "height width 3"],
     area_m2: Float[np.ndarray, "height width"],
     animal: AnimalConfig,
+    moving: Bool[np.ndarray, "height width"] | None = None,
 ) -> list[Candidate]:
-    """Group moving pixels, largest area first; ``area_m2`` is the area of each pixel at its distance."""
+    """Group pixels, largest area first; ``area_m2`` is the area of each pixel at its distance.
+
+    ``moving`` tells which of them move; by default all do.
+    """
     found = []
-    for own in components(is_moving):
+    for own in components(chosen):
         area = float(area_m2[own].sum())
         if area < MIN_AREA_M2:
             continue
@@ -123,7 +131,8 @@ def candidates(
         center = np.median(points, axis=0)
         radius = float(np.quantile(np.linalg.norm(points - center, axis=1), 0.95))
         if radius < animal.largest_m:
-            found.append(Candidate(center, area, radius, float(probability[own].mean())))
+            share = 1.0 if moving is None else float(moving[own].mean())
+            found.append(Candidate(center, area, radius, float(probability[own].mean()), share))
     return sorted(found, key=lambda candidate: -candidate.area_m2)[:CANDIDATES]
 
 
@@ -195,6 +204,28 @@ def self_moving(
         center = np.array([chosen[frame].center_world for frame in own])
         center = scipy.ndimage.median_filter(center, (5, 1), mode="nearest")
         reliable[own] = np.linalg.norm(np.ptp(center, axis=0)) > TRAVEL_M
+    return reliable
+
+
+def plausible(
+    chosen: Sequence[Candidate | None], timestamp_s: Float[np.ndarray, "frame"], animal: AnimalConfig
+) -> Bool[np.ndarray, "frame"]:
+    """Return the frames of segments that move or that the animal reaches between moving ones.
+
+    The rest may be furniture that looks like it: where it rested, others saw through before or after.
+    """
+    reliable, parts = np.zeros(len(chosen), bool), segments(chosen, timestamp_s, animal)
+    moves = [np.mean([chosen[frame].moving for frame in own]) > MIN_MOVING for own in parts]
+    moving_parts = np.flatnonzero(moves)
+    for index, own in enumerate(parts):
+        before, after = moving_parts[moving_parts < index], moving_parts[moving_parts > index]
+        steps = [(parts[each][-1], own[0]) for each in before[-1:]]
+        steps += [(own[-1], parts[each][0]) for each in after[:1]]
+        reliable[own] = moves[index] or all(
+            np.linalg.norm(chosen[end].center_world - chosen[start].center_world)
+            < JUMP_M + animal.speed_m_s * (timestamp_s[end] - timestamp_s[start])
+            for start, end in steps
+        )
     return reliable
 
 

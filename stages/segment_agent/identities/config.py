@@ -9,7 +9,7 @@ class Config:
 
     portraits: int = 48
     """Pictures of each turnaround, spread evenly; a quarter of them is held out for testing."""
-    steps: int = 1200
+    steps: int = 2000
     """Training steps."""
     batch: int = 6
     """Crops per step."""
