@@ -158,7 +158,7 @@ class Ats:
         goals = []
         for chunk in _chunks(context):
             codes = self.sampler.codes(self.observe(chunk), self.sampling, count)
-            goal = self.sampler.goals(codes, self.sampling, rng).reshape(len(chunk), count, 3)
+            goal = self.sampler.goals(codes, rng).reshape(len(chunk), count, 3)
             goals.append(rigid.apply(world_from_ego(chunk.world_from_agent[:, -1], self.ego), goal))
         return Samples(np.concatenate(goals))
 
@@ -171,7 +171,7 @@ class Ats:
         """
         parts = []
         for chunk in _chunks(context, at_once):
-            path = self.sampler.plan_paths(self.observe(chunk), self.sampling, rng, count=count)
+            path = self.sampler.plan_paths(self.sampler.codes(self.observe(chunk), self.sampling, count), rng)
             frame = np.repeat(world_from_ego(chunk.world_from_agent[:, -1], self.ego), count, axis=0)
             path = rigid.apply(frame, path)
             parts.append(path.reshape(len(chunk), count, *path.shape[1:]))

@@ -11,7 +11,6 @@ from typing import assert_never
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import Architecture, Scaling
 from pipeline.behavior.path_encoding import PATH_CHANNELS
@@ -45,51 +44,34 @@ class GaussianSampler(Sampler):
     """Samples from Gaussians with independent channels."""
 
     def draw_plans(
-        self,
-        codes: PlanCondition,
-        sampling: PlanSamplingConfig,
-        rng: np.random.Generator,
-        goal: Array | None,
-        path: Array | None,
+        self, codes: PlanCondition, rng: np.random.Generator, goal: Array | None, path: Array | None
     ) -> SampledPlan:
         """Draw plans; each level is conditioned on the mean of the one above."""
         towards = self.scaling.goal(self._goal(codes)[0]) if goal is None else goal
         along = path
         if along is None:
-            along = self.scaling.path_of_scaled(self._path(codes, towards, sampling)[0][:, :3])
-        goal = self.goals(codes, sampling, rng) if goal is None else goal
-        path = self.paths(codes, towards, sampling, rng) if path is None else path
-        return SampledPlan(goal, path, self.bodies(codes, along, sampling, rng))
+            along = self.scaling.path_of_scaled(self._path(codes, towards)[0][:, :3])
+        goal = self.goals(codes, rng) if goal is None else goal
+        path = self.paths(codes, towards, rng) if path is None else path
+        return SampledPlan(goal, path, self.bodies(codes, along, rng))
 
-    def draw_plan_paths(
-        self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
-    ) -> Float[np.ndarray, "plan frame 3"]:
+    def plan_paths(self, codes: PlanCondition, rng: np.random.Generator) -> Float[np.ndarray, "plan frame 3"]:
         """Draw paths to the mean goal, meters, ego frame."""
-        return self.paths(codes, self.scaling.goal(self._goal(codes)[0]), sampling, rng)
+        return self.paths(codes, self.scaling.goal(self._goal(codes)[0]), rng)
 
-    def goals(
-        self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
-    ) -> Float[np.ndarray, "plan 3"]:
+    def goals(self, codes: PlanCondition, rng: np.random.Generator) -> Float[np.ndarray, "plan 3"]:
         """Draw goals in the ego frame, meters."""
         return codes.on_support(self.scaling.goal(self._sample_gaussian(self._goal(codes), rng)))
 
     def draw_paths(
-        self,
-        codes: PlanCondition,
-        goal: Float[np.ndarray, "plan 3"],
-        sampling: PlanSamplingConfig,
-        rng: np.random.Generator,
+        self, codes: PlanCondition, goal: Float[np.ndarray, "plan 3"], rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw a path towards each goal, meters, ego frame."""
-        scaled = self._sample_gaussian(self._path(codes, goal, sampling), rng)
+        scaled = self._sample_gaussian(self._path(codes, goal), rng)
         return codes.constrained(self.scaling.path_of_scaled(scaled[:, :3]), self.scaling.rate_hz)
 
     def bodies(
-        self,
-        codes: PlanCondition,
-        path: Float[np.ndarray, "plan frame 3"],
-        sampling: PlanSamplingConfig,
-        rng: np.random.Generator,
+        self, codes: PlanCondition, path: Float[np.ndarray, "plan frame 3"], rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame channel"]:
         """Draw bodies along paths, meters and radians, ego frame."""
         control = self.scaling.scaled_path(path)
@@ -105,12 +87,10 @@ class GaussianSampler(Sampler):
         zeros = np.zeros((len(codes.full), 3), np.float32)
         return [self.networks.goal(zeros, _step(zeros, t), codes.full) for t in (MEAN_STEP, LOG_STD_STEP)]
 
-    def _path(
-        self, codes: PlanCondition, goal: Float[np.ndarray, "plan 3"], sampling: PlanSamplingConfig
-    ) -> list[Array]:
+    def _path(self, codes: PlanCondition, goal: Float[np.ndarray, "plan 3"]) -> list[Array]:
         control = self.scaling.scaled_goal(goal)
         zeros = np.zeros((len(goal), PATH_CHANNELS, self.scaling.path_std.shape[1]), np.float32)
-        keep = _keep_mask(zeros, float(sampling.goal))
+        keep = _keep_mask(zeros, float(codes.sampling.goal))
         return [
             self.networks.path(zeros, _step(zeros, t), codes.full, control, keep)
             for t in (MEAN_STEP, LOG_STD_STEP)
@@ -127,42 +107,31 @@ class OneStageSampler(Sampler):
     """Samples path and body together; the goal is the end of the path."""
 
     def draw_plans(
-        self,
-        codes: PlanCondition,
-        sampling: PlanSamplingConfig,
-        rng: np.random.Generator,
-        goal: Array | None,
-        path: Array | None,
+        self, codes: PlanCondition, rng: np.random.Generator, goal: Array | None, path: Array | None
     ) -> SampledPlan:
         """Draw plans, which cannot be conditioned on a goal or path."""
         assert goal is None and path is None, "a one-stage model takes no goal and no path"
-        sequence = self._sequence(codes, sampling, rng)
+        sequence = self._sequence(codes, rng)
         path = self._path(codes, sequence)
         body = np.swapaxes(sequence[:, PATH_CHANNELS:], 1, 2) * self.scaling.body_std + self.scaling.body_mean
         return SampledPlan(path[:, -1], path, body)
 
-    def draw_plan_paths(
-        self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
-    ) -> Float[np.ndarray, "plan frame 3"]:
+    def plan_paths(self, codes: PlanCondition, rng: np.random.Generator) -> Float[np.ndarray, "plan frame 3"]:
         """Draw whole plans and keep the paths, meters, ego frame."""
-        return self.draw_plans(codes, sampling, rng, None, None).path
+        return self.draw_plans(codes, rng, None, None).path
 
-    def goals(
-        self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
-    ) -> Float[np.ndarray, "plan 3"]:
+    def goals(self, codes: PlanCondition, rng: np.random.Generator) -> Float[np.ndarray, "plan 3"]:
         """Draw whole plans, some at once, and keep the ends of their paths."""
         rows = np.arange(len(codes.full))
         some = (codes[rows[start : start + PLANS_AT_ONCE]] for start in range(0, len(rows), PLANS_AT_ONCE))
-        paths = (self._path(each, self._sequence(each, sampling, rng)) for each in some)
+        paths = (self._path(each, self._sequence(each, rng)) for each in some)
         return np.concatenate([path[:, -1] for path in paths])
 
     def _path(self, codes: PlanCondition, sequence: Array) -> Float[np.ndarray, "plan frame 3"]:
         path = self.scaling.path(sequence[:, :PATH_CHANNELS], codes.start)
         return codes.constrained(path, self.scaling.rate_hz)
 
-    def _sequence(
-        self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
-    ) -> Array:
+    def _sequence(self, codes: PlanCondition, rng: np.random.Generator) -> Array:
         frames = self.scaling.path_std.shape[1]
         control = np.zeros((len(codes.full), 3, frames), np.float32)
 
@@ -176,7 +145,7 @@ class OneStageSampler(Sampler):
         body = len(self.scaling.body_mean)
         shape = len(codes.full), PATH_CHANNELS + body, frames
         denoisers = [denoise(code) for code in (codes.full, *codes.references)]
-        solver, steps = self.of_sequences(sampling)
+        solver, steps = self.of_sequences(codes.sampling)
         stds = solver.path_noise_std, solver.body_noise_std
         noise_std = np.repeat(stds, (PATH_CHANNELS, body))[:, None]
         return self._denoised(denoisers, shape, solver, steps, rng, correct, noise_std)

@@ -138,6 +138,8 @@ class PlanCondition:
     """conditions without the observer, then without all others if companions are guided; or unconditional"""
     start: Float[np.ndarray, "plan 3"]
     """current position, ego frame"""
+    sampling: PlanSamplingConfig
+    """how plans are sampled with them"""
     constraint: SceneConstraint | None
     """constraint of goals and paths"""
     count: int = 1
@@ -147,7 +149,7 @@ class PlanCondition:
         """Return some of the rows, one plan each."""
         constraint = None if self.constraint is None else self.constraint[some // self.count]
         references = tuple(code[some] for code in self.references)
-        return PlanCondition(self.full[some], references, self.start[some], constraint)
+        return PlanCondition(self.full[some], references, self.start[some], self.sampling, constraint)
 
     def on_support(self, goal: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
         """Move goals in meters to where the agent may rest."""
@@ -182,37 +184,19 @@ class Sampler:
         path: Float[np.ndarray, "plan frame 3"] | None = None,
     ) -> SampledPlan:
         """Draw ``count`` plans per observation in one batch; a given goal or path is not sampled."""
-        return self.draw_plans(self.codes(observation, sampling, count), sampling, rng, goal, path)
-
-    def plan_paths(
-        self,
-        observation: Observation,
-        sampling: PlanSamplingConfig,
-        rng: np.random.Generator,
-        *,
-        count: int = 1,
-    ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw goals and paths as `plan` does, without bodies; meters, ego frame."""
-        return self.draw_plan_paths(self.codes(observation, sampling, count), sampling, rng)
+        return self.draw_plans(self.codes(observation, sampling, count), rng, goal, path)
 
     def draw_plans(
-        self,
-        codes: PlanCondition,
-        sampling: PlanSamplingConfig,
-        rng: np.random.Generator,
-        goal: Array | None,
-        path: Array | None,
+        self, codes: PlanCondition, rng: np.random.Generator, goal: Array | None, path: Array | None
     ) -> SampledPlan:
         """Draw one plan per row, sampling the levels that are not given."""
-        goal = self.goals(codes, sampling, rng) if goal is None else goal
-        path = self.paths(codes, goal, sampling, rng) if path is None else path
-        return SampledPlan(goal, path, self.bodies(codes, path, sampling, rng))
+        goal = self.goals(codes, rng) if goal is None else goal
+        path = self.paths(codes, goal, rng) if path is None else path
+        return SampledPlan(goal, path, self.bodies(codes, path, rng))
 
-    def draw_plan_paths(
-        self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
-    ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw one path per row, to a goal of its own."""
-        return self.paths(codes, self.goals(codes, sampling, rng), sampling, rng)
+    def plan_paths(self, codes: PlanCondition, rng: np.random.Generator) -> Float[np.ndarray, "plan frame 3"]:
+        """Draw one path per row, to a goal of its own, without bodies; meters, ego frame."""
+        return self.paths(codes, self.goals(codes, rng), rng)
 
     def codes(self, observation: Observation, sampling: PlanSamplingConfig, count: int = 1) -> PlanCondition:
         """Encode the kept conditions and the references of guidance, repeating rows ``count`` times."""
@@ -232,46 +216,36 @@ class Sampler:
         past = observation.past.reshape(len(observation), observation.others.shape[2], -1)
         start = np.repeat(past[:, -1, :3], count, axis=0)
         constraint = observation.constraint if sampling.avoid_solid and sampling.scene else None
-        return PlanCondition(full, tuple(references), start, constraint, count)
+        return PlanCondition(full, tuple(references), start, sampling, constraint, count)
 
-    def goals(
-        self, codes: PlanCondition, sampling: PlanSamplingConfig, rng: np.random.Generator
-    ) -> Float[np.ndarray, "plan 3"]:
+    def goals(self, codes: PlanCondition, rng: np.random.Generator) -> Float[np.ndarray, "plan 3"]:
         """Draw goals in the ego frame, meters."""
 
         def denoise(code: Array) -> Denoise:
             return lambda x, t: self.networks.goal(x, _filled(len(x), t), code)
 
         denoisers = [denoise(code[:: codes.count]) for code in (codes.full, *codes.references)]
-        steps = sampling.goal_steps or self.schedule.sampled_steps
-        x = self._denoised(denoisers, (len(codes.full), 3), sampling, steps, rng)
+        steps = codes.sampling.goal_steps or self.schedule.sampled_steps
+        x = self._denoised(denoisers, (len(codes.full), 3), codes.sampling, steps, rng)
         return codes.on_support(self.scaling.goal(x))
 
     def paths(
-        self,
-        codes: PlanCondition,
-        goal: Float[np.ndarray, "plan 3"],
-        sampling: PlanSamplingConfig,
-        rng: np.random.Generator,
+        self, codes: PlanCondition, goal: Float[np.ndarray, "plan 3"], rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw paths to goals; paths that miss their goals are drawn again."""
-        path = self.draw_paths(codes, goal, sampling, rng)
+        path, sampling = self.draw_paths(codes, goal, rng), codes.sampling
         for _ in range(sampling.max_path_draws - 1 if sampling.goal and sampling.guidance >= 1 else 0):
             off = goal_error(path, codes.start, goal)
             again = np.flatnonzero(off > 1)
             if not len(again):
                 break
-            other = self.draw_paths(codes[again], goal[again], sampling, rng)
+            other = self.draw_paths(codes[again], goal[again], rng)
             closer = goal_error(other, codes.start[again], goal[again]) < off[again]
             path[again[closer]] = other[closer]
         return path
 
     def draw_paths(
-        self,
-        codes: PlanCondition,
-        goal: Float[np.ndarray, "plan 3"],
-        sampling: PlanSamplingConfig,
-        rng: np.random.Generator,
+        self, codes: PlanCondition, goal: Float[np.ndarray, "plan 3"], rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw a path to each goal (Eq. 8) with guidance; meters, ego frame."""
         control = self.scaling.scaled_goal(goal)
@@ -281,19 +255,15 @@ class Sampler:
                 x, _filled(len(x), t), code, control, _filled((len(x), 1), keep)
             )
 
-        denoisers = [denoise(codes.full, float(sampling.goal)), *map(denoise, codes.references)]
+        denoisers = [denoise(codes.full, float(codes.sampling.goal)), *map(denoise, codes.references)]
         correct = partial(self.paths_out_of_solid, codes)
         shape = (len(goal), PATH_CHANNELS, self.scaling.path_std.shape[1])
-        solver, steps = self.of_sequences(sampling)
+        solver, steps = self.of_sequences(codes.sampling)
         path = self._denoised(denoisers, shape, solver, steps, rng, correct, solver.path_noise_std)
-        return self.decode_paths(codes, path, goal, sampling)
+        return self.decode_paths(codes, path, goal)
 
     def bodies(
-        self,
-        codes: PlanCondition,
-        path: Float[np.ndarray, "plan frame 3"],
-        sampling: PlanSamplingConfig,
-        rng: np.random.Generator,
+        self, codes: PlanCondition, path: Float[np.ndarray, "plan frame 3"], rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame channel"]:
         """Draw bodies along paths; if all conditions are guided, the path is one of them."""
         control = self.scaling.scaled_path(path)
@@ -305,7 +275,8 @@ class Sampler:
 
         shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
         denoisers = [denoise(codes.full, 1.0), *map(denoise, codes.references)]
-        solver, steps = self.of_sequences(replace(sampling, guidance=min(sampling.guidance, 1.0)))
+        guidance = min(codes.sampling.guidance, 1.0)
+        solver, steps = self.of_sequences(replace(codes.sampling, guidance=guidance))
         body = self._denoised(denoisers, shape, solver, steps, rng, noise_std=solver.body_noise_std)
         return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
 
@@ -335,11 +306,10 @@ class Sampler:
         codes: PlanCondition,
         scaled: Float[np.ndarray, "plan 4 frame"],
         goal: Float[np.ndarray, "plan 3"],
-        sampling: PlanSamplingConfig,
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Convert scaled paths to meters, snap them to the goals that condition them, and constrain them."""
+        path, sampling = self.scaling.path(scaled, codes.start), codes.sampling
         pull = float(sampling.goal and sampling.snap_to_goal) * min(sampling.guidance, 1.0)
-        path = self.scaling.path(scaled, codes.start)
         return codes.constrained(snapped_to_goal(path, codes.start, goal, pull), self.scaling.rate_hz)
 
     def _denoised(

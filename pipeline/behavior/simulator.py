@@ -298,10 +298,10 @@ class AnimalBatch:
         ``commanded`` goals (meters, ego frame) replace sampled ones where they are not NaN.
         """
         codes = self.sampler.codes(observation, self.sampling, count)
-        goals = self.sampler.goals(codes, self.sampling, self.rng)
+        goals = self.sampler.goals(codes, self.rng)
         given = np.repeat(commanded, count, axis=0)
         goals = np.where(np.isfinite(given), given, goals).astype(goals.dtype)
-        paths = self.sampler.paths(codes, goals, self.sampling, self.rng)
+        paths = self.sampler.paths(codes, goals, self.rng)
         world = rigid.apply(np.repeat(frame, count, axis=0), paths).reshape(len(frame), count, -1, 3)
         blocked = self.scenes.inside_solid(world, video).mean(-1)
         off = np.linalg.norm(world[:, :, : intent.shape[1]] - intent[:, None], axis=-1)

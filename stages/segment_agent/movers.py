@@ -120,7 +120,7 @@ def candidates(
 ) -> list[Candidate]:
     """Group pixels, largest area first; ``area_m2`` is the area of each pixel at its distance.
 
-    ``moving`` tells which of them move; by default all do.
+    ``moving`` marks those that move; by default all do.
     """
     found = []
     for own in components(chosen):

@@ -94,10 +94,10 @@ def fans(
     count = 12 if paths else FAN_GOALS
     for row, (name, sampling) in zip(grid, samplings.items(), strict=True):
         rng, codes = np.random.default_rng(seed), sampler.codes(observation, sampling, count)
-        goals = sampler.goals(codes, sampling, rng)
+        goals = sampler.goals(codes, rng)
         lines = None
         if paths:
-            lines = sampler.paths(codes, goals, sampling, rng).reshape(len(frame), count, -1, 3)
+            lines = sampler.paths(codes, goals, rng).reshape(len(frame), count, -1, 3)
         goals = goals.reshape(len(frame), count, 3)
         for column, axis in enumerate(row):
             rooms[column].window(axis, frame[column], observation.others[column, :, :, :3], goals[column])
@@ -125,14 +125,14 @@ def guided_paths(
     figure, grid = windows_panels(len(scales), windows)
     plain = PlanSamplingConfig(max_path_draws=1)
     codes = sampler.codes(observation, plain, GUIDED_PATHS)
-    sampled = sampler.goals(codes, plain, np.random.default_rng(seed))
+    sampled = sampler.goals(codes, np.random.default_rng(seed))
     sampled = sampled.reshape(windows, GUIDED_PATHS, 3)
     goal = sampled[np.arange(windows), np.linalg.norm(sampled, axis=-1).argmax(1)]
     for row, scale in zip(grid, scales, strict=True):
         sampling = replace(plain, guidance=scale)
         codes = sampler.codes(observation, sampling, GUIDED_PATHS)
         each = np.repeat(goal, GUIDED_PATHS, axis=0)
-        paths = sampler.paths(codes, each, sampling, np.random.default_rng(seed))
+        paths = sampler.paths(codes, each, np.random.default_rng(seed))
         for column, axis in enumerate(row):
             some = paths.reshape(windows, GUIDED_PATHS, -1, 3)[column]
             rooms[column].steered(axis, frame[column], goal[column], some)

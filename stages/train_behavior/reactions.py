@@ -85,7 +85,7 @@ def measure(sampler: Sampler, observation: Observation, *, radius_m: float, seed
         observer: Float[np.ndarray, "1 past_frame 10"], sampling: PlanSamplingConfig
     ) -> Float[np.ndarray, "window 3"]:
         seen = replace(observation, others=np.tile(observer, (len(observation), 1, 1, 1)))
-        goals = sampler.goals(sampler.codes(seen, sampling, SAMPLES), sampling, np.random.default_rng(seed))
+        goals = sampler.goals(sampler.codes(seen, sampling, SAMPLES), np.random.default_rng(seed))
         return goals.reshape(len(observation), SAMPLES, 3).mean(1)
 
     none = mean_goals(approach(SIDES[0], 1.0, 0.0, **how), replace(sampling, observer=False))

@@ -85,13 +85,13 @@ def test_given_goal_and_path_are_kept(ats, data):
 
 def test_paths_that_miss_their_goals_are_resampled(ats, data):
     context, _ = data.windows(data.indices(TEST)[::20])
-    codes = ats.sampler.codes(
-        observe(context, room(), REST, "yaw"), replace(ats.sampling, avoid_solid=False), 8
-    )
+    sampling = replace(ats.sampling, avoid_solid=False)
+    codes = ats.sampler.codes(observe(context, room(), REST, "yaw"), sampling, 8)
     goal = codes.start + np.random.default_rng(0).normal(0, 0.4, codes.start.shape)
 
     def misses(**changes):
-        path = ats.sampler.paths(codes, goal, replace(ats.sampling, **changes), np.random.default_rng(1))
+        changed = replace(codes, sampling=replace(ats.sampling, **changes))
+        path = ats.sampler.paths(changed, goal, np.random.default_rng(1))
         return goal_error(path, codes.start, goal)
 
     once, often = misses(max_path_draws=1), misses(max_path_draws=4)
@@ -113,7 +113,9 @@ def test_body_variance_scales_with_the_noise(ats, data):
     path = np.tile(np.linspace(0, 1, 56)[None, :, None] * [0.3, 0.0, 0.7], (40, 1, 1))
     std = [
         ats.sampler.bodies(
-            codes, path, replace(ats.sampling, body_noise_std=noise_std), np.random.default_rng(0)
+            replace(codes, sampling=replace(ats.sampling, body_noise_std=noise_std)),
+            path,
+            np.random.default_rng(0),
         )
         .std(0)
         .mean()
@@ -128,7 +130,9 @@ def test_paths_without_noise_are_determined_by_the_goal(ats, data):
     goal = np.tile([[0.3, 0.0, 0.7]], (40, 1))
     std = [
         ats.sampler.draw_paths(
-            codes, goal, replace(ats.sampling, path_noise_std=noise_std), np.random.default_rng(0)
+            replace(codes, sampling=replace(ats.sampling, path_noise_std=noise_std)),
+            goal,
+            np.random.default_rng(0),
         )
         .std(0)
         .mean()

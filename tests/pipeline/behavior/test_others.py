@@ -163,7 +163,7 @@ def test_guidance_of_companions_changes_plans(sampler):
     seen = observe(context, room(), REST, "yaw")
     plain = PlanSamplingConfig(goal_steps=4, sequence_steps=2, avoid_solid=False)
     goals = [
-        sampler.goals(sampler.codes(seen, how), how, np.random.default_rng(0))
+        sampler.goals(sampler.codes(seen, how), np.random.default_rng(0))
         for how in (plain, replace(plain, companions_guidance=0.0), replace(plain, guidance=0.0))
     ]
     assert np.abs(goals[0] - goals[1]).max() > 1e-4
@@ -288,7 +288,7 @@ def test_candidate_nearest_to_the_intent_is_followed(sampler):
         return animals._least_blocked(seen, frame, None, 8, free, intent)[1]
 
     codes, rng = sampler.codes(seen, animals.sampling, 8), np.random.default_rng(1)
-    each = sampler.paths(codes, sampler.goals(codes, animals.sampling, rng), animals.sampling, rng)
+    each = sampler.paths(codes, sampler.goals(codes, rng), rng)
     assert np.ptp(each[:, -1], axis=0).max() > 1e-2, "meters"
     np.testing.assert_array_equal(drawn(none)[0], each[0])
     for path in each:

@@ -48,11 +48,11 @@ class Oracle:
     def codes(self, observation, sampling, count=1):
         return count
 
-    def paths(self, count, goal, sampling, rng):
+    def paths(self, count, goal, rng):
         np.testing.assert_allclose(goal, np.repeat(self.path[:, -1], count, 0), atol=1e-9)
         return np.repeat(self.path, count, axis=0)
 
-    def bodies(self, count, path, sampling, rng):
+    def bodies(self, count, path, rng):
         np.testing.assert_allclose(path, np.repeat(self.path, count, 0), atol=1e-9)
         return np.repeat(self.body, count, axis=0)
 
@@ -133,12 +133,11 @@ def test_gaussian_samples_have_the_predicted_moments():
     scaling = Scaling(np.full(3, 0.3), np.ones(4), np.ones((3, 56)), np.zeros(6), np.ones(6))
     sampler = samplers.GaussianSampler(FixedNetworks(), STANDARD, scaling)
     codes = sampler.codes(behavior_observation(), PlanSamplingConfig(), 4000)
-    goals = sampler.goals(codes, PlanSamplingConfig(), np.random.default_rng(0))
+    goals = sampler.goals(codes, np.random.default_rng(0))
     drawn = scaling.scaled_goal(goals)
     np.testing.assert_allclose([drawn.mean(), drawn.std()], [2, 0.5], rtol=0.03)
-    path = sampler.plan_paths(
-        behavior_observation(), PlanSamplingConfig(), np.random.default_rng(0), count=99
-    )
+    codes = sampler.codes(behavior_observation(), PlanSamplingConfig(), 99)
+    path = sampler.plan_paths(codes, np.random.default_rng(0))
     np.testing.assert_allclose(path.mean(0), np.ones((56, 3)), atol=0.005)
     np.testing.assert_allclose(path.std(), np.exp(samplers.LOG_STD_BOUNDS[0]), rtol=0.03)
 
@@ -167,7 +166,7 @@ def test_networks_alone_sample_by_the_schedule_and_do_not_snap_to_goals(method, 
     alone, ends = snapped.networks_only(), []
     for sampling in (snapped, alone):
         codes, rng = sampler.codes(behavior_observation(), sampling, 4), np.random.default_rng(0)
-        ends.append(np.abs(sampler.paths(codes, goal, sampling, rng)[:, -1] - goal).max())
+        ends.append(np.abs(sampler.paths(codes, goal, rng)[:, -1] - goal).max())
     assert counted.calls == 2 * calls
     assert ends[0] < ends[1]
     assert not alone.avoid_solid
