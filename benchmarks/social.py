@@ -104,11 +104,7 @@ class ForwardFacingSampler(Sampler):
     """Samples goals and paths; the body is upright and faces its direction of motion."""
 
     def bodies(
-        self,
-        codes: PlanCondition,
-        path: Float[np.ndarray, "plan frame 3"],
-        sampling: PlanSamplingConfig,
-        rng: np.random.Generator,
+        self, codes: PlanCondition, path: Float[np.ndarray, "plan frame 3"], rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame channel"]:
         """Return roots that turn along the path, starting with heading +z."""
         steps = np.diff(path, axis=1, prepend=codes.start[:, None])[..., ::2]

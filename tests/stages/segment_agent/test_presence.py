@@ -67,6 +67,20 @@ def test_moved_objects_are_no_animal():
     assert np.flatnonzero(movers.self_moving(chosen, time_s, AnimalConfig())).tolist() == list(range(30, 50))
 
 
+def test_tracks_that_never_move_must_be_within_reach():
+    """The animal walks, leaves, and rests nearby; meanwhile a shelf that looks like it is tracked."""
+    animal = [Candidate(np.array([0.05 * i, 0.0, 2.0]), 0.05, 0.2) for i in range(20)]
+    rests = [Candidate(np.array([1.5, 0.0, 2.0]), 0.05, 0.2, moving=0.0)] * 10
+    shelf = [Candidate(np.array([9.0, 1.0, 2.0]), 0.05, 0.2, moving=0.0)] * 10
+    chosen = [*animal, *[None] * 6, *rests, *[None] * 6, *shelf]
+    time_s = 0.1 * np.arange(len(chosen))
+    assert np.flatnonzero(movers.plausible(chosen, time_s, AnimalConfig())).tolist() == [
+        *range(20),
+        *range(26, 36),
+    ]
+    assert movers.plausible(shelf, time_s[:10], AnimalConfig()).all(), "no other track is known"
+
+
 @pytest.mark.parametrize(
     ("similarity", "moved", "presumed", "present"),
     [

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from pipeline.core.errors import InputError
 from pipeline.data import images, npz
@@ -271,6 +272,14 @@ def test_appearance_is_learned_despite_label_noise():
     for example, truth in list(zip(examples, truths, strict=True))[::7]:
         assert iou(network.log_odds(example.color) > 0, truth) > 0.7
         np.testing.assert_array_equal(network.log_odds(example.color), again.log_odds(example.color))
+
+
+def test_small_animals_weigh_more():
+    counted, animal = torch.ones(2, 100, 100, dtype=torch.bool), torch.zeros(2, 100, 100, dtype=torch.bool)
+    animal[0, :10, :10], animal[1, :50, :50] = True, True
+    weight = appearance._balanced(counted, animal)
+    assert weight[0][animal[0]].sum() == appearance.ANIMAL_SHARE * 100**2
+    assert (weight[0][~animal[0]] == 1).all() and (weight[1] == 1).all()
 
 
 def test_extrapolated_corners_are_consistent():
