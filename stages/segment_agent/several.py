@@ -36,6 +36,8 @@ OTHER_LOG_ODDS = -1.0
 """log-odds below which a pixel without evidence of an animal belongs to another one"""
 PORTRAITS_SHARE = 0.25
 """portraits for training, as a share of the recording's examples: more would outweigh its room"""
+LEARNING_ROUNDS = 2
+"""rounds of learning: the first masks hold only animals that travel, the next ones those that rest, too"""
 STRANGER_SHARE = 0.5
 """share of unknown animals among frames with a track above which an animal has no turnaround; fewer may be
 visitors"""
@@ -113,11 +115,11 @@ def find_all(
     portraits: Sequence[Portrait],
 ) -> list[Segmenter]:
     """Prepare the masks of every animal: by motion and identity, then by the appearance learned from them."""
-    count = len(scores.network.names)
+    animals = range(len(scores.network.names))
     evidence_of = motion_evidence(references)
-    segmenters, networks = [], []
+    segmenters, known = [], []
     portrait_count = round(PORTRAITS_SHARE * config.learning.examples)
-    for animal in range(count):
+    for animal in animals:
         margin_of = scores.of(animal)
         spheres = find_mover(clip, poses, references, config.animal, None, margin_of=margin_of)
         own = identity_evidence(evidence_of, scores.against_others(animal))
@@ -125,28 +127,32 @@ def find_all(
         if not _is_present(segmenter, margin_of):
             segmenter = replace(segmenter, spheres=[None] * len(clip))
         segmenters.append(segmenter)
-        rng = np.random.default_rng([config.seed, animal])
         examples = examples_of(portraits, animal, portrait_count)
-        known = masks.KnownAppearance(examples, scores.recognized(animal))
-        networks.append(masks.learn_appearance(segmenter, references, config, rng, known))
+        known.append(masks.KnownAppearance(examples, scores.recognized(animal)))
+    found, networks = segmenters.copy(), [None for _ in animals]
 
     def occluded(frame: int) -> Bool[np.ndarray, "height width"]:
-        found = [np.zeros(working_size(clip, config.height_px), bool)]
-        for segmenter, network in zip(segmenters, networks, strict=True):
-            found += [] if network is None else [masks.occlusion_mask(segmenter, frame, network)]
-        return np.any(found, axis=0)
+        inside = [np.zeros(working_size(clip, config.height_px), bool)]
+        for segmenter, network in zip(found, networks, strict=True):
+            inside += [] if network is None else [masks.occlusion_mask(segmenter, frame, network)]
+        return np.any(inside, axis=0)
 
-    room = free_space.masked(references, occluded)
-    evidence_of = motion_evidence(room)
-    for animal, network in enumerate(networks):
-        if network is None:
-            continue
-        segmenter, own = segmenters[animal], identity_evidence(evidence_of, scores.against_others(animal))
-        appearance, margin_of = masks.appearance_of(segmenter, network), scores.of(animal)
-        spheres = find_mover(clip, poses, room, config.animal, None, appearance, margin_of)
-        spheres = masks.with_motion_radius(spheres, segmenter.spheres)
-        segmenters[animal] = replace(segmenter, spheres=spheres, evidence_of=own, appearance=network)
-    return segmenters
+    for attempt in range(LEARNING_ROUNDS):
+        rngs = [np.random.default_rng([config.seed, animal, attempt]) for animal in animals]
+        learned = [
+            masks.learn_appearance(found[animal], references, config, rngs[animal], known[animal])
+            for animal in animals
+        ]
+        networks = [new or old for new, old in zip(learned, networks, strict=True)]
+        room = free_space.masked(references, occluded)
+        for animal, network in enumerate(networks):
+            if network is not None:
+                appearance, margin_of = masks.appearance_of(found[animal], network), scores.of(animal)
+                spheres = find_mover(clip, poses, room, config.animal, None, appearance, margin_of)
+                spheres = masks.with_motion_radius(spheres, segmenters[animal].spheres)
+                own = identity_evidence(motion_evidence(room), scores.against_others(animal))
+                found[animal] = replace(found[animal], spheres=spheres, evidence_of=own, appearance=network)
+    return found
 
 
 def examples_of(portraits: Sequence[Portrait], animal: int, portrait_count: int) -> list[Portrait]:
