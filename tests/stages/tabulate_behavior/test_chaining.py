@@ -24,10 +24,10 @@ class Breathing:
     def codes(self, observation, sampling, count=1):
         return count * len(observation)
 
-    def goals(self, count, sampling, rng):
+    def goals(self, count, rng):
         return np.zeros((count, 3))
 
-    def paths(self, count, goal, sampling, rng):
+    def paths(self, count, goal, rng):
         return np.tile(0.002 * np.sin(np.arange(FUTURE))[:, None] * [0, 1, 0], (count, 1, 1))
 
     def plan(self, observation, sampling, rng, goal, path):
