@@ -304,9 +304,11 @@ def _read_by(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[I
                 arguments += ["--captures", str(folder)] if scale_from else []
                 deciding += [other.id for other in scale_from]
             continue
+        source = dag.NODES[need.artifact]
+        if video and source.of_several and video.role not in (source.roles or (video.role,)):
+            continue
         found = list(_inputs(plan, need, node, part))
         inputs += found
-        source = dag.NODES[need.artifact]
         several = source.roles and (need.roles or not node.roles)
         several = several or (source.trials == "each" and not isinstance(part, Trial))
         whole = plan.home_of(need.artifact).folder / need.artifact

@@ -214,11 +214,12 @@ def _rules(plan: Plan, all_jobs: list[Job], after: Mapping[str, Sequence[str]]) 
             for node in ("home_simulator", "report", "simulator")
             if node in stamped
         )
-        following = f"make {name}.<artifact>[.redo], make {name} VARIANT=no_scene"
+        variant = "" if plan.animals else f" make {name} VARIANT=no_scene,"
         lines += [f".PHONY: {name}", f"{name}: {' '.join(wanted)}"]
         lines += [f"\t@echo '[{home}] done.{' Open:' if pages else ''}'"]
         lines += [f"\t@echo '  {page}'" for page in pages]
-        lines += [f"\t@echo 'Next: {following}, make new AGENT=<name>, make help'"]
+        following = f"make {name}.<artifact>[.redo],{variant} make new AGENT=<name>, make help"
+        lines += [f"\t@echo 'Next: {following}'"]
     return "\n".join(lines) + "\n"
 
 

@@ -1,8 +1,8 @@
-"""Masks of one animal of several: all are segmented together, so that each pixel belongs to one.
+"""Masks of several animals: all are segmented together, so that each pixel belongs to one.
 
 The network trained on all turnarounds (`identity`) classifies what moves; then each animal is handled like a
-single one (`masks`): track, appearance in this recording, mask. In the mask of the followed animal, pixels of
-the others are unknown.
+single one (`masks`): track, appearance in this recording, mask. In the masks of an animal, pixels of the
+others are unknown.
 """
 
 from collections.abc import Sequence
@@ -80,9 +80,9 @@ class IdentityScores:
 
 
 def segment(
-    clip: Clip, flow: Path, followed: str, network: Identities, portraits: Sequence[Portrait], config: Config
-) -> Segmentation:
-    """Return one mask per frame of the followed animal, poses, people, and the share of unknown animals.
+    clip: Clip, flow: Path, network: Identities, portraits: Sequence[Portrait], config: Config
+) -> dict[str, Segmentation]:
+    """Return each animal's masks, one per frame, with poses, people, and the share of unknown animals.
 
     Raises InputError MSK-007 if unknown animals prevail.
     """
@@ -100,10 +100,13 @@ def segment(
         what = f"in {100 * share:.0f} % of the frames that show an animal it matches no turnaround"
         remedy = "film a turnaround of each animal that lives here (turnaround_<name>), or leave this out"
         raise InputError("MSK-007", what, str(clip.folder), remedy)
-    own = network.names.index(followed)
-    found = (resolve_overlaps(segmenters, scores, own, frame) for frame in range(len(clip)))
-    found = people.hide(found, persons, clip, poses)
-    return Segmentation(found, path, persons, float(unknown.mean()), references, "one of several")
+
+    def segmentation(own: int) -> Segmentation:
+        found = (resolve_overlaps(segmenters, scores, own, frame) for frame in range(len(clip)))
+        found = people.hide(found, persons, clip, poses)
+        return Segmentation(found, path, persons, float(unknown.mean()), references, "one of several")
+
+    return {name: segmentation(index) for index, name in enumerate(network.names)}
 
 
 def find_all(

@@ -1,7 +1,8 @@
 """The stage: frames and flow of one recording -> a mask per frame and the quality page."""
 
+import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import assert_never
 
@@ -9,8 +10,9 @@ import numpy as np
 
 from pipeline.core import devices
 from pipeline.core.errors import InputError
-from pipeline.core.progress import log, track
+from pipeline.core.progress import log
 from pipeline.core.videos import Video, role_of_animal
+from pipeline.data import qa
 from pipeline.data.clips import Clip
 from stages.segment_agent import prompts, several, writing
 from stages.segment_agent.config import Config
@@ -31,7 +33,9 @@ class Inputs:
     prompt: Path | None = None
     """A box or a click on the animal, given by a user."""
     identities: Path | None = None
-    """The artifact `identities`, in a home of several animals."""
+    """The artifact `identities`; then all animals of the home are segmented."""
+    home_masks: Path | None = None
+    """`home_masks/<id>`, the masks of all animals of the home."""
 
 
 def run(
@@ -42,43 +46,41 @@ def run(
     device: devices.Device = "cpu",
     video: Video | None = None,
     videos: Sequence[Video] = (),
-) -> writing.Summary:
+) -> None:
     """Segment one recording and write its masks into `out`.
 
-    With several animals, the one whose turnaround is among `videos` is segmented. Raises InputError
-    MSK-006 for a prompt or a backend that cannot distinguish them.
+    With `identities`, the masks of each animal are written into a folder with its name. With `home_masks`,
+    those of the animal whose turnaround is among `videos` are copied. Raises InputError MSK-006 for a prompt
+    or a backend that cannot distinguish animals.
     """
+    if inputs.home_masks is not None:
+        name = next(video.animal for video in videos if video.animal)
+        shutil.copytree(inputs.home_masks / name, out, dirs_exist_ok=True)
+        return
     clip, role = Clip.open(inputs.frames), role_of_animal(video, config.role)
-    if inputs.identities is not None and role == "session":
-        found = _segment_one_of_several(clip, inputs, inputs.identities, config, videos)
-    else:
-        prompt = None if inputs.prompt is None else prompts.parse(inputs.prompt, clip)
-        match config.backend:
-            case "weightless":
-                if clip.odometry_from_camera is None:
-                    log("no usable odometry: camera motion comes from depth and flow, which drifts more")
-                rng = np.random.default_rng(config.seed)
-                found = segment(clip, inputs.flow, role, prompt, config, rng)
-                if found.path is not None:
-                    millimeters = MM * found.path.residual_m
-                    log(f"poses: {found.path.alignments} depth alignments agree within {millimeters:.0f} mm")
-            case "foundation":
-                from stages.segment_agent.backends import foundation
+    if inputs.identities is not None:
+        _segment_home(clip, inputs, inputs.identities, config, out)
+        return
+    prompt = None if inputs.prompt is None else prompts.parse(inputs.prompt, clip)
+    match config.backend:
+        case "weightless":
+            if clip.odometry_from_camera is None:
+                log("no usable odometry: camera motion comes from depth and flow, which drifts more")
+            rng = np.random.default_rng(config.seed)
+            found = segment(clip, inputs.flow, role, prompt, config, rng)
+            if found.path is not None:
+                millimeters = MM * found.path.residual_m
+                log(f"poses: {found.path.alignments} depth alignments agree within {millimeters:.0f} mm")
+        case "foundation":
+            from stages.segment_agent.backends import foundation
 
-                found = Segmentation(foundation.segment(clip, prompt, config.foundation, device))
-            case _:
-                assert_never(config.backend)
-    writing.write_people(out, clip, found)
-    summary = writing.write(out, track(found.masks, "masks", len(clip)), len(clip))
-    writing.report_quality(out, clip, summary, config.animal, found)
-    if found.unknown_animals is None and not any(summary.visible):
-        log("the animal was never seen: does it move here? A prompt (<recording>.prompt.toml) helps")
-    return summary
+            found = Segmentation(foundation.segment(clip, prompt, config.foundation, device))
+        case _:
+            assert_never(config.backend)
+    writing.write(out, clip, found, config.animal)
 
 
-def _segment_one_of_several(
-    clip: Clip, inputs: Inputs, identities: Path, config: Config, videos: Sequence[Video]
-) -> Segmentation:
+def _segment_home(clip: Clip, inputs: Inputs, identities: Path, config: Config, out: Path) -> None:
     if inputs.prompt is not None or config.backend != "weightless":
         what = "a prompt" if inputs.prompt is not None else f"the backend {config.backend!r}"
         raise InputError(
@@ -87,7 +89,11 @@ def _segment_one_of_several(
             str(inputs.prompt or inputs.frames),
             "leave it out: sessions of several animals are segmented by motion and by their turnarounds",
         )
-    followed = next(video.animal for video in videos if video.animal)
-    assert followed is not None, "the planner lists one animal's turnaround"
     network, portraits = Identities.load(identities), load_portraits(identities)
-    return several.segment(clip, inputs.flow, followed, network, portraits, config)
+    checks: list[qa.Check] = []
+    for name, found in several.segment(clip, inputs.flow, network, portraits, config).items():
+        (out / name).mkdir()
+        own = writing.write(out / name, clip, found, config.animal)
+        checks += [replace(check, name=f"{name}: {check.name}") for check in own]
+    good, bad = "the checks of every animal pass", "an animal's masks are wrong: see its own quality page"
+    qa.write(out, good=good, bad=bad, checks=checks)

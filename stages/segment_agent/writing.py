@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from pipeline.core.progress import log, track
 from pipeline.data import images, npz, plots, qa
 from pipeline.data.clips import PEOPLE, Clip, Masks
 from pipeline.data.qa import Check
@@ -40,7 +41,16 @@ class Summary:
     shown: dict[int, np.ndarray] = field(default_factory=dict)
 
 
-def write(folder: Path, masks: Iterable[Mask], count: int) -> Summary:
+def write(folder: Path, clip: Clip, found: Segmentation, animal: AnimalConfig) -> list[Check]:
+    """Write masks frame by frame, people, and the quality page; return its checks."""
+    write_people(folder, clip, found)
+    summary = write_masks(folder, track(found.masks, "masks", len(clip)), len(clip))
+    if found.unknown_animals is None and not any(summary.visible):
+        log("the animal was never seen: does it move here? A prompt (<recording>.prompt.toml) helps")
+    return report_quality(folder, clip, summary, animal, found)
+
+
+def write_masks(folder: Path, masks: Iterable[Mask], count: int) -> Summary:
     """Write ``%06d.png`` and ``masks.npz``; keep evenly spaced masks for the quality page."""
     summary, shown = Summary(), set(np.linspace(0, count - 1, SHOWN).astype(int).tolist())
     for frame, mask in enumerate(masks):
@@ -107,8 +117,11 @@ def _percent(flags: Bool[np.ndarray, "frame"]) -> float:
 
 def report_quality(
     folder: Path, clip: Clip, summary: Summary, animal: AnimalConfig, found: Segmentation
-) -> None:
-    """Write the quality page of written masks; ``found`` is their segmentation."""
+) -> list[Check]:
+    """Write the quality page of written masks and return its checks; ``found`` is their segmentation.
+
+    One of several animals may be absent.
+    """
     if found.path is None or found.references is None:
         checks = checks_of(summary)
     else:
@@ -116,6 +129,7 @@ def report_quality(
         by_space = overlap.estimate(clip, poses, found.references, masks, animal, found.shown)
         checks = checks_of(summary, found.path.residual_m, by_space)
     if found.unknown_animals is not None:
+        checks = checks if any(summary.visible) else []
         checks.append(Check("frames with a stranger", 100 * found.unknown_animals, "%", warn=5))
     area, visible = np.array(summary.area), np.array(summary.visible)
     over_time = plots.time_series("share", area, clip.timestamp_s, ~visible)
@@ -128,3 +142,4 @@ def report_quality(
         checks=checks,
         pictures=qa.captioned(CAPTIONS, overlay=plots.grid(tiles, COLUMNS), area=over_time),
     )
+    return checks

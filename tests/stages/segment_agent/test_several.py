@@ -1,6 +1,7 @@
 """Two animals in one room: appearance is learned from turnarounds, and pixels are assigned to one animal."""
 
 import importlib.util
+import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,7 +10,7 @@ import pytest
 
 from pipeline.core.errors import InputError
 from pipeline.core.videos import Video
-from pipeline.data.clips import Clip
+from pipeline.data.clips import Clip, Masks
 from stages.segment_agent import identity, masks, several, stage
 from stages.segment_agent.appearance import Example
 from stages.segment_agent.config import Config, LearningConfig
@@ -143,8 +144,9 @@ def together(tmp_path_factory):
 @pytest.mark.slow
 def test_identities_persist_when_animals_pass_each_other(network, portraits, together):
     folder, truth = together
+    animals = several.segment(Clip.open(folder), Path("none"), network, portraits, OPTIONS)
     for name, own, others in (("orange", truth.masks, truth.others), ("green", truth.others, truth.masks)):
-        found = several.segment(Clip.open(folder), Path("none"), name, network, portraits, OPTIONS)
+        found = animals[name]
         labels = np.stack([mask.labels for mask in found.masks])
         shown = own.mean((1, 2)) > 0.002
         score = [
@@ -158,13 +160,22 @@ def test_identities_persist_when_animals_pass_each_other(network, portraits, tog
 
 
 @pytest.mark.slow
-def test_absent_animal_has_no_mask(network, portraits, tmp_path):
+def test_masks_of_all_animals_are_written_once_and_an_absent_one_has_none(learned, tmp_path):
     poses, agent = scenery.session()
     scenery.record(tmp_path / "frames", poses, agent, scenery.drifted(poses))
-    found = several.segment(
-        Clip.open(tmp_path / "frames"), Path("none"), "green", network, portraits, OPTIONS
-    )
-    assert not any((mask.labels == 255).any() for mask in found.masks)
+    made, own = tmp_path / "home_masks", tmp_path / "masks"
+    made.mkdir()
+    stage.run(stage.Inputs(tmp_path / "frames", Path("none"), identities=learned), OPTIONS, made)
+    assert not any((mask == 255).any() for mask in Masks.open(made / "green"))
+    checks = json.loads((made / "qa.json").read_text())["checks"]
+    assert "green: frames with a stranger" in {each["name"] for each in checks}
+    assert not any(each["name"].startswith("green: IoU") for each in checks), "it may be away"
+    own.mkdir()
+    inputs = stage.Inputs(tmp_path / "frames", Path("none"), home_masks=made)
+    stage.run(inputs, OPTIONS, own, videos=VIDEOS[1:])
+    assert np.mean([(mask == 255).any() for mask in Masks.open(own)]) > 0.5
+    names = [{str(path.relative_to(root)) for path in root.rglob("*")} for root in (own, made / "orange")]
+    assert names[0] == names[1] > {"qa.json", "masks.npz", "people.npz"}
 
 
 @pytest.mark.slow
@@ -174,13 +185,12 @@ def test_third_animal_without_turnaround_is_reported(network, portraits, tmp_pat
     scenery.record(tmp_path / "frames", poses, agent, scenery.drifted(poses))
     clip = Clip.open(tmp_path / "frames")
     with pytest.raises(InputError, match="MSK-007"):
-        several.segment(clip, Path("none"), "green", network, portraits, OPTIONS)
+        several.segment(clip, Path("none"), network, portraits, OPTIONS)
 
 
 def test_prompt_with_unknown_animal_is_refused(network, together, tmp_path):
     network.save(tmp_path)
     prompt = tmp_path / "prompt.toml"
     prompt.write_text("frame = 0\nclick = [0.5, 0.5]\n")
-    inputs = stage.Inputs(together[0], Path("none"), prompt, tmp_path)
     with pytest.raises(InputError, match="MSK-006"):
-        stage.run(inputs, OPTIONS, tmp_path, videos=VIDEOS[:1])
+        stage.run(stage.Inputs(together[0], Path("none"), prompt, tmp_path), OPTIONS, tmp_path)
