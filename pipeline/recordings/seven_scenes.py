@@ -1,15 +1,24 @@
 """7-Scenes style folders: `frame-%06d.color.png|jpg`, `.depth.png` (millimeters), `.pose.txt` or none.
 
 The frame number counts at 30 Hz. Intrinsics from `camera-intrinsics.txt` or the set's default (depth camera).
+The set's pictures are those of a separate color camera. Copies in which they were brought to the depth
+camera's lens state the same intrinsics, so matches between pictures decide.
 """
 
 import re
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from pipeline.recordings import errors, text_files
+from pipeline.geometry import cameras
+from pipeline.geometry.subsampling import evenly
+from pipeline.mapping import sift
+from pipeline.mapping.picture_agreement import beats
+from pipeline.recordings import errors, extraction, text_files
 from pipeline.recordings.containers import FolderContainer
 from pipeline.recordings.recording import (
     DepthCamera,
@@ -28,6 +37,10 @@ KINECT_DEPTH_FROM_COLOR = np.array([[1, 0, 0, 0.025], [0, 1, 0, 0], [0, 0, 1, 0]
 """the color camera is 2.5 cm to the right of the depth camera"""
 SAME_LENS_PX = 0.5
 """tolerance for given intrinsics to count as those of the data set's depth camera, as often"""
+PAIRS, GAP_S = 24, 1.2
+"""pairs of pictures in which two readings of a Kinect's folder are compared, and seconds between the two"""
+KEYPOINTS, MIN_MATCHES, INLIER_PX, FARTHEST_M = 800, 20, 2.0, 5.0
+"""SIFT keypoints per picture, minimum of matches of a pair, inlier threshold of PnP, range of depth"""
 NAME = re.compile(r"frame-([0-9]{1,18})\.(color\.(?:png|jpg|jpeg)|depth\.png|pose\.txt)\Z")
 
 
@@ -50,12 +63,7 @@ def open_recording(path: Path) -> Recording:
     default = KINECT_DEPTH if kinect else None
     intrinsics, remarks = text_files.read_intrinsics(container, len(index), default)
     camera, camera_remarks = text_files.depth_camera(container, intrinsics[0], sizes)
-    given = intrinsics[0, [0, 1, 0, 1], [0, 1, 2, 2]]
-    if camera is None and kinect and np.abs(given - KINECT_DEPTH).max() < SAME_LENS_PX:
-        camera = DepthCamera(intrinsics[0], KINECT_DEPTH_FROM_COLOR)
-        intrinsics = intrinsics_from_coefficients(np.tile(KINECT_COLOR, (len(index), 1)), container.where)
-        camera_remarks = (text_files.depth_camera_remark(camera, intrinsics[0]),)
-    return Recording(
+    stored = Recording(
         where=container.where,
         kind="7-Scenes RGB-D",
         index=index,
@@ -70,6 +78,57 @@ def open_recording(path: Path) -> Recording:
         remarks=remarks + camera_remarks,
         listed=len(files["color"].keys() | files["depth"].keys()),
     )
+    given = intrinsics[0, [0, 1, 0, 1], [0, 1, 2, 2]]
+    if camera is not None or not kinect or np.abs(given - KINECT_DEPTH).max() >= SAME_LENS_PX:
+        return stored
+    camera = DepthCamera(intrinsics[0], KINECT_DEPTH_FROM_COLOR)
+    intrinsics = intrinsics_from_coefficients(np.tile(KINECT_COLOR, (len(index), 1)), container.where)
+    raw = replace(
+        stored,
+        intrinsics=intrinsics,
+        pose=_poses(container, index, files["pose"], camera),
+        depth_camera=camera,
+        remarks=(*remarks, text_files.depth_camera_remark(camera, intrinsics[0])),
+    )
+    registered, separate = _inliers((stored, raw)).T.astype(float)
+    if not beats(registered, separate, tests=1):
+        return raw
+    remark = "pictures match each other better with the depth camera's lens than with the color camera's"
+    return replace(stored, remarks=(*remarks, remark))
+
+
+def _inliers(readings: Sequence[Recording]) -> Int[np.ndarray, "pair reading"]:
+    """Count the points of a picture that PnP finds in a later one, by readings of the same recording.
+
+    Only points with depth in all readings count; damaged and unlike pictures are left out.
+    """
+    time_s, found = readings[0].timestamp_s, []
+    for row in evenly(len(time_s), PAIRS, rounded=True).tolist():
+        rows = row, min(int(np.searchsorted(time_s, time_s[row] + GAP_S)), len(time_s) - 1)
+        colors = [extraction.picture(readings[0], each) for each in rows]
+        grays = [cv2.cvtColor(color, cv2.COLOR_RGB2GRAY) for color in colors if color is not None]
+        if len(grays) < 2 or rows[0] == rows[1]:
+            continue
+        first, second = (sift.describe(gray, KEYPOINTS) for gray in grays)
+        mine, theirs = sift.matches(first.descriptors, second.descriptors).T
+        shown = []
+        for each in readings:
+            assert each.intrinsics is not None, "a Kinect's are known"
+            depth = extraction.stored_depth(each, int(each.index[row]), FARTHEST_M)
+            lens = each.intrinsics[row]
+            shown.append((cameras.back_project_pixels(first.pixel[mine], lens, depth, lens), lens))
+        known = np.all([points[:, 2] > 0 for points, _ in shown], axis=0)
+        if known.sum() < MIN_MATCHES:
+            continue
+        inliers = [
+            cv2.solvePnPRansac(
+                points[known].astype(float), second.pixel[theirs[known]], lens, None,
+                reprojectionError=INLIER_PX, flags=cv2.SOLVEPNP_EPNP,
+            )[3]
+            for points, lens in shown
+        ]  # fmt: skip
+        found.append([0 if each is None else len(each) for each in inliers])
+    return np.array(found, int).reshape(-1, len(readings))
 
 
 def _poses(

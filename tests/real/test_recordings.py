@@ -3,8 +3,10 @@
 import dataclasses
 import json
 import os
+import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -57,6 +59,20 @@ def test_rotated_seven_scenes_are_detected(turn):
     recording = dataclasses.replace(recording, pose=pose_from_matrix(turned))
     plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, max_side_px=640)
     assert plan.pose_check.convention.quarter_turns == turn
+
+
+@pytest.mark.slow
+def test_kinect_pictures_brought_to_the_depth_cameras_lens_are_recognized(tmp_path):
+    """Raw folders and copies with rescaled pictures both state the depth camera's lens."""
+    raw = open_recording(_sample("7scenes_AB50"))
+    assert raw.depth_camera is not None and raw.intrinsics[0, 0, 0] == 525.5
+    shutil.copytree(_sample("7scenes_AB50"), tmp_path / "copy")
+    zoom = 585 / 525.5
+    matrix = np.array([[zoom, 0, (1 - zoom) * 320], [0, zoom, (1 - zoom) * 240]])
+    for path in (tmp_path / "copy").glob("*.color.jpg"):
+        cv2.imwrite(str(path), cv2.warpAffine(cv2.imread(str(path)), matrix, (640, 480)))
+    copy = open_recording(tmp_path / "copy")
+    assert copy.depth_camera is None and copy.intrinsics[0, 0, 0] == 585
 
 
 def test_stray_odometry_is_read():
