@@ -68,7 +68,7 @@ CHANGES = {
     "different channel order": (("channels", "goal"), ["z", "y", "x"]),
     "different schedule": (("schedule", "alpha_bar"), [1.0, 0.5]),
     "unknown setting": (("architecture", "memory"), 4),
-    "missing setting": (("architecture", "map_lookup"), None),
+    "missing setting": (("architecture", "unet_width"), None),
     "missing scale": (("scaling", "goal_std"), None),
     "missing table": (("path_encoding",), None),
 }

@@ -17,8 +17,6 @@ ObservedPast = Literal["positions", "poses"]
 Guided = Literal["observer", "all"]
 """Conditions that the reference of guidance lacks: observer and goal; or all, as in the paper,
 which needs `joint_dropout` in training."""
-MapLookup = Literal["attention", "pointwise"]
-"""How denoisers read the map: by attention, or, as in the released code, at the noisy point itself."""
 AblatedInput = Literal["nothing", "scene", "observer", "past"]
 """The part of perception that an ablation replaces by its learned null."""
 NoiseCourse = Literal["linear", "rectified"]

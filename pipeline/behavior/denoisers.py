@@ -166,14 +166,12 @@ class ControlUNet(SequenceDenoiser):
         channels: int,
         control: int,
         condition: int,
-        width: int = 32,
-        multipliers: tuple[int, ...] = (1, 2, 4),
+        widths: tuple[int, ...] = (32, 64, 128),
         schedule: Schedule = STANDARD,
         outputs: int | None = None,
     ):
         """``outputs``: if not ``channels``, those of the velocity and further ones (`BodyDenoiser.gated`)."""
         super().__init__(schedule)
-        widths = tuple(width * m for m in multipliers)
         self.embedding = Embedding(TrailingLinear(condition, EMBEDDING))
         self.main = UNet1d(channels, widths, EMBEDDING)
         self.side = UNet1d(control, widths, EMBEDDING)
@@ -189,12 +187,7 @@ class ControlUNet(SequenceDenoiser):
         control = control if control.ndim == 3 else control[..., None].expand(-1, -1, x.shape[-1])
         side = self.side(control, embedding)
         added = [inject(h) * keep[..., None] for inject, h in zip(self.inject, side, strict=True)]
-        return self.out(self.main(self.unet_input(x, t, condition), embedding, added)[-1])
-
-    def unet_input(self, x: Sequences, t: Steps, condition: Conditions) -> Sequences:
-        """Return the input of the main branch: the noisy sequence."""
-        del t, condition
-        return x
+        return self.out(self.main(x, embedding, added)[-1])
 
 
 class UncontrolledUNet(SequenceDenoiser):
@@ -204,14 +197,12 @@ class UncontrolledUNet(SequenceDenoiser):
         self,
         channels: int,
         read: nn.Module,
-        width: int = 32,
-        multipliers: tuple[int, ...] = (1, 2, 4),
+        widths: tuple[int, ...] = (32, 64, 128),
         schedule: Schedule = STANDARD,
         outputs: int | None = None,
     ):
         """``read`` projects a condition to `EMBEDDING` channels; ``outputs`` as in `ControlUNet`."""
         super().__init__(schedule)
-        widths = tuple(width * m for m in multipliers)
         self.embedding = Embedding(read)
         self.main = UNet1d(channels, widths, EMBEDDING)
         self.out = nn.Conv1d(widths[0], outputs or channels, 1)
@@ -231,8 +222,7 @@ class ConcatenationUNet(UncontrolledUNet):
         channels: int,
         control: int,
         condition: int,
-        width: int = 32,
-        multipliers: tuple[int, ...] = (1, 2, 4),
+        widths: tuple[int, ...] = (32, 64, 128),
         schedule: Schedule = STANDARD,
         outputs: int | None = None,
     ):
@@ -240,7 +230,7 @@ class ConcatenationUNet(UncontrolledUNet):
         read = nn.Sequential(
             nn.Linear(condition + control + 1, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING)
         )
-        super().__init__(channels, read, width, multipliers, schedule, outputs)
+        super().__init__(channels, read, widths, schedule, outputs)
         self.condition = condition
 
     def velocity(

@@ -12,13 +12,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pipeline.behavior.config import MapLookup
 from pipeline.behavior.denoisers import TIME_CHANNELS, NoiseFromVelocity, time_embedding
 from pipeline.behavior.diffusion import STANDARD, Schedule
 from pipeline.behavior.encoders import ATTENDED_CHANNELS, MIN_WEIGHT
 from pipeline.behavior.path_encoding import GOAL_LENGTH_POWER, with_powered_length
 from pipeline.behavior.perception import GRID_CELL_M, GRID_SHAPE, MAP_KEY_CHANNELS
-from pipeline.behavior.pointwise import MapAtGoal
 
 HORIZON_CHANNELS = 8
 REST_STDS, BESIDE_STDS = (0.0, 0.05, 0.2, 0.6), (0.2, 0.5, 1.0)
@@ -35,8 +33,7 @@ class GoalMLP(nn.Module):
 
     def __init__(
         self, code: int, hidden: int = 128, layers: int = 6, schedule: Schedule = STANDARD, *,
-        ensemble_size: int = 1,
-        map_cells: int = 0, map_lookup: MapLookup = "attention", attended_channels: int = 0,
+        ensemble_size: int = 1, map_cells: int = 0, attended_channels: int = 0,
     ):  # fmt: skip
         super().__init__()
         code += attended_channels
@@ -45,11 +42,7 @@ class GoalMLP(nn.Module):
         self.map_numbers = 2 * MAP_KEY_CHANNELS * map_cells**2
         code_channels = TIME_CHANNELS + HORIZON_CHANNELS + code
         self.clean, self.staying = CleanGoalEstimate(schedule), GoalLikelihood(REST_STDS)
-        self.map: MapAtGoal | MapAttention | None = None
-        if map_cells and map_lookup == "pointwise":
-            self.map = MapAtGoal()
-        elif map_cells:
-            self.map = MapAttention(map_cells, code_channels, ensemble_size)
+        self.map = MapAttention(map_cells, code_channels, ensemble_size) if map_cells else None
         inputs = 3 + code_channels + self.staying.numbers + (self.map.NUMBERS if self.map else 0)
         inputs += self.others.numbers if self.others else 0
         sizes, inner = [inputs] + [hidden] * (layers - 1), []

@@ -27,7 +27,6 @@ from pipeline.behavior.config import (
     Ego,
     Family,
     Guided,
-    MapLookup,
     ObservedPast,
     PlanSamplingConfig,
     SceneEncoder,
@@ -63,7 +62,6 @@ from pipeline.behavior.perception import (
     PerceptionConfig,
     PerceptionEnsemble,
 )
-from pipeline.behavior.pointwise import WaypointUNet
 from pipeline.behavior.trajectories import ABSENT_M, FUTURE, KINDS, PAST, RATE_HZ
 from pipeline.core.errors import InputError, other_versions_refused
 from pipeline.geometry import rigid
@@ -99,7 +97,6 @@ class Architecture:
     future: int = FUTURE
     rate_hz: float = RATE_HZ
     ensemble_size: int = 3
-    map_lookup: MapLookup = "attention"
     guided: Guided = "observer"
     """conditions that guidance amplifies: all if trained with `joint_dropout`"""
 
@@ -214,21 +211,17 @@ class BehaviorNets(nn.Module):
             schedule,
             ensemble_size=a.ensemble_size,
             map_cells=a.map_cells,
-            map_lookup=a.map_lookup,
             attended_channels=a.attended_channels,
         )
         bones = 6 * a.bones
         gates = min(a.body_components, bones)
         components = gates or bones
         corrected = ROOT_CHANNELS + components
-        sizes = (a.code_length, a.unet_width, a.unet_multipliers, schedule)
+        widths = tuple(a.unet_width * multiplier for multiplier in a.unet_multipliers)
+        sizes = (a.code_length, widths, schedule)
         match a.control:
             case "unet":
-                if a.map_cells and a.map_lookup == "pointwise":
-                    maps = a.ensemble_size, a.map_cells, a.future
-                    self.path = WaypointUNet(*maps, 3, *sizes, rate_hz=a.rate_hz)
-                else:
-                    self.path = ControlUNet(PATH_CHANNELS, 3, *sizes)
+                self.path = ControlUNet(PATH_CHANNELS, 3, *sizes)
                 body = ControlUNet(corrected, CONTROL_CHANNELS, *sizes, outputs=corrected + gates)
             case "concatenation":
                 self.path = ConcatenationUNet(PATH_CHANNELS, 3, *sizes)

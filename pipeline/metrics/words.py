@@ -89,7 +89,8 @@ def describe(key: str) -> MetricWords:
     An unknown key keeps its own words, underscores as spaces.
     """
     _, *subjects, name = key.split("/")
-    words = [_subject(subject) for subject in subjects]
+    parts = [subject.split("_minus_") for subject in subjects]
+    words = [" less ".join(SUBJECTS.get(each, each) for each in part) for part in parts]
     ending = next((suffix for suffix in SUFFIXES if name.endswith(suffix)), "")
     name, tail = name.removesuffix(ending), [SUFFIXES[ending]] if ending else []
     covered = COVERED.fullmatch(name)
@@ -121,7 +122,3 @@ def number(value: Any) -> str:
     if value == round(value) or abs(value) >= 100:
         return f"{value:.0f}"
     return f"{value:#.3g}".rstrip(".") if abs(value) >= 1e-3 else f"{value:.1e}"
-
-
-def _subject(name: str) -> str:
-    return " less ".join(SUBJECTS.get(each, each) for each in name.split("_minus_"))

@@ -3,6 +3,7 @@
 Device poses must be usable. This is a quick check, not a mask: an animal that never moves is missed.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -45,7 +46,8 @@ def find_motion(shots: Sequence[SampledFrame]) -> MotionShare | None:
     clusters = [_clusters(shot, _moved(shot, shots)) for shot in shots]
     animals = [[at for at, area in found if ANIMAL_M2[0] < area < ANIMAL_M2[1]] for found in clusters]
     seen = float(np.mean([bool(found) for found in animals]))
-    several = float(np.mean([_far_apart(found) for found in animals]))
+    apart = [[np.linalg.norm(a - b) for a, b in itertools.combinations(found, 2)] for found in animals]
+    several = float(np.mean([max(each, default=0.0) > TWO_APART_M for each in apart]))
     large = float(np.mean([any(area > LARGE_M2 for _, area in found) for found in clusters]))
     return MotionShare(seen, several, large)
 
@@ -77,7 +79,3 @@ def _clusters(
     area = shot.depth**2 / (shot.depth_intrinsics[0, 0] * shot.depth_intrinsics[1, 1])
     regions = [labels == label for label in range(1, count)]
     return [(np.median(points[region], axis=0), float(area[region].sum())) for region in regions]
-
-
-def _far_apart(centers: Sequence[Float[np.ndarray, "3"]]) -> bool:
-    return any(np.linalg.norm(a - b) > TWO_APART_M for i, a in enumerate(centers) for b in centers[i + 1 :])

@@ -76,7 +76,9 @@ def decode_headings(
     """
     grid = 2 * np.pi * np.arange(HEADINGS) / HEADINGS - np.pi
     cues, weight = motion_cues(timestamp_s, candidates), weights(candidates)
-    walking = MOTION_WEIGHT * weight * _walking_weight(cues)
+    slow, fast = WALKING_M_S
+    walks = np.clip((np.hypot(*cues.velocity[:, [0, 2]].T) - slow) / (fast - slow), 0, 1)
+    walking = MOTION_WEIGHT * weight * walks
     visual = [_visual_cost(each, grid, cues.novelty[index]) for index, each in enumerate(candidates)]
     turn = (rigid.wrap(grid[:, None] - grid[None]) / np.deg2rad(TURN_DEG)) ** 2
 
@@ -128,12 +130,6 @@ def _heading_cost(candidates, angle):
     """Return the cost of each hypothesis given the heading ``angle``, radians."""
     turned = rigid.wrap(angle - rigid.yaw(candidates.world_from_agent)) / np.deg2rad(HEADING_SIGMA_DEG)
     return candidates.cost + np.minimum(turned**2, FLIP_COST)
-
-
-def _walking_weight(cues: MotionCues) -> Float[np.ndarray, "observation"]:
-    """Return 0..1: confidence that the animal walks."""
-    slow, fast = WALKING_M_S
-    return np.clip((np.hypot(*cues.velocity[:, [0, 2]].T) - slow) / (fast - slow), 0, 1)
 
 
 def _visual_cost(candidates, grid, novelty):

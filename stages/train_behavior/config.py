@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from pipeline.behavior.config import AblatedInput, Control, Ego, Family, MapLookup, ObservedPast, SceneEncoder
+from pipeline.behavior.config import AblatedInput, Control, Ego, Family, ObservedPast, SceneEncoder
 
 Weighting = Literal["noise", "velocity", "flow"]
 """Prediction target whose error has equal weight at all noise levels, see `objective.squared_error`."""
@@ -124,9 +124,6 @@ class Config:
     """Horizontal distance in meters beyond which others are not perceived; at least 8 with companions."""
     unet_width: int = 16
     """Channels of the UNets' finest level; the next two have 2 and 4 times as many."""
-    map_lookup: MapLookup = "attention"
-    """How goals read the map of the 2.5-D encoder: by attention, or, as in the released code, at the noisy
-    point itself; then paths read it too, at each noisy waypoint."""
     training: BehaviorTrainingConfig = field(default_factory=BehaviorTrainingConfig)
     """Length of training, augmentation, losses."""
     homes: tuple[str, ...] = ()

@@ -82,7 +82,10 @@ def level_losses(
     body = body_error(
         lambda x, t: nets.body(x, t, code[body_rows], along, control_keep[body_rows]), batch.body[body_rows]
     )
-    return goal_loss | {"path": path.mean(), "body": mean_of_known(body, known)}
+    # over the known rows of all processes; root and bones have equal weight
+    each = (body[:, :ROOT_CHANNELS].mean((1, 2)) + body[:, ROOT_CHANNELS:].mean((1, 2))) / 2
+    count = distributed.mean(known.sum().float()).clamp_min(1 / distributed.size())
+    return goal_loss | {"path": path.mean(), "body": (each * known).sum() / count}
 
 
 def sequence_rows(
@@ -98,12 +101,6 @@ def sequence_rows(
     bodies = bodies if objective.body_share > 0 else 0
     body = torch.argsort((~batch.bones_known).int(), stable=True)[:bodies]
     return torch.arange(paths, device=body.device), body, batch.bones_known[body]
-
-
-def mean_of_known(error: Float[Tensor, "row channel frame"], known: Bool[Tensor, "row"]) -> Float[Tensor, ""]:
-    """Return the mean over known rows of all processes; root and bones have equal weight."""
-    each = (error[:, :ROOT_CHANNELS].mean((1, 2)) + error[:, ROOT_CHANNELS:].mean((1, 2))) / 2
-    return (each * known).sum() / distributed.mean(known.sum().float()).clamp_min(1 / distributed.size())
 
 
 def perceive(

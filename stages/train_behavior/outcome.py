@@ -56,7 +56,6 @@ def architecture_for(config: Config, data: BehaviorData, scenes: Scenes) -> Arch
         future=data.future,
         rate_hz=data.rate_hz,
         ensemble_size=config.ensemble_size,
-        map_lookup=config.map_lookup,
         guided="all" if config.training.objective.joint_dropout else "observer",
     )
 

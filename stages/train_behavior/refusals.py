@@ -18,9 +18,6 @@ def check_settings(config: Config, data: BehaviorData, architecture: Architectur
     optimization, staged = config.training.optimization, architecture.family != "one_stage"
     goal_steps, steps, table = optimization.goal_steps, optimization.steps, "[train_behavior]"
     off = "set it to false"
-    if config.map_lookup == "pointwise" and not architecture.map_cells:
-        what, remedy = "only the 2.5-D encoder makes a map", 'scene = "pillars" makes one'
-        raise InputError("REC-002", what, f"{table}: map_lookup", remedy)
     if config.export and not staged:
         what = "a model without goals cannot be exported: page and samplers ask for them"
         remedy = f"{off}; `make behavior-tables` judges such models"

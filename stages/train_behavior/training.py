@@ -11,7 +11,6 @@ from pipeline.behavior.body_denoiser import OneStageDenoiser
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import ROOT_CHANNELS, Architecture, BehaviorNets, Scaling
 from pipeline.behavior.perception import POSITION, VolumeScene
-from pipeline.behavior.pointwise import WaypointUNet
 from pipeline.core import distributed
 from pipeline.core.training import FitRecord, fit
 from stages.train_behavior.baseline_losses import gaussian_losses, one_stage_losses
@@ -164,9 +163,8 @@ def initial_nets(
     for part in (nets.goal.map, nets.goal.others):
         if part is not None:
             part.goal_std[:] = torch.from_numpy(scaling.goal_std)
-    for net in (nets.path, nets.body):
-        if isinstance(net, WaypointUNet | OneStageDenoiser):
-            net.velocity_std[:] = torch.from_numpy(scaling.velocity_std)
+    if isinstance(body, OneStageDenoiser):
+        body.velocity_std[:] = torch.from_numpy(scaling.velocity_std)
     return nets
 
 

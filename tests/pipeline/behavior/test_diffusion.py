@@ -88,7 +88,7 @@ def test_guidance_is_linear_in_its_scale():
 
 def test_control_affects_every_block_and_can_be_dropped():
     torch.manual_seed(0)
-    net = ControlUNet(4, 3, condition=8, width=8, multipliers=(1, 2)).eval()
+    net = ControlUNet(4, 3, condition=8, widths=(8, 16)).eval()
     x, t, code = torch.randn(2, 4, 56), torch.tensor([3.0, 40.0]), torch.randn(2, 8)
     keep, drop = torch.ones(2, 1), torch.zeros(2, 1)
     first, second = torch.randn(2, 3), torch.randn(2, 3)
@@ -106,8 +106,8 @@ def test_control_affects_every_block_and_can_be_dropped():
 
 def test_uncontrolled_network_equals_controlled_one_without_control():
     torch.manual_seed(0)
-    steered = ControlUNet(4, 3, condition=8, width=8, multipliers=(1, 2)).eval()
-    free = UncontrolledUNet(4, torch.nn.Linear(8, EMBEDDING), width=8, multipliers=(1, 2)).eval()
+    steered = ControlUNet(4, 3, condition=8, widths=(8, 16)).eval()
+    free = UncontrolledUNet(4, torch.nn.Linear(8, EMBEDDING), widths=(8, 16)).eval()
     free.load_state_dict(
         {name: value for name, value in steered.state_dict().items() if name in free.state_dict()}
     )

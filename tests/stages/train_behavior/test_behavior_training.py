@@ -335,12 +335,11 @@ def test_mixed_precision_is_accurate_and_keeps_float32_weights(data, shape, name
 @pytest.mark.parametrize(
     "shape",
     [
-        replace(ARCHITECTURE, map_lookup="pointwise"),
         replace(ARCHITECTURE, control="concatenation"),
         replace(ARCHITECTURE, companions=True),
         replace(ARCHITECTURE, scene="volume", observed_past="poses", body_components=0),
     ],
-    ids=["pointwise", "concatenation", "companions", "paper"],
+    ids=["concatenation", "companions", "paper"],
 )
 def test_models_of_other_architectures_are_written_and_read(data, tmp_path, shape):
     settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=2, goal_steps=1, batch=8))
@@ -573,7 +572,6 @@ def test_earlier_goals_have_the_given_probability(windows, share, lowest, highes
             "REC-002",
         ),
         (Config(family="one_stage"), "REC-002"),
-        (Config(map_lookup="pointwise", scene="volume"), "REC-002"),
         (Config(horizon_s=60.0), "BEH-001"),
     ],
 )
