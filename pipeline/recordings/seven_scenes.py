@@ -1,22 +1,20 @@
 """7-Scenes style folders: `frame-%06d.color.png|jpg`, `.depth.png` (millimeters), `.pose.txt` or none.
 
 The frame number counts at 30 Hz. Intrinsics from `camera-intrinsics.txt` or the set's default (depth camera).
-The set's pictures are those of a separate color camera. Copies in which they were brought to the depth
-camera's lens state the same intrinsics, so matches between pictures decide.
+The set's pictures are those of a separate color camera. Copies state the same intrinsics after pictures were
+rescaled to the depth camera's lens, or registered to it, so edges of pictures at depth steps decide.
 """
 
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from pipeline.geometry import cameras
 from pipeline.geometry.subsampling import evenly
-from pipeline.mapping import sift
+from pipeline.mapping.edge_agreement import edge_contrast
 from pipeline.mapping.picture_agreement import beats
 from pipeline.recordings import errors, extraction, text_files
 from pipeline.recordings.containers import FolderContainer
@@ -37,10 +35,8 @@ KINECT_DEPTH_FROM_COLOR = np.array([[1, 0, 0, 0.025], [0, 1, 0, 0], [0, 0, 1, 0]
 """the color camera is 2.5 cm to the right of the depth camera"""
 SAME_LENS_PX = 0.5
 """tolerance for given intrinsics to count as those of the data set's depth camera, as often"""
-PAIRS, GAP_S = 24, 1.2
-"""pairs of pictures in which two readings of a Kinect's folder are compared, and seconds between the two"""
-KEYPOINTS, MIN_MATCHES, INLIER_PX, FARTHEST_M = 800, 20, 2.0, 5.0
-"""SIFT keypoints per picture, minimum of matches of a pair, inlier threshold of PnP, range of depth"""
+FRAMES, FARTHEST_M = 24, 5.0
+"""frames in which readings of a Kinect's folder are compared, and the range of their depth"""
 NAME = re.compile(r"frame-([0-9]{1,18})\.(color\.(?:png|jpg|jpeg)|depth\.png|pose\.txt)\Z")
 
 
@@ -82,53 +78,34 @@ def open_recording(path: Path) -> Recording:
     if camera is not None or not kinect or np.abs(given - KINECT_DEPTH).max() >= SAME_LENS_PX:
         return stored
     camera = DepthCamera(intrinsics[0], KINECT_DEPTH_FROM_COLOR)
-    intrinsics = intrinsics_from_coefficients(np.tile(KINECT_COLOR, (len(index), 1)), container.where)
-    raw = replace(
-        stored,
-        intrinsics=intrinsics,
-        pose=_poses(container, index, files["pose"], camera),
-        depth_camera=camera,
-        remarks=(*remarks, text_files.depth_camera_remark(camera, intrinsics[0])),
+    poses = _poses(container, index, files["pose"], camera)
+    color_camera = intrinsics_from_coefficients(np.tile(KINECT_COLOR, (len(index), 1)), container.where)
+    raw, rescaled = (
+        replace(
+            stored,
+            intrinsics=lens,
+            pose=poses,
+            depth_camera=camera,
+            remarks=(*remarks, text_files.depth_camera_remark(camera, lens[0])),
+        )
+        for lens in (color_camera, intrinsics)
     )
-    registered, separate = _inliers((stored, raw)).T.astype(float)
-    if not beats(registered, separate, tests=1):
-        return raw
-    remark = "pictures match each other better with the depth camera's lens than with the color camera's"
-    return replace(stored, remarks=(*remarks, remark))
+    contrast = [_edge_contrast(each) for each in (raw, rescaled, stored)]
+    best = int(np.argmax([np.nan_to_num(each).mean() for each in contrast]))
+    return (raw, rescaled, stored)[best if beats(contrast[best], contrast[0], tests=2) else 0]
 
 
-def _inliers(readings: Sequence[Recording]) -> Int[np.ndarray, "pair reading"]:
-    """Count the points of a picture that PnP finds in a later one, by readings of the same recording.
-
-    Only points with depth in all readings count; damaged and unlike pictures are left out.
-    """
-    time_s, found = readings[0].timestamp_s, []
-    for row in evenly(len(time_s), PAIRS, rounded=True).tolist():
-        rows = row, min(int(np.searchsorted(time_s, time_s[row] + GAP_S)), len(time_s) - 1)
-        colors = [extraction.picture(readings[0], each) for each in rows]
-        grays = [cv2.cvtColor(color, cv2.COLOR_RGB2GRAY) for color in colors if color is not None]
-        if len(grays) < 2 or rows[0] == rows[1]:
+def _edge_contrast(recording: Recording) -> Float[np.ndarray, "frame"]:
+    """Return `edge_contrast` of frames spread over a recording; NaN for damaged pictures."""
+    found = []
+    for row in evenly(len(recording.index), FRAMES, rounded=True).tolist():
+        color = extraction.picture(recording, row)
+        if color is None:
+            found.append(np.nan)
             continue
-        first, second = (sift.describe(gray, KEYPOINTS) for gray in grays)
-        mine, theirs = sift.matches(first.descriptors, second.descriptors).T
-        shown = []
-        for each in readings:
-            assert each.intrinsics is not None, "a Kinect's are known"
-            depth = extraction.stored_depth(each, int(each.index[row]), FARTHEST_M)
-            lens = each.intrinsics[row]
-            shown.append((cameras.back_project_pixels(first.pixel[mine], lens, depth, lens), lens))
-        known = np.all([points[:, 2] > 0 for points, _ in shown], axis=0)
-        if known.sum() < MIN_MATCHES:
-            continue
-        inliers = [
-            cv2.solvePnPRansac(
-                points[known].astype(float), second.pixel[theirs[known]], lens, None,
-                reprojectionError=INLIER_PX, flags=cv2.SOLVEPNP_EPNP,
-            )[3]
-            for points, lens in shown
-        ]  # fmt: skip
-        found.append([0 if each is None else len(each) for each in inliers])
-    return np.array(found, int).reshape(-1, len(readings))
+        depth = extraction.stored_depth(recording, int(recording.index[row]), FARTHEST_M)
+        found.append(edge_contrast(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), depth))
+    return np.array(found)
 
 
 def _poses(

@@ -34,6 +34,8 @@ class CaptureMeasurements:
     """share of frames localized in the walk-through, 0..1"""
     parallax: Parallax | None = None
     """of a walk-through without depth"""
+    misalignment: str = ""
+    """how the depth camera seems to differ from what the recording states"""
 
 
 SHORTEST_S: dict[Role, float] = {"walkthrough": 30.0, "turnaround": 8.0, "session": 15.0, "heldout": 5.0}
@@ -66,6 +68,7 @@ REMEDIES = {
     "CAP-057": "copy the file unedited; check the unit of its depth, its intrinsics and what mirrored it",
     "CAP-058": "leave poses out that are not its own; else move slowly, along things with a pattern",
     "CAP-059": "film the room again with nobody in it; if nobody was there, ignore it (large panes of glass)",
+    "CAP-060": "describe the depth camera by depth_from_color.txt and depth_intrinsics.txt",
 }
 
 
@@ -105,6 +108,8 @@ def _of_depth(seen: CaptureMeasurements, role: Role) -> dict[str, str]:
         found["CAP-037"] = f"{1 - sample.depth_valid:.0%} of the depth is unknown"
     if sample.beyond > MAX_BEYOND:
         found["CAP-038"] = f"{sample.beyond:.0%} of the depth is beyond the sensor's range"
+    if seen.misalignment:
+        found["CAP-060"] = f"depth steps lie on edges of pictures if the depth camera {seen.misalignment}"
     return found
 
 

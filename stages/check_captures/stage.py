@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.core.errors import InputError
 from pipeline.core.videos import Role
 from pipeline.recordings.formats import open_recording
-from stages.check_captures import moving_objects, overlap, parallax, sampling
+from stages.check_captures import alignment, moving_objects, overlap, parallax, sampling
 from stages.check_captures.overlap import DescribedFrame
 from stages.check_captures.problems import CaptureMeasurements, problems
 
@@ -64,15 +64,15 @@ def _seen(
     if sample.plan is None:
         shifted = parallax.parallax(sample.shots) if role == "walkthrough" else None
         return CaptureMeasurements(sample, parallax=shifted)
-    drift_m = overlap.drift_m(sample.shots)
+    drift_m, misalignment = overlap.drift_m(sample.shots), alignment.misalignment(sample.shots)
     moving = moving_objects.find_motion(sample.shots) if role in ("walkthrough", "session") else None
     if role == "walkthrough":
         room += overlap.describe(sample.shots)
-        return CaptureMeasurements(sample, drift_m, moving)
+        return CaptureMeasurements(sample, drift_m, moving, misalignment=misalignment)
     placed = None
     if room and role != "turnaround":  # may be filmed anywhere: only the animal's template is made from it
         placed = overlap.placed_share(room, overlap.describe(sample.shots), rng)
-    return CaptureMeasurements(sample, drift_m, moving, placed)
+    return CaptureMeasurements(sample, drift_m, moving, placed, misalignment=misalignment)
 
 
 def _described(name: str, role: Role, seen: CaptureMeasurements) -> str:

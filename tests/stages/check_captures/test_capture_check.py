@@ -11,8 +11,9 @@ from pipeline.geometry import cameras, rigid
 from pipeline.geometry.meshes import RayCaster, render_view
 from pipeline.mapping import picture_agreement
 from pipeline.recordings.formats import open_recording
+from pipeline.recordings.recording import DepthCamera, reproject
 from stages.check_captures import __main__ as front
-from stages.check_captures import moving_objects, overlap, parallax, problems, sampling
+from stages.check_captures import alignment, moving_objects, overlap, parallax, problems, sampling
 from stages.check_captures.sampling import SampledFrame
 from tests.pipeline.recordings import made_formats
 from tests.stages import textured_room
@@ -150,9 +151,11 @@ def test_damaged_pictures_and_missing_depth_are_reported(tmp_path):
 
 
 def _shots(
-    seed: int, count: int, offset: np.ndarray | None = None, balls=lambda frame: ()
+    seed: int, count: int, offset: np.ndarray | None = None, balls=lambda frame: (), painted: bool = False
 ) -> list[SampledFrame]:
-    """Rendered views of a room with the given colors, with balls of (center, radius) per frame."""
+    """Rendered views of a room with the given colors, with balls of (center, radius) per frame, ``painted`` or
+    only in the depth.
+    """
     mesh = textured_room.textured_room(seed, edge_m=0.08)
     caster, size, intrinsics = (
         RayCaster(mesh),
@@ -164,7 +167,9 @@ def _shots(
         depth, hits = render_view(caster, camera, intrinsics, *size)
         color = hits.interpolate(mesh, mesh.color).reshape(*size, 3)
         for center, radius in balls(frame):
-            depth = np.minimum(depth, _ball(camera, intrinsics, size, center, radius))
+            ball = _ball(camera, intrinsics, size, center, radius)
+            color = np.where((painted & (ball < depth))[..., None], 30, color)
+            depth = np.minimum(depth, ball)
         odometry = camera if offset is None else offset @ camera
         gray = color.mean(-1).astype(np.uint8)
         small = depth[1::3, 1::3].astype(np.float32)
@@ -195,6 +200,26 @@ def test_room_is_recognized_and_another_is_not():
         sample = sampling.RecordingSample(*[None] * 2, [], 0.0)
         seen = problems.CaptureMeasurements(sample, placed=share)
         assert problems._of_content(seen, "session").keys() == describe_capture
+
+
+@pytest.mark.parametrize(
+    ("shift_m", "found"),
+    [((0.0, 0.0, 0.0), ""), ((0.025, 0.0, 0.0), "2.5 cm left"), ((0.0, -0.05, 0.0), "5 cm below")],
+)
+def test_depth_of_a_camera_beside_the_color_camera_is_reported(shift_m, found):
+    def balls(frame):
+        return [((0.5 * np.sin(frame + i), 0.2 + 0.2 * i, 0.5 * np.cos(frame + i)), 0.15) for i in range(4)]
+
+    depth_from_color = rigid.make(np.eye(3), np.array(shift_m))
+    shots = []
+    for shot, colored in zip(
+        _shots(0, 20, balls=balls), _shots(0, 20, balls=balls, painted=True), strict=True
+    ):
+        color_from_depth = DepthCamera(shot.depth_intrinsics, rigid.inverse(depth_from_color))
+        moved = reproject(shot.depth, color_from_depth, shot.depth_intrinsics, shot.depth.shape)
+        shots.append(dataclasses.replace(colored, depth=moved))
+    assert found in alignment.misalignment(shots)
+    assert bool(found) == bool(alignment.misalignment(shots))
 
 
 def test_movers_are_counted():
