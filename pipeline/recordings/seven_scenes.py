@@ -1,8 +1,8 @@
 """7-Scenes style folders: `frame-%06d.color.png|jpg`, `.depth.png` (millimeters), `.pose.txt` or none.
 
 The frame number counts at 30 Hz. Intrinsics from `camera-intrinsics.txt` or the set's default (depth camera).
-The set's pictures are those of a separate color camera. Copies state the same intrinsics after pictures were
-rescaled to the depth camera's lens, or registered to it, so edges of pictures at depth steps decide.
+The set's pictures are those of a separate color camera. Copies whose pictures were brought to the depth
+camera's lens state the same intrinsics, so edges of pictures at depth steps decide.
 """
 
 import re
@@ -36,7 +36,7 @@ KINECT_DEPTH_FROM_COLOR = np.array([[1, 0, 0, 0.025], [0, 1, 0, 0], [0, 0, 1, 0]
 SAME_LENS_PX = 0.5
 """tolerance for given intrinsics to count as those of the data set's depth camera, as often"""
 FRAMES, FARTHEST_M = 24, 5.0
-"""frames in which readings of a Kinect's folder are compared, and the range of their depth"""
+"""frames in which both readings of a Kinect's folder are compared, and the range of their depth"""
 NAME = re.compile(r"frame-([0-9]{1,18})\.(color\.(?:png|jpg|jpeg)|depth\.png|pose\.txt)\Z")
 
 
@@ -78,21 +78,15 @@ def open_recording(path: Path) -> Recording:
     if camera is not None or not kinect or np.abs(given - KINECT_DEPTH).max() >= SAME_LENS_PX:
         return stored
     camera = DepthCamera(intrinsics[0], KINECT_DEPTH_FROM_COLOR)
-    poses = _poses(container, index, files["pose"], camera)
-    color_camera = intrinsics_from_coefficients(np.tile(KINECT_COLOR, (len(index), 1)), container.where)
-    raw, rescaled = (
-        replace(
-            stored,
-            intrinsics=lens,
-            pose=poses,
-            depth_camera=camera,
-            remarks=(*remarks, text_files.depth_camera_remark(camera, lens[0])),
-        )
-        for lens in (color_camera, intrinsics)
+    lens = intrinsics_from_coefficients(np.tile(KINECT_COLOR, (len(index), 1)), container.where)
+    raw = replace(
+        stored,
+        intrinsics=lens,
+        pose=_poses(container, index, files["pose"], camera),
+        depth_camera=camera,
+        remarks=(*remarks, text_files.depth_camera_remark(camera, lens[0])),
     )
-    contrast = [_edge_contrast(each) for each in (raw, rescaled, stored)]
-    best = int(np.argmax([np.nan_to_num(each).mean() for each in contrast]))
-    return (raw, rescaled, stored)[best if beats(contrast[best], contrast[0], tests=2) else 0]
+    return stored if beats(_edge_contrast(stored), _edge_contrast(raw), tests=1) else raw
 
 
 def _edge_contrast(recording: Recording) -> Float[np.ndarray, "frame"]:

@@ -47,7 +47,7 @@ def find_motion(shots: Sequence[SampledFrame]) -> MotionShare | None:
     animals = [[at for at, area in found if ANIMAL_M2[0] < area < ANIMAL_M2[1]] for found in clusters]
     seen = float(np.mean([bool(found) for found in animals]))
     apart = [[np.linalg.norm(a - b) for a, b in itertools.combinations(found, 2)] for found in animals]
-    several = float(np.mean([max(each, default=0.0) > TWO_APART_M for each in apart]))
+    several = float(np.mean([float(max(each, default=0.0)) > TWO_APART_M for each in apart]))
     large = float(np.mean([any(area > LARGE_M2 for _, area in found) for found in clusters]))
     return MotionShare(seen, several, large)
 
