@@ -37,28 +37,19 @@ ABSENT_M = 100.0
 
 @dataclass(frozen=True)
 class Sequence:
-    """A 7-Scenes style folder: color, depth in meters (0 unknown), poses, one pinhole for both."""
+    """A raw 7-Scenes folder; its depth is reprojected into the color camera: one pinhole for both."""
 
     folder: Path
     numbers: tuple[int, ...]
-    registered: bool
-    """Whether depth is reprojected into the color camera; otherwise color is only rescaled to the focal length of the
-    depth camera."""
 
     @property
     def intrinsics(self) -> Float[np.ndarray, "3 3"]:
         """Return the intrinsics shared by color and depth, pixels."""
-        focal = COLOR_FOCAL_PX if self.registered else DEPTH_FOCAL_PX
-        return np.array([[focal, 0, 320.0], [0, focal, 240.0], [0, 0, 1]])
+        return np.array([[COLOR_FOCAL_PX, 0, 320.0], [0, COLOR_FOCAL_PX, 240.0], [0, 0, 1]])
 
     def color(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
         """Read a picture, RGB."""
-        picture = images.read_color(self._path(index, "color.jpg"))
-        if self.registered:
-            return np.ascontiguousarray(picture)
-        zoom = DEPTH_FOCAL_PX / COLOR_FOCAL_PX
-        matrix = np.array([[zoom, 0, (1 - zoom) * 320], [0, zoom, (1 - zoom) * 240]])
-        return cv2.warpAffine(picture, matrix, (640, 480), flags=cv2.INTER_CUBIC)
+        return np.ascontiguousarray(images.read_color(self._path(index, "color.jpg")))
 
     def depth(self, index: int) -> Float[np.ndarray, "height width"]:
         """Read depth, meters."""
@@ -67,13 +58,12 @@ class Sequence:
             / MILLIMETERS
         )
         raw[raw > FARTHEST_M] = 0
-        return _reproject_depth(raw, DEPTH_FOCAL_PX, COLOR_FOCAL_PX, BASELINE_M) if self.registered else raw
+        return _reproject_depth(raw, DEPTH_FOCAL_PX, COLOR_FOCAL_PX, BASELINE_M)
 
     def poses(self) -> Float[np.ndarray, "frame 4 4"]:
         """Read `world_from_camera`, rotated so that +y is up."""
         given = np.stack([np.loadtxt(self._path(index, "pose.txt")) for index in range(len(self.numbers))])
-        if self.registered:
-            given = given @ rigid.make(np.eye(3), np.array([BASELINE_M, 0, 0]))
+        given = given @ rigid.make(np.eye(3), np.array([BASELINE_M, 0, 0]))
         return align_gravity(self.view, given)
 
     def view(self, index: int) -> DepthImage:

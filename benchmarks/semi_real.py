@@ -4,14 +4,14 @@ sequence, with exact ground truth.
 Each recording is a 7-Scenes style folder that `extract_frames` reads, with the ground truth in a separate folder. The
 animal enters and leaves the scene; many frames show none.
 
-    python -m benchmarks.semi_real draw SEQUENCE OUT --seeds 1 2 [--first 500 --step 3] [--registered]
+    python -m benchmarks.semi_real draw SEQUENCE OUT --seeds 1 2 [--first 500 --step 3]
     python -m benchmarks.semi_real score OUT [--masks masks]
 
 For a whole build, the walk-through is another part of the sequence without the animal, and the turnaround is that of
 the built-in capture with the same coat; sessions have no poses, so that registration has no odometry.
 
-    python -m benchmarks.semi_real draw SEQUENCE OUT --empty --last 499 --registered
-    python -m benchmarks.semi_real draw SEQUENCE OUT --seeds 1 2 --coat 8 --first 500 --registered --no-poses
+    python -m benchmarks.semi_real draw SEQUENCE OUT --empty --last 499
+    python -m benchmarks.semi_real draw SEQUENCE OUT --seeds 1 2 --coat 8 --first 500 --no-poses
     cp -r OUT/recordings/* build/toy/synthetic_capture/recordings/turnaround.r3d captures/kitchen/
     cp agents/toy.toml agents/kitchen.toml && make kitchen.registration
     python -m benchmarks.semi_real registration build/kitchen OUT/truth build/toy/synthetic_capture/truth \\
@@ -234,9 +234,6 @@ def main() -> None:
         "--step", type=int, default=3, help="stride of frames; negative: in reverse order"
     )
     draw_parser.add_argument(
-        "--registered", action="store_true", help="reproject depth into the color camera"
-    )
-    draw_parser.add_argument(
         "--coat", type=int, help="seed of the animal's appearance; default: the seed of the recording"
     )
     draw_parser.add_argument("--empty", action="store_true", help="render no animal: a walk-through")
@@ -261,7 +258,7 @@ def main() -> None:
         )
         numbers = [n for n in known if arguments.first <= n <= arguments.last][:: arguments.step]
         render = RenderConfig(arguments.coat, arguments.empty, not arguments.no_poses)
-        sequence = Sequence(arguments.sequence, tuple(numbers), arguments.registered)
+        sequence = Sequence(arguments.sequence, tuple(numbers))
         for seed in arguments.seeds:
             draw(
                 sequence, arguments.out, "walkthrough" if arguments.empty else f"session-{seed}", seed, render
