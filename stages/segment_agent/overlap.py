@@ -16,7 +16,7 @@ from stages.segment_agent.free_space import References
 
 Subject = Literal["moving", "resting", "one of several"]
 """what masks are of: a moving animal; one that may rest all the time, so that unseen space is right; one of
-several. Only the first has false negatives"""
+several, which were recognized, so that unseen space does not count. Only the first has false negatives"""
 EVERY = 2
 """every how many frames are evaluated: masks of consecutive frames err alike"""
 
@@ -39,8 +39,9 @@ def estimate(
         points, area_m2, chosen = free_space.sample(clip, frame, pose, inner, locate.COARSE_PX)
         labels = locate.resample_nearest(masks[frame], clip.depth_size, chosen)
         votes = free_space.vote(room, points, frame)
-        inside, right = labels == 255, movers.moving(votes)
-        right |= (shown == "resting") & (votes.occupied == 0)
+        right = movers.moving(votes) | ((shown == "resting") & (votes.occupied == 0))
+        seen = (shown != "one of several") | (votes.free + votes.occupied > 0)
+        inside = (labels == 255) & (right | seen)
         intersection_m2.append(area_m2[inside & right].sum())
         union_m2.append(area_m2[inside].sum())
         outside = locate.opened_motion(votes, movers.SURE_SHARES[0]) & (labels == 0) & (shown == "moving")
