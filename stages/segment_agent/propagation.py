@@ -1,7 +1,7 @@
 """Propagate the mask of one frame through a recording without depth.
 
 The log-odds of all pixels of all frames are a mean field (Krahenbuhl and Koltun 2011), updated frame by
-frame, forward and back. The unary is the mean of two networks of `appearance`, of which one sees motion
+frame, forward and back. The unary is the mean of four networks of `appearance`, of which two see motion
 against the background beside the colors. Messages come from the frames 1, 2, 4 and 8 before and after along
 the flow, as far as its two directions agree, and from neighbors in the picture up to its edges (domain
 transform, Gastal and Oliveira 2011). The networks learn from the one mask, then from all frames where motion
@@ -35,6 +35,8 @@ CERTAIN, PROMPTED_SHARE = 2.0, 0.17
 """log-odds of training pixels; share of the prompted frame among the examples"""
 CROP_PX, STEPS = 112, (80, 120, 120)
 """side of training crops; training steps on the prompted frame, on all, and again on all"""
+NETWORKS = 2
+"""networks per kind of picture, which are averaged: masks by single ones depend on their initial weights"""
 
 LogOdds = Float[np.ndarray, "height width"]
 Beliefs = list[LogOdds | None]
@@ -53,12 +55,12 @@ def propagate(
     for iteration, steps in enumerate(STEPS):
         options = replace(learning, steps=steps, crop_px=CROP_PX)
         unary = np.zeros((len(frames), *footage.size), np.float16)
-        for picture in (footage.color, footage.with_motion):
+        for picture in (footage.color,) * NETWORKS + (footage.with_motion,) * NETWORKS:
             shown = examples(footage, found, prompted, learning.examples, picture)
             network = learn(shown, options, rng, min_px=1, scaled=0.0)
             assert network is not None, "the prompted frame shows the animal"
             for frame in frames:
-                unary[frame] += network.log_odds(picture(frame)) / 2
+                unary[frame] += network.log_odds(picture(frame)) / (2 * NETWORKS)
         unary[prompted][~possible] = -np.inf
         for frame in [*(forward[::-1] if iteration else []), *forward, prompted]:
             found[frame] = update_frame(footage, frame, unary[frame], found)
