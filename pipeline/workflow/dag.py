@@ -107,7 +107,8 @@ class Node:
     stands_in_for: str | None = None
     """Artifact that it replaces as an input of other nodes, for those recordings."""
     of_several: bool = False
-    """Made and read only in a home of several animals, once for all of them."""
+    """Made and read only in a home of several animals, once for all of them; an input of those recordings
+    that have it."""
     begins_animal: bool = False
     """In a home of several animals it and everything downstream is made per animal."""
 
