@@ -12,17 +12,22 @@ MIN_PIXELS = 100
 """minimum pixels at depth steps"""
 
 
-def edge_contrast(gray: UInt8[np.ndarray, "height width"], depth: Float[np.ndarray, "height width"]) -> float:
-    """Return how much stronger the picture's gradients are on the near side of depth steps than elsewhere.
+def relative_gradient(gray: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """Return gradients of a picture relative to their local mean, which light and texture change."""
+    smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), BLUR_PX)
+    gradient = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
+    return gradient / (cv2.blur(gradient, (NEIGHBORHOOD_PX, NEIGHBORHOOD_PX)) + MIN_GRADIENT)
 
-    Gradients are relative to their local mean, which light and texture change. ``depth`` is registered to
-    the picture and of its size; NaN without enough steps.
+
+def edge_contrast(
+    gradient: Float[np.ndarray, "height width"], depth: Float[np.ndarray, "height width"]
+) -> float:
+    """Return how much stronger `relative_gradient` is on the near side of depth steps than elsewhere.
+
+    ``depth`` is registered to the picture and of its size; NaN without enough steps.
     """
     far = cv2.dilate(depth, np.ones((3, 3), np.uint8))
     step = (depth > 0) & (far > depth * (1 + STEP_SHARE) + STEP_M)
     if step.sum() < MIN_PIXELS:
         return np.nan
-    smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), BLUR_PX)
-    gradient = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
-    gradient /= cv2.blur(gradient, (NEIGHBORHOOD_PX, NEIGHBORHOOD_PX)) + MIN_GRADIENT
     return float(gradient[step].mean() - gradient[depth > 0].mean())

@@ -6,6 +6,7 @@ camera's lens state the same intrinsics, so edges of pictures at depth steps dec
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.geometry.subsampling import evenly
-from pipeline.mapping.edge_agreement import edge_contrast
+from pipeline.mapping.edge_agreement import edge_contrast, relative_gradient
 from pipeline.mapping.picture_agreement import beats
 from pipeline.recordings import errors, extraction, text_files
 from pipeline.recordings.containers import FolderContainer
@@ -86,20 +87,22 @@ def open_recording(path: Path) -> Recording:
         depth_camera=camera,
         remarks=(*remarks, text_files.depth_camera_remark(camera, lens[0])),
     )
-    return stored if beats(_edge_contrast(stored), _edge_contrast(raw), tests=1) else raw
+    as_stored, as_raw = _edge_contrasts((stored, raw)).T
+    return stored if beats(as_stored, as_raw, tests=1) else raw
 
 
-def _edge_contrast(recording: Recording) -> Float[np.ndarray, "frame"]:
-    """Return `edge_contrast` of frames spread over a recording; NaN for damaged pictures."""
-    found = []
+def _edge_contrasts(readings: Sequence[Recording]) -> Float[np.ndarray, "frame reading"]:
+    """Return `edge_contrast` of frames spread over a recording, by its readings; no damaged pictures."""
+    recording, found = readings[0], []
     for row in evenly(len(recording.index), FRAMES, rounded=True).tolist():
         color = extraction.picture(recording, row)
         if color is None:
-            found.append(np.nan)
             continue
-        depth = extraction.stored_depth(recording, int(recording.index[row]), FARTHEST_M)
-        found.append(edge_contrast(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), depth))
-    return np.array(found)
+        gradient = relative_gradient(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY))
+        number = int(recording.index[row])
+        depths = [extraction.stored_depth(each, number, FARTHEST_M) for each in readings]
+        found.append([edge_contrast(gradient, depth) for depth in depths])
+    return np.array(found, float).reshape(-1, len(readings))
 
 
 def _poses(

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Float
 
 from pipeline.geometry import rigid
-from pipeline.mapping.edge_agreement import edge_contrast
+from pipeline.mapping.edge_agreement import edge_contrast, relative_gradient
 from pipeline.mapping.picture_agreement import beats
 from pipeline.recordings.recording import DepthCamera, reproject
 from stages.check_captures.sampling import SampledFrame
@@ -21,26 +20,27 @@ SHIFTS_M, FOCAL_FACTORS = (-0.05, -0.025, 0.025, 0.05), (0.9, 1.1)
 
 def misalignment(shots: Sequence[SampledFrame]) -> str:
     """Return which other depth camera explains edges significantly better than the stored one; "" if none."""
-    stored = _contrasts(shots)
-    found = {}
+    readings = {"": (0.0, 0.0, 1.0)}
     for x, y in [(shift, 0.0) for shift in SHIFTS_M] + [(0.0, shift) for shift in SHIFTS_M]:
         side = ("right" if x < 0 else "left") if x else ("below" if y < 0 else "above")
-        found[f"is {100 * abs(x + y):g} cm {side} of the color camera"] = _contrasts(shots, (x, y, 0.0))
+        readings[f"is {100 * abs(x + y):g} cm {side} of the color camera"] = x, y, 1.0
     for factor in FOCAL_FACTORS:
-        found[f"has {factor:g} times the focal length"] = _contrasts(shots, focal=factor)
-    better = {name: each for name, each in found.items() if beats(each, stored, tests=len(found))}
+        readings[f"has {factor:g} times the focal length"] = 0.0, 0.0, factor
+    contrasts = np.array([_contrasts(shot, list(readings.values())) for shot in shots])
+    stored, *others = contrasts.reshape(-1, len(readings)).T
+    names = list(readings)[1:]
+    better = {name: each for name, each in zip(names, others, strict=True) if beats(each, stored, len(names))}
     return max(better, key=lambda name: float(np.nanmean(better[name])), default="")
 
 
-def _contrasts(
-    shots: Sequence[SampledFrame], shift_m: Sequence[float] = (0.0, 0.0, 0.0), focal: float = 1.0
-) -> Float[np.ndarray, "shot"]:
-    """Return `edge_contrast` of shots if the depth camera were shifted or had another focal length."""
-    contrasts, depth_from_color = [], rigid.make(np.eye(3), np.array(shift_m))
-    for shot in shots:
+def _contrasts(shot: SampledFrame, readings: Sequence[tuple[float, float, float]]) -> list[float]:
+    """Return `edge_contrast` by readings: x and y of the depth camera (meters), factor on its focal."""
+    depths = []
+    for x, y, focal in readings:
         lens = shot.depth_intrinsics.copy()
         lens[[0, 1], [0, 1]] *= focal
-        depth = reproject(shot.depth, DepthCamera(lens, depth_from_color), shot.intrinsics, shot.gray.shape)
-        gray = cv2.resize(shot.gray, depth.shape[::-1], interpolation=cv2.INTER_AREA)
-        contrasts.append(edge_contrast(gray, depth))
-    return np.array(contrasts)
+        camera = DepthCamera(lens, rigid.make(np.eye(3), np.array([x, y, 0.0])))
+        depths.append(reproject(shot.depth, camera, shot.intrinsics, shot.gray.shape))
+    gray = cv2.resize(shot.gray, depths[0].shape[::-1], interpolation=cv2.INTER_AREA)
+    gradient = relative_gradient(gray)
+    return [edge_contrast(gradient, depth) for depth in depths]
