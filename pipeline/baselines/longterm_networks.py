@@ -26,7 +26,7 @@ class AblationSpec:
     """RouteNet predicts orientations; else PoseNet does"""
     paper: bool = False
     """RouteNet makes no draft and reads positions, orientations and scene points only; PoseNet has no
-    `Strides` and is trained along such routes"""
+    `GaitPhase` and is trained along such routes"""
     follows_route: bool = True
     """PoseNet is conditioned on the route"""
     one: bool = False
