@@ -20,7 +20,7 @@ from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels, channels
 from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.planning import Observation, Sampler, observe
 from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.trajectories import ABSENT_M, KINDS, TRAIN, BehaviorData, Context, Trajectory
+from pipeline.behavior.trajectories import ABSENT_M, TRAIN, BehaviorData, Context, Trajectory, as_companions
 from pipeline.geometry import rigid
 
 
@@ -58,9 +58,9 @@ class AnimalBatch:
 
     Animals of the same ``life``, and companions from outside of the batch, are perceived and avoided. All
     animals that need a plan share one batch of sampling. A plan is followed until it ends, a perceived being
-    moves, or the commanded goal changes. Beside companions, which move all the time, an animal keeps its
-    intent until the horizon has passed: of several candidates it takes the one nearest to what is left of its
-    plan. ``plans_drawn`` counts the plans.
+    moves, or the commanded goal changes. Beside companions, which move all the time, an animal keeps its goal
+    until the horizon has passed: of several paths there it takes the one nearest to what is left of its plan.
+    ``plans_drawn`` counts the plans.
     """
 
     def __init__(
@@ -228,7 +228,7 @@ class AnimalBatch:
         self, some: Int[np.ndarray, "some"], intent: Float[np.ndarray, "some frame 3"] | None = None
     ) -> tuple[PoseFrames, Float[np.ndarray, "some 3"], Float[np.ndarray, "some"]]:
         """Draw plans for some of the animals: of several candidates the least blocked, and of those the
-        nearest to the ``intent``; without one, the first unless it is blocked.
+        nearest to the ``intent``, whose end is their goal; without one, the first unless it is blocked.
         """
         root, channels = (
             np.concatenate([getattr(frame, name) for frame in self.past], axis=1)[some]
@@ -241,8 +241,10 @@ class AnimalBatch:
         frame = world_from_ego(root[:, -1], self.ego)
         boneless = observation.boneless(self.sampler.scaling.body_mean)
         self.plans_drawn += len(some)
-        commanded = rigid.apply(rigid.inverse(frame), self.goal_command[some][:, None])[:, 0]
         intent = np.full((len(some), 1, 3), np.nan) if intent is None else intent
+        end = intent[np.arange(len(some)), np.isfinite(intent[..., 0]).sum(1) - 1]
+        goal = np.where(np.isnan(end), self.goal_command[some], end)
+        commanded = rigid.apply(rigid.inverse(frame), goal[:, None])[:, 0]
         count = self.chaining.candidates if np.isfinite(intent).any() else 1
         goal, path, blocked = self._least_blocked(boneless, frame, video, count, commanded, intent)
         again = np.flatnonzero(blocked)
@@ -375,13 +377,6 @@ class Simulator:
         bones = bones_from_channels(now.bones[0, 0], self.rest)
         time_s, goal = self.frame / self.data.rate_hz, self.animals.goal[0].copy()
         return SimulatorState(time_s, now.root[0, 0], bones, goal, float(self.animals.blocked[0]))
-
-
-def as_companions(
-    positions_world: Float[np.ndarray, "animal past_frame 3"],
-) -> Float[np.ndarray, "animal past_frame 4"]:
-    """Return the tracks of animals as companions: positions and kind."""
-    return np.pad(positions_world, ((0, 0), (0, 0), (0, 1)), constant_values=KINDS.index("animal"))
 
 
 def blended_frames(old: PoseFrames, new: PoseFrames, frames: int) -> PoseFrames:

@@ -248,6 +248,13 @@ class BehaviorData:
         return whole
 
 
+def as_companions(
+    positions_world: Float[np.ndarray, "animal past_frame 3"],
+) -> Float[np.ndarray, "animal past_frame 4"]:
+    """Return the tracks of animals as companions: positions and kind."""
+    return np.pad(positions_world, ((0, 0), (0, 0), (0, 1)), constant_values=KINDS.index("animal"))
+
+
 def nearest(
     companions: Float[np.ndarray, "window companion past_frame 4"], agent: Float[np.ndarray, "window 3"]
 ) -> Float[np.ndarray, "window some past_frame 4"]:

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.behavior.avoidance import clearance_of
-from pipeline.behavior.simulator import SimulatorState, as_companions
-from pipeline.behavior.trajectories import RATE_HZ, TRAIN, BehaviorData, Trajectory
+from pipeline.behavior.simulator import SimulatorState
+from pipeline.behavior.trajectories import RATE_HZ, TRAIN, BehaviorData, Trajectory, as_companions
 from pipeline.data import images
 from pipeline.geometry import views
 from pipeline.geometry.meshes import Mesh

@@ -12,8 +12,16 @@ from pipeline.behavior.encoders import ATTENDED_CHANNELS, HEADS, OthersEncoder
 from pipeline.behavior.model import BehaviorNets
 from pipeline.behavior.planning import Sampler, TorchNetworks, observe
 from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.simulator import AnimalBatch, as_companions
-from pipeline.behavior.trajectories import ABSENT_M, KINDS, MAX_COMPANIONS, PAST, BehaviorData, nearest
+from pipeline.behavior.simulator import AnimalBatch
+from pipeline.behavior.trajectories import (
+    ABSENT_M,
+    KINDS,
+    MAX_COMPANIONS,
+    PAST,
+    BehaviorData,
+    as_companions,
+    nearest,
+)
 from stages.train_behavior.objective import with_some_absent
 from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, scaling, wandering
 
@@ -275,6 +283,17 @@ def test_replanning_keeps_the_intent_until_the_horizon_of_the_first_plan(sampler
     kept = [frame + end for frame, end in ends if frame < horizon - animals.chaining.blend_frames]
     assert len(kept) > 2 and set(kept) == {horizon}
     assert ends[-1][0] + ends[-1][1] > horizon
+
+
+def test_the_next_plan_has_the_goal_of_the_intent(sampler):
+    animals, at = beside_a_companion(sampler)
+    first, far = np.array([0]), np.full((1, 3), ABSENT_M)
+    for _ in range(5):
+        animals.step(far, at(np.array([0.1, 0.0, 0.2])))
+    intent = animals._intent(first)[0, : animals.plan_frames - 5]
+    plans = [animals._draw_plans(first, wanted)[1][0] for wanted in (intent[None], None)]
+    np.testing.assert_allclose(plans[0], intent[-1], atol=1e-4)
+    assert np.linalg.norm(plans[1] - intent[-1]) > 1e-2, "drawn anew without"
 
 
 def test_candidate_nearest_to_the_intent_is_followed(sampler):

@@ -10,8 +10,7 @@ from playwright.sync_api import Browser, Page
 from pipeline.baselines.predictors import Ats
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.simulator import as_companions
-from pipeline.behavior.trajectories import BehaviorData, Context
+from pipeline.behavior.trajectories import BehaviorData, Context, as_companions
 from tests.stages.export_simulator import browser, small_world, twins
 from tests.stages.export_simulator.test_page import check_golden
 
@@ -62,7 +61,7 @@ def test_animals_perceive_each_other_as_in_python(home: Path, animals: Path, chr
         assert wrong == []
 
 
-def test_plan_nearest_to_the_intent_is_taken(home: Path, chromium: Browser) -> None:
+def test_plan_has_the_goal_of_the_intent(home: Path, chromium: Browser) -> None:
     with browser.shown(chromium, (home / "index.html").as_uri()) as (page, wrong):
         page.wait_for_function(ALL_PLAN, timeout=60_000)
         page.evaluate("ats.pause()")
@@ -75,9 +74,8 @@ def test_plan_nearest_to_the_intent_is_taken(home: Path, chromium: Browser) -> N
                 " ({ goals, chosen, end: path.at(-1) }))",
                 goal.tolist(),
             )
-            np.testing.assert_allclose(plan["goals"], goals, atol=1e-6)
-            off = np.linalg.norm(goals - goal, axis=1)
-            assert off[plan["chosen"]] <= np.sort(off)[3] + 1e-6, "one of the four nearest goals"
+            np.testing.assert_allclose(plan["goals"], [goal], atol=1e-4)
+            assert plan["chosen"] == 0
             ends.append(plan["end"])
         assert np.ptp(np.array(ends), axis=0).max() > 0.1, "meters"
         assert wrong == []

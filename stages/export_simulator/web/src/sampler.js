@@ -273,12 +273,15 @@ export class Sampler {
     const codes = await this.codes(bare, question.keep, question.interactivity);
     const commanded = Boolean(question.aim);
     const leg = commanded && this.leg(frame, question.aim, question.raised, options.detour);
-    const scaled = commanded ? leg.scaled : await this.sampledGoals(codes, question.samples, options);
+    // the goal that it keeps until the horizon
+    const kept = !commanded && question.intent?.at(-1);
+    const given = kept ? Float32Array.from(this.scaled(apply(inverse(frame), kept))) : leg.scaled;
+    const scaled = given ?? (await this.sampledGoals(codes, question.samples, options));
     const keepGoal = commanded ? 1 : question.keep.goal;
     const goals = this.goalsInWorld(frame, scaled);
-    const tried = commanded
+    const tried = given
       ? Array(Math.min(CANDIDATES, question.samples)).fill(0)
-      : this.insideFirst(goals, question.intent?.at(-1)).slice(0, CANDIDATES);
+      : this.insideFirst(goals).slice(0, CANDIDATES);
     const targets = Float32Array.from(
       tried.flatMap((index) => Array.from(scaled.subarray(3 * index, 3 * index + 3))),
     );
@@ -309,12 +312,10 @@ export class Sampler {
     return { goals, chosen: tried[best], ...lived, cleared: arrives ? lived.path.at(-1) : null };
   }
 
-  // The numbers of goals, those that lie in the allowed space first, then those nearest to where the animal
-  // intends to end, otherwise as sampled.
-  insideFirst(goals, end) {
+  // The numbers of goals, those that lie in the allowed space first, otherwise as sampled.
+  insideFirst(goals) {
     const inside = goals.map((goal) => this.senses.allows(goal));
-    const off = goals.map((goal) => (end ? distance(goal, end) : 0));
-    return goals.map((_, i) => i).sort((a, b) => inside[b] - inside[a] || off[a] - off[b] || a - b);
+    return goals.map((_, i) => i).sort((a, b) => inside[b] - inside[a] || a - b);
   }
 
   // A visitor's goal binds: bend a scaled path so that it is there (on the floor plan) when a walk at the
