@@ -53,9 +53,7 @@ class Reader:
 def _recording(path: Path) -> None:
     recording = open_recording(path)
     plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, max_side_px=640)
-    for _, frame in zip(
-        range(2), extraction.frames(recording, plan, max_depth_m=6.0, jpeg_quality=80), strict=False
-    ):
+    for _, frame in zip(range(2), extraction.frames(recording, plan, max_depth_m=6.0), strict=False):
         assert frame is None or frame.depth.ndim == 2
 
 

@@ -75,7 +75,7 @@ class ExtractedFrame:
     """One upright frame."""
 
     color: UInt8[np.ndarray, "height width 3"]
-    jpeg: bytes
+    jpeg: bytes | None
     """the phone's original bytes if the picture is unchanged"""
     depth: Float[np.ndarray, "depth_height depth_width"]
     """meters, 0 = unknown"""
@@ -234,7 +234,7 @@ def picture(
 
 
 def frames(
-    recording: Recording, plan: ExtractionPlan, *, max_depth_m: float, jpeg_quality: int
+    recording: Recording, plan: ExtractionPlan, *, max_depth_m: float
 ) -> Iterator[ExtractedFrame | None]:
     """Yield the plan's frames in order, upright; None for damaged ones."""
     for number in recording.index[plan.chosen]:
@@ -251,10 +251,7 @@ def frames(
             turned = (cameras.turn_image(image, plan.quarter_turns) for image in (color, depth, confidence))
             color, depth, confidence = turned
         as_stored = not plan.quarter_turns and plan.stored_size == recording.color_size
-        if as_stored and isinstance(stored, bytes) and stored[:2] == JPEG:
-            jpeg = stored
-        else:
-            jpeg = images.encode_jpeg(color, jpeg_quality)
+        jpeg = stored if as_stored and isinstance(stored, bytes) and stored[:2] == JPEG else None
         sharpness, brightness = picture_statistics(color)
         yield ExtractedFrame(color, jpeg, depth, confidence, sharpness, brightness, float((depth > 0).mean()))
 

@@ -14,8 +14,8 @@ from pipeline.recordings import errors, extraction
 from pipeline.recordings.extraction import ExtractionPlan
 from pipeline.recordings.recording import Recording
 
-SIDE_PX, JPEG_QUALITY = 640, 50
-"""of the pictures, which are not kept"""
+SIDE_PX = 640
+"""of the pictures"""
 DEPTH_SIDE_PX = 192
 """longer side of the sampled depth"""
 BLURRED_SHARE = 0.4
@@ -111,7 +111,7 @@ def sample(recording: Recording, count: int, *, max_depth_m: float) -> Recording
     plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=max_depth_m, max_side_px=SIDE_PX)
     rows, shots = evenly(len(plan.chosen), count, rounded=True), []
     sample = replace(plan, chosen=plan.chosen[rows])
-    frames = extraction.frames(recording, sample, max_depth_m=max_depth_m, jpeg_quality=JPEG_QUALITY)
+    frames = extraction.frames(recording, sample, max_depth_m=max_depth_m)
     for row, frame in zip(rows, frames, strict=True):
         if frame is not None:
             raw = recording.read_depth(int(recording.index[plan.chosen[row]]))

@@ -76,7 +76,7 @@ def map_pictures(
         scale=scale,
     )
     upright_frames = zip(pictures, depth, confidence, strict=True)
-    frames = (_frame(*each, turns, settings.jpeg_quality) for each in upright_frames)
+    frames = (_frame(*each, turns) for each in upright_frames)
     return plan, frames, _summary(recording, rows, solved, scale)
 
 
@@ -188,13 +188,11 @@ def _unit_m(
     return TYPICAL_DEPTH_M / float(np.median(known)) if len(known) else 1.0, extraction.RELATIVE
 
 
-def _frame(
-    picture: np.ndarray, depth: np.ndarray, confidence: np.ndarray, turns: int, jpeg_quality: int
-) -> ExtractedFrame:
+def _frame(picture: np.ndarray, depth: np.ndarray, confidence: np.ndarray, turns: int) -> ExtractedFrame:
     confidence = np.where(depth > 0, confidence, 0).astype(np.uint8)
     color, depth, confidence = (cameras.turn_image(image, turns) for image in (picture, depth, confidence))
-    jpeg, statistics = images.encode_jpeg(color, jpeg_quality), extraction.picture_statistics(color)
-    return ExtractedFrame(color, jpeg, depth, confidence, *statistics, float((depth > 0).mean()))
+    statistics = extraction.picture_statistics(color)
+    return ExtractedFrame(color, None, depth, confidence, *statistics, float((depth > 0).mean()))
 
 
 def _summary(recording: Recording, rows: np.ndarray, solved: Structure, scale: str) -> str:

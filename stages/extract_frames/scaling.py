@@ -33,8 +33,8 @@ MIN_PAIRS = 4
 AGREE_SHARE = 0.1
 """relative difference of scale within which pairs are consistent"""
 RANSAC_TRIALS = 2000
-RATE_HZ, MAX_DEPTH_M, MAX_SIDE_PX, JPEG_QUALITY = 10.0, 5.0, 640, 50
-"""extraction settings for recordings with depth, whose pictures are not kept"""
+RATE_HZ, MAX_DEPTH_M, MAX_SIDE_PX = 10.0, 5.0, 640
+"""extraction settings for recordings with depth"""
 
 
 def meters_per_unit(mapped: Sequence[SiftPoints], measured: Recording, seed: int) -> float | None:
@@ -55,7 +55,7 @@ def _described(recording: Recording) -> Iterator[SiftPoints]:
     plan = extraction.understand(recording, rate_hz=RATE_HZ, max_depth_m=MAX_DEPTH_M, max_side_px=MAX_SIDE_PX)
     rows = evenly(len(plan.chosen), FRAMES, rounded=True)
     sample = replace(plan, chosen=plan.chosen[rows])
-    frames = extraction.frames(recording, sample, max_depth_m=MAX_DEPTH_M, jpeg_quality=JPEG_QUALITY)
+    frames = extraction.frames(recording, sample, max_depth_m=MAX_DEPTH_M)
     for row, frame in zip(rows, frames, strict=True):
         if frame is not None:
             gray, lens = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), plan.depth_intrinsics[row]

@@ -47,7 +47,7 @@ def run(
         plan = extraction.understand(
             recording, rate_hz=config.rate_hz, max_side_px=config.max_side_px, **reach
         )
-        frames = extraction.frames(recording, plan, jpeg_quality=config.jpeg_quality, **reach)
+        frames = extraction.frames(recording, plan, **reach)
         summary = extraction.summary(recording, plan)
         agreement = extraction.picture_agreement_of(recording, plan, **reach)
     progress.log(summary)
@@ -55,8 +55,6 @@ def run(
         progress.log(f"{agreement.reason}; correlation {agreement.correlation:.2f}")
     total = len(plan.chosen)
     tracked = progress.track(frames, "frames", total=total)
-    written = writing.write_frames(
-        out, tracked, total=total, min_depth_valid=config.min_depth_valid, where=recording.where
-    )
+    written = writing.write_frames(out, tracked, config, total=total, where=recording.where)
     writing.write_table(out, recording, plan, written)
     writing.report_quality(out, recording, plan, written, agreement, rate_hz=config.rate_hz)

@@ -15,6 +15,7 @@ from pipeline.mapping.picture_agreement import PictureAgreement
 from pipeline.recordings import errors, extraction
 from pipeline.recordings.extraction import DARK, MEASURED, RELATIVE, ExtractedFrame, ExtractionPlan
 from pipeline.recordings.recording import Recording
+from stages.extract_frames.config import Config
 
 MAX_LOST = 0.5
 """maximum share of damaged pictures (0..1)"""
@@ -42,7 +43,7 @@ class WrittenFrames:
 
 
 def write_frames(
-    folder: Path, frames: Iterable[ExtractedFrame | None], *, total: int, min_depth_valid: float, where: str
+    folder: Path, frames: Iterable[ExtractedFrame | None], config: Config, *, total: int, where: str
 ) -> WrittenFrames:
     """Write the frames that have enough depth, numbered without gaps.
 
@@ -58,10 +59,12 @@ def write_frames(
             continue
         if number in shown:
             strip.append((thumbnail(frame.color), thumbnail(_colored_depth(frame.depth))))
-        if frame.depth_valid < min_depth_valid:
+        if frame.depth_valid < config.min_depth_valid:
             continue
         name = f"{len(statistics):06d}"
-        (folder / "color" / f"{name}.jpg").write_bytes(frame.jpeg)
+        (folder / "color" / f"{name}.jpg").write_bytes(
+            frame.jpeg or images.encode_jpeg(frame.color, config.jpeg_quality)
+        )
         images.write_depth(folder / "depth" / f"{name}.exr", frame.depth)
         images.write_gray(folder / "confidence" / f"{name}.png", frame.confidence)
         statistics.append((frame.sharpness, frame.brightness, frame.depth_valid))
@@ -69,7 +72,7 @@ def write_frames(
     if lost > MAX_LOST * total:
         raise errors.damaged(where, f"{lost} of {total} pictures cannot be decoded")
     if len(statistics) < MIN_FRAMES:
-        known = f"{min_depth_valid:.0%} of the depth is known in {len(statistics)} of {total} frames"
+        known = f"{config.min_depth_valid:.0%} of the depth is known in {len(statistics)} of {total} frames"
         what = f"{known}; {MIN_FRAMES} are the least"
         remedy = "record some seconds at least, things within 5 m, in light, with the LiDAR camera"
         raise InputError("CAP-007", what, where, remedy)

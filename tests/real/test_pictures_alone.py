@@ -45,7 +45,7 @@ def walk(tmp_path_factory) -> Walk:
     workspace = tmp_path_factory.mktemp("workspace")
     plan, frames, _ = photogrammetry.map_pictures(recording, {}, Config(), workspace)
     out = tmp_path_factory.mktemp("frames")
-    written = writing.write_frames(out, frames, total=len(plan.chosen), min_depth_valid=0.2, where="walk")
+    written = writing.write_frames(out, frames, Config(), total=len(plan.chosen), where="walk")
     writing.write_table(out, recording, plan, written)
     clip, kept = Clip.open(out), plan.chosen[written.usable]
     centers, true = clip.odometry_from_camera[:, :3, 3], truth.world_from_camera[kept][:, :3, 3]

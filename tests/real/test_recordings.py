@@ -99,7 +99,7 @@ def test_exr_export_passes_the_pose_check():
     assert plan.pose_check.residual_m < LIMIT_M
     assert plan.gravity_known
     assert plan.quarter_turns == 0
-    frames = list(extraction.frames(recording, plan, max_depth_m=6.0, jpeg_quality=95))
+    frames = list(extraction.frames(recording, plan, max_depth_m=6.0))
     assert len(frames) == 12
     assert frames[0].color.shape == (640, 480, 3)
     np.testing.assert_allclose(plan.intrinsics[0], np.diag([1 / 3, 1 / 3, 1]) @ recording.intrinsics[0])

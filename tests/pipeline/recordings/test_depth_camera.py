@@ -63,7 +63,7 @@ def test_sidecar_describes_the_depth_camera(tmp_path):
     assert recording.depth_camera.baseline_m == pytest.approx(0.03)
     assert any("30 mm from the color camera" in remark for remark in recording.remarks)
     plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, max_side_px=640)
-    frame = next(iter(extraction.frames(recording, plan, max_depth_m=6.0, jpeg_quality=90)))
+    frame = next(iter(extraction.frames(recording, plan, max_depth_m=6.0)))
     lens = plan.depth_intrinsics[0]
     np.testing.assert_allclose(
         lens, cameras.scale_intrinsics(made.intrinsics, recording.color_size, frame.depth.shape)

@@ -41,7 +41,7 @@ def _understand(path):
 
 
 def _frames(recording, plan):
-    return list(extraction.frames(recording, plan, max_depth_m=6.0, jpeg_quality=95))
+    return list(extraction.frames(recording, plan, max_depth_m=6.0))
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -116,7 +116,7 @@ def test_too_short_recording_is_refused(tmp_path, monkeypatch, capsys, frames):
 
 def test_mostly_damaged_video_is_refused(tmp_path):
     with pytest.raises(InputError, match="CAP-001.*3 of 4 pictures"):
-        writing.write_frames(tmp_path, [None] * 3, total=4, min_depth_valid=0.2, where="a.mp4")
+        writing.write_frames(tmp_path, [None] * 3, Config(), total=4, where="a.mp4")
 
 
 def test_symbolic_link_in_an_archive_is_refused(tmp_path, monkeypatch, capsys):
