@@ -14,13 +14,13 @@ from torch import Tensor
 
 from pipeline.behavior.diffusion import STANDARD
 from pipeline.behavior.encoders import other_channels_torch
-from pipeline.behavior.model import Architecture, Scaling, channels_from_bones
+from pipeline.behavior.model import ROOT_CHANNELS, Architecture, Scaling, channels_from_bones
 from pipeline.behavior.path_encoding import (
     GOAL_LENGTH_POWER,
     velocity_channels_from_path,
     with_powered_length,
 )
-from pipeline.behavior.perception import PerceptionEnsemble, world_from_ego
+from pipeline.behavior.perception import POSITION, PerceptionEnsemble, world_from_ego
 from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.geometry import rigid, rigid_torch
 from stages.train_behavior.config import AugmentationConfig
@@ -305,7 +305,8 @@ def draw_batch(
     known = rotation[:, :count], windows.bones[frames[:, :count]]
     remembered = body_channels(*with_posture_noise(*known, statistics, augmentation, generator))
     past = torch.cat([root[:, :count], remembered], dim=-1)
-    held = past[:, -PerceptionEnsemble.POSTURE_FRAMES :]
+    held = past[:, -PerceptionEnsemble.POSTURE_FRAMES :].clone()
+    held[~bones_known, :, POSITION + ROOT_CHANNELS :] = statistics.past_mean[POSITION + ROOT_CHANNELS :]
     past = past + torch.randn(past.shape, generator=generator) * statistics.past_std * augmentation.past
     ego = windows.world_from_ego[index] @ rigid_torch.make(turn, torch.zeros(size, 3))
     body = body_channels(rotation[:, posed], windows.bones[frames[:, posed]])

@@ -255,6 +255,9 @@ def test_mirrored_samples_swap_the_scene_and_hide_their_bones(windows):
     mirrored, _ = drawn(windows, replace(PLAIN, mirror=1.0))
     assert not mirrored.bones_known.any()
     assert not mirrored.bones_keep.any()
+    held = mirrored.held[..., 9:]
+    torch.testing.assert_close(held, held[:1, :1].expand_as(held), msg="bones of nobody")
+    assert not torch.equal(mirrored.held[..., 3:9], held[:1, :1, :6].expand_as(held[..., :6]))
     torch.testing.assert_close(mirrored.goal[:, 0], -plain.goal[:, 0])
     same = (mirrored.scene == plain.scene.flip(2)).all(1)
     assert same.float().mean() > 0.99  # points on voxel borders are ambiguous
