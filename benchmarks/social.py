@@ -110,7 +110,7 @@ class ForwardFacingSampler(Sampler):
         steps = np.diff(path, axis=1, prepend=codes.start[:, None])[..., ::2]
         facing, found = (
             np.tile([0.0, 1.0], (len(path), 1)),
-            np.zeros((*path.shape[:2], len(self.scaling.body_mean))),
+            np.tile(self.scaling.body_mean, (*path.shape[:2], 1)),
         )
         for frame in range(path.shape[1]):
             step = steps[:, frame]

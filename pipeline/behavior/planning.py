@@ -24,7 +24,7 @@ from pipeline.behavior.model import (
     past_channels,
 )
 from pipeline.behavior.path_encoding import PATH_CHANNELS, goal_error, snapped_to_goal
-from pipeline.behavior.perception import POSITION, FeatureVolume, world_from_ego
+from pipeline.behavior.perception import FeatureVolume, world_from_ego
 from pipeline.behavior.scenes import SceneConstraint, Scenes
 from pipeline.behavior.trajectories import ABSENT_M, Context, nearest
 from pipeline.geometry import rigid
@@ -86,12 +86,6 @@ class Observation:
         others = self.others.copy()
         others[:, 0, :, 0] = ABSENT_M
         return replace(self, others=others)
-
-    def boneless(self, mean: Float[np.ndarray, "body"]) -> "Observation":
-        """Return a copy with bones of the mean body, which for goals and paths are hidden ones."""
-        past = self.past.reshape(len(self), self.others.shape[2], -1).copy()
-        past[..., POSITION + ROOT_CHANNELS :] = mean[ROOT_CHANNELS:]
-        return replace(self, past=past.reshape(len(self), -1))
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from pipeline.behavior.avoidance import around_person, clearance_of
 from pipeline.behavior.config import Ego, PlanSamplingConfig, ReplanningConfig
 from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels, channels_from_bones
 from pipeline.behavior.perception import world_from_ego
-from pipeline.behavior.planning import Observation, Sampler, observe
+from pipeline.behavior.planning import PlanCondition, Sampler, observe
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import ABSENT_M, TRAIN, BehaviorData, Context, Trajectory, as_companions
 from pipeline.geometry import rigid
@@ -130,7 +130,7 @@ class AnimalBatch:
 
         ``companions`` are the past tracks of those from outside, as many as in `begin`.
         """
-        self.observer.append(np.asarray(observer, float))
+        self.observer.append(np.array(observer, float))
         self.companions = companions
         due = np.flatnonzero(self._must_replan())
         if len(due):
@@ -239,24 +239,24 @@ class AnimalBatch:
         context = Context(root, bones, observer, video, companions=self._companions(some))
         observation = observe(context, self.scenes, self.rest, self.ego)
         frame = world_from_ego(root[:, -1], self.ego)
-        boneless = observation.boneless(self.sampler.scaling.body_mean)
         self.plans_drawn += len(some)
         intent = np.full((len(some), 1, 3), np.nan) if intent is None else intent
         end = intent[np.arange(len(some)), np.isfinite(intent[..., 0]).sum(1) - 1]
         goal = np.where(np.isnan(end), self.goal_command[some], end)
         commanded = rigid.apply(rigid.inverse(frame), goal[:, None])[:, 0]
         count = self.chaining.candidates if np.isfinite(intent).any() else 1
-        goal, path, blocked = self._least_blocked(boneless, frame, video, count, commanded, intent)
+        codes = self.sampler.codes(observation, self.sampling, count)
+        goal, path, blocked = self._least_blocked(codes, frame, video, commanded, intent)
         again = np.flatnonzero(blocked)
         if len(again) and self.chaining.candidates > 1:
-            count, where = self.chaining.candidates - 1, None if video is None else video[again]
-            seen, wanted = boneless[again], intent[again]
-            others = self._least_blocked(seen, frame[again], where, count, commanded[again], wanted)
+            where, rest = None if video is None else video[again], self.chaining.candidates - 1
+            more = self.sampler.codes(observation[again], self.sampling, rest)
+            others = self._least_blocked(more, frame[again], where, commanded[again], intent[again])
             better = others[2] < blocked[again]
             for mine, other in zip((goal, path, blocked), others, strict=True):
                 mine[again[better]] = other[better]
         path = self._around_others(path, frame, root[:, -1, :3, 3], some)
-        plan = self.sampler.plan(observation, self.sampling, self.rng, goal=goal, path=path)
+        plan = self.sampler.draw_plans(codes[np.arange(len(some)) * count], self.rng, goal, path)
         return (
             PoseFrames(plan.world_from_agent(frame), plan.body[..., ROOT_CHANNELS:]),
             rigid.apply(frame, plan.goal[:, None])[:, 0],
@@ -288,19 +288,17 @@ class AnimalBatch:
 
     def _least_blocked(
         self,
-        observation: Observation,
+        codes: PlanCondition,
         frame: Float[np.ndarray, "some 4 4"],
         video: Int[np.ndarray, "some"] | None,
-        count: int,
         commanded: Float[np.ndarray, "some 3"],
         intent: Float[np.ndarray, "some intended 3"],
     ) -> tuple[Float[np.ndarray, "some 3"], Float[np.ndarray, "some frame 3"], Float[np.ndarray, "some"]]:
-        """Return goal, path and blocked share of the best of ``count`` candidates per observation.
+        """Return goal, path and blocked share of the best of the candidates of every animal.
 
         ``commanded`` goals (meters, ego frame) replace sampled ones where they are not NaN.
         """
-        codes = self.sampler.codes(observation, self.sampling, count)
-        goals = self.sampler.goals(codes, self.rng)
+        count, goals = codes.count, self.sampler.goals(codes, self.rng)
         given = np.repeat(commanded, count, axis=0)
         goals = np.where(np.isfinite(given), given, goals).astype(goals.dtype)
         paths = self.sampler.paths(codes, goals, self.rng)
@@ -376,7 +374,7 @@ class Simulator:
     def _state(self, now: PoseFrames) -> SimulatorState:
         bones = bones_from_channels(now.bones[0, 0], self.rest)
         time_s, goal = self.frame / self.data.rate_hz, self.animals.goal[0].copy()
-        return SimulatorState(time_s, now.root[0, 0], bones, goal, float(self.animals.blocked[0]))
+        return SimulatorState(time_s, now.root[0, 0].copy(), bones, goal, float(self.animals.blocked[0]))
 
 
 def blended_frames(old: PoseFrames, new: PoseFrames, frames: int) -> PoseFrames:

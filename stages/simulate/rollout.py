@@ -56,7 +56,8 @@ def write_take(folder: Path, take: Take) -> None:
     npz.save(folder / "take.npz", **vars(take))
     position = take.world_from_agent[:, :3, 3]
     quaternion = rigid.quaternion_from_rotation(take.world_from_agent[:, :3, :3])
-    speed = np.linalg.norm(np.gradient(position, 1 / RATE_HZ, axis=0), axis=1)
+    moved = np.gradient(position, axis=0) if len(position) > 1 else np.zeros((1, 3))
+    speed = RATE_HZ * np.linalg.norm(moved, axis=1)
     distance = np.linalg.norm((take.observer_world - position)[:, [0, 2]], axis=1)
     rows = np.column_stack([take.timestamp_s, position, quaternion, speed, take.observer_world, distance])
     with open(folder / "take.csv", "w", newline="") as file:

@@ -304,7 +304,7 @@ def test_candidate_nearest_to_the_intent_is_followed(sampler):
 
     def drawn(intent):
         animals.rng = np.random.default_rng(1)
-        return animals._least_blocked(seen, frame, None, 8, free, intent)[1]
+        return animals._least_blocked(codes, frame, None, free, intent)[1]
 
     codes, rng = sampler.codes(seen, animals.sampling, 8), np.random.default_rng(1)
     each = sampler.paths(codes, sampler.goals(codes, rng), rng)
