@@ -220,7 +220,7 @@ class Simulator {
     if (key === 'view') this.room.look(this.state.view, this.eyes(), this.selected.place);
     if (key === 'animal') this.greet();
     if (key === 'does') this.panel.refresh();
-    if (key === 'seed' || key === 'replay') this.reset();
+    if (['seed', 'replay'].includes(key) || (key === 'animal' && this.replaying)) this.reset();
     else if (!['goals', 'path', 'outline', 'speed', 'view', 'animal', 'does'].includes(key)) this.hurry();
   }
 
@@ -239,9 +239,9 @@ class Simulator {
     this.panel.refresh();
   }
 
-  // Let everybody plan anew.
+  // Let everybody plan anew, whatever they intended.
   hurry() {
-    for (const resident of this.residents) resident.urgent = true;
+    for (const resident of this.residents) Object.assign(resident, { urgent: true, intentEnd: 0 });
   }
 
   say(text) {
@@ -337,9 +337,8 @@ class Simulator {
       selected.stops = new Stops(points, rootOf(selected.timeline.at(this.now)), (point) =>
         selected.rootAt(point),
       );
-    selected.route = null;
+    Object.assign(selected, { route: null, urgent: true, intentEnd: 0 });
     this.showCommands();
-    selected.urgent = true;
   }
 
   // Walk along a stroke of points [x, z]; a dot is a goal.

@@ -17,7 +17,6 @@ export class Planner {
     planner.worker.onmessage = ({ data }) => planner.answered(data, onProgress);
     planner.worker.onerror = (event) => planner.broke(new Error(event.message));
     const wasm = await assets.bytes('ort.wasm');
-    onProgress(0.15);
     onProgress(0.3);
     for (const [index, { contract, prefix, allowed }] of residents.entries()) {
       const models = Object.fromEntries(

@@ -336,10 +336,7 @@ export class Resident {
 
   // The height of the root at a goal, world.
   rootAt(point) {
-    const {
-      scene: { floor_m: floor },
-      agent: { standing_m: standing },
-    } = this.contract;
+    const { standing_m: standing } = this.contract.agent;
     return point[2] ? this.support.carried([point[0], point[2] + standing, point[1]], false) : standing;
   }
 

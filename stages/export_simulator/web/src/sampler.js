@@ -266,11 +266,8 @@ export class Sampler {
     const observation = this.senses.observe(question.past, question.observer, question.companions);
     const { frame } = observation;
     const options = this.drawing(frame, question);
-    const whole = await this.codes(observation, question.keep, question.interactivity);
-    if (question.path) return this.followed(frame, whole, question.path, options);
-    // sampled bones walk less distinctly than recorded ones do: conditioned on them, the animal would stop
-    const bare = this.senses.boneless(observation, this.contract.scaling.body_mean);
-    const codes = await this.codes(bare, question.keep, question.interactivity);
+    const codes = await this.codes(observation, question.keep, question.interactivity);
+    if (question.path) return this.followed(frame, codes, question.path, options);
     const commanded = Boolean(question.aim);
     const leg = commanded && this.leg(frame, question.aim, question.raised, options.detour);
     // the goal that it keeps until the horizon
@@ -279,9 +276,7 @@ export class Sampler {
     const scaled = given ?? (await this.sampledGoals(codes, question.samples, options));
     const keepGoal = commanded ? 1 : question.keep.goal;
     const goals = this.goalsInWorld(frame, scaled);
-    const tried = given
-      ? Array(Math.min(CANDIDATES, question.samples)).fill(0)
-      : this.insideFirst(goals).slice(0, CANDIDATES);
+    const tried = given ? Array(CANDIDATES).fill(0) : this.insideFirst(goals).slice(0, CANDIDATES);
     const targets = Float32Array.from(
       tried.flatMap((index) => Array.from(scaled.subarray(3 * index, 3 * index + 3))),
     );
@@ -306,7 +301,7 @@ export class Sampler {
       this.positions(paths.subarray(3 * this.frames * best, 3 * this.frames * (best + 1))),
       options,
     );
-    const lived = await this.withBody(frame, whole, path, options);
+    const lived = await this.withBody(frame, codes, path, options);
     const arrives =
       leg.last && !options.detour?.unfinished(apply(frame, codes.start), lived.path.at(-1), question.aim);
     return { goals, chosen: tried[best], ...lived, cleared: arrives ? lived.path.at(-1) : null };

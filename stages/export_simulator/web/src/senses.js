@@ -24,7 +24,6 @@ import {
 const UPRIGHT = 0.2;
 const [PERSON, ANIMAL] = [0, 1]; // kinds of others
 const ABSENT_M = 1000; // where somebody is put who is not there
-const ROOT_CHANNELS = 6;
 const TURNS = 8; // by which goals get out of something solid, up to a right angle either way
 const WITHIN = 0.01; // how far inside an allowed voxel a point is put, in edges of the voxel
 
@@ -70,15 +69,6 @@ export class Senses {
       ),
       past: Float32Array.from(past.flatMap((rows) => this.pastChannels(egoFromWorld, rows))),
     };
-  }
-
-  // The same with the bones of a mean body, of which goals and paths make no more than of hidden ones.
-  boneless(observation, mean) {
-    const past = Float32Array.from(observation.past);
-    const length = 3 + mean.length;
-    for (let at = 0; at < past.length; at += length)
-      past.set(mean.slice(ROOT_CHANNELS), at + 3 + ROOT_CHANNELS);
-    return { ...observation, past };
   }
 
   // world_from_ego at a root pose.
