@@ -69,7 +69,7 @@ class LiveAnimal:
         Raises SIM-012 if time or position are not finite, or time is negative.
         """
         place = np.asarray(observer_world, float)
-        if not np.isfinite([seconds, *place]).all() or seconds < 0:
+        if place.shape != (3,) or not np.isfinite([seconds, *place]).all() or seconds < 0:
             what = f"cannot let {seconds} s pass with an observer at {place.tolist()}"
             remedy = "give seconds and a position of three finite numbers"
             raise InputError("SIM-012", what, "advance", remedy)

@@ -21,7 +21,7 @@ from pipeline.environments.world import AnimalWorld, checked
 
 PERSON, ANIMAL = "person", "animal"
 GOAL_M = 3.0
-"""Distance of the goal that an action of 1 stands for, meters."""
+"""Distance of the goal along each axis that an action of 1 stands for, meters."""
 
 
 class PersonAnimalEnv(ParallelEnv):
@@ -73,7 +73,7 @@ class PersonAnimalEnv(ParallelEnv):
         """Let 0.1 s pass; actions in -1..1 are parts of the highest speeds, or of the farthest goal."""
         root = self.world.animals.past[-1].root[0, 0]
         if ANIMAL in actions:
-            wish = checked(np.asarray(actions[ANIMAL])[None], (1, 2))
+            wish = checked(np.asarray(actions[ANIMAL])[None], (1, 2)).clip(-1, 1)
             goal = to_world(GOAL_M * wish, self._animal_heading())[0]
             self.world.animals.command((root[:3, 3] + [goal[0], 0.0, goal[1]])[None])
         outcome = self.world.step(np.asarray(actions[PERSON])[None])

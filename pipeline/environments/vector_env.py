@@ -37,11 +37,9 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
         self.split = (options or {}).get("split", "train")
         self.frame, self.ended = np.zeros(self.num_envs, int), np.zeros(self.num_envs, bool)
         self.world.begin(self.num_envs, self.np_random, self.split)
-        return person_observation(self.world), {
-            "distance_m": self.world.distance_m,
-            "share_known": self.world.share_known,
-            "home": self.world.home,
-        }
+        world = self.world
+        info = {"distance_m": world.distance_m, "share_known": world.share_known, "home": world.home}
+        return person_observation(world), info
 
     def step(self, actions: Float[np.ndarray, "person action"]):
         """Let 0.1 s pass everywhere; where an episode had ended, another begins instead."""
@@ -54,7 +52,7 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
         terminated, truncated, reward = lived & over, lived & late, np.where(lived, reward, 0.0)
         self.ended = terminated | truncated
         info = {
-            "distance_m": outcome.distance_m,
+            "distance_m": self.world.distance_m,
             "reached": lived & outcome.reached,
             "flees": lived & outcome.flees,
             "home": self.world.home,

@@ -20,7 +20,8 @@ from pipeline.behavior.model import bones_from_channels
 from pipeline.behavior.planning import Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import AnimalBatch
-from pipeline.behavior.trajectories import PAST, RATE_HZ, TEST, TRAIN, BehaviorData, Context
+from pipeline.behavior.trajectories import RATE_HZ, TEST, TRAIN, BehaviorData, Context
+from pipeline.core.config import from_table
 from pipeline.core.errors import InputError
 from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.floor import PersonFloor, to_local, to_world
@@ -94,12 +95,11 @@ class AnimalWorld:
 
         ``settings`` replace fields of ``config``.
         """
-        config = replace(config or EnvironmentConfig(), **settings)
-        config = replace(config, observations=tuple(config.observations))
         given = [Path(each) for each in (*(() if home is None else (home,)), *homes)]
         if isinstance(build, AnimalWorld):
-            assert not given, "a world that is open has its homes"
+            assert not (given or config or settings), "a world that is open has its homes and settings"
             return build
+        config = from_table(EnvironmentConfig, settings, where="environment", base=config)
         return cls.load(Path(build), config, homes=given, device=device)
 
     @classmethod
@@ -260,13 +260,14 @@ class AnimalWorld:
             ahead = animal - self.persons.position[row]
             self.persons.heading[row] = np.arctan2(ahead[0], ahead[1])
             self.persons.velocity[row] = 0.0
-        observer = np.repeat(self.eyes[some][:, None], PAST, axis=1)
+        observer = np.repeat(self.eyes[some][:, None], self.data.past, axis=1)
         return replace(context, observer_world=observer, observer_rotation=None)
 
     def _moments(self, count: int, split: str) -> Int[np.ndarray, "some"]:
         """Draw windows; where there are several homes, each is as likely as another."""
-        windows = self.data.indices(SPLITS[split])
-        assert len(windows), f"there is no window of the split {split}"
+        windows = self.data.indices(SPLITS.get(split, -1))
+        if not len(windows):
+            raise InputError("REC-002", f"no window of the split {split!r}", "reset", "train or test")
         home = self.habitat.home_of_video[self.data.video[windows]]
         homes = np.unique(home)
         if len(homes) == 1:

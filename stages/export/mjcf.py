@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from pipeline.adapters.live_animal import ZUP_FROM_WORLD
 from pipeline.behavior.perception import FeatureVolume
 from pipeline.data import npz
 from pipeline.geometry import rigid
@@ -17,7 +18,6 @@ from stages.export.writing import ExportRecord, extra, version
 
 GRAY = 150
 """of an animal without colors, 0..255"""
-ZUP_FROM_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
 def write(folder: Path, agent: Agent, volume: FeatureVolume) -> ExportRecord:

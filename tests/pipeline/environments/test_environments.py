@@ -80,7 +80,9 @@ def test_vectorized_episodes_restart_and_are_seeded(build):
         seen, _ = env.reset(seed=3)
         ends = np.zeros(4, int)
         for _ in range(25):
-            seen, reward, terminated, truncated, _ = env.step(np.zeros((4, 3), np.float32))
+            seen, reward, terminated, truncated, info = env.step(np.zeros((4, 3), np.float32))
+            place = np.linalg.norm(seen["animal"][:, :2], axis=1)
+            np.testing.assert_allclose(info["distance_m"], place, rtol=1e-5)
             ends += terminated | truncated
         assert seen["animal"].shape == (4, 7) and (ends >= 2).all() and np.isfinite(reward).all()
         lives.append(seen["animal"])
@@ -101,6 +103,28 @@ def test_animal_can_live_in_another_home(build, tmp_path):
     assert env.observation_space.contains(seen)
     with pytest.raises(InputError, match="ART-003.*nowhere"):
         gymnasium.make("AgentToSim/Cat-v0", build=str(own), home="nowhere", config=QUICK)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"embodiment": "car"},
+        {"reward": "x"},
+        {"observations": "rgbd"},
+        {"episode_s": "long"},
+        {"sped_m_s": 1.0},
+    ],
+)
+def test_invalid_settings_are_refused(build, settings):
+    with pytest.raises(InputError, match="REC-00[12]"):
+        AnimalWorld.opened(build, **settings)
+
+
+def test_an_unknown_split_is_refused():
+    from pipeline.environments.person_env import PersonEnv
+
+    with pytest.raises(InputError, match="REC-002.*'valid'"):
+        PersonEnv(small_world()).reset(seed=0, options={"split": "valid"})
 
 
 @pytest.mark.parametrize("action", [[np.nan, 0.0, 0.0], [0.0, np.inf, 0.0], [0.0, 0.0]])
