@@ -24,6 +24,9 @@ WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 
 .PHONY: $(COMMANDS) FORCE
 # Variables that become part of a command line or a path may contain plain names only.
+ifeq ($(origin NAME),environment)  # some systems put the host's name there
+NAME :=
+endif
 PLAIN := a b c d e f g h i j k l m n o p q r s t u v w x y z 0 1 2 3 4 5 6 7 8 9 _ -
 rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)
 $(foreach name,AGENT NAME ABSENT REPLAYED OTHER VARIANT FORMAT PLACES PROCESSES LOCK BODY,$(if $(call rest,$(PLAIN),$(value $(name))),$(error REC-004 \
@@ -41,7 +44,8 @@ help:
 	@sed 's/cat/$(ANIMAL)/g' pipeline/workflow/help.txt
 	@echo 'agents: $(AGENTS)'
 
-include $(WANTED:%=build/%$(if $(TABLES),/tables)$(if $(VARIANT),/variants/$(VARIANT))/plan/rules.mk)
+RULES := $(WANTED:%=build/%$(if $(TABLES),/tables)$(if $(VARIANT),/variants/$(VARIANT))/plan/rules.mk)
+include $(RULES)
 build/%/plan/rules.mk: .venv/.ok FORCE
 	@$(PLAN) plan $* $(if $(MAKE_RESTARTS),>/dev/null)
 
@@ -170,4 +174,4 @@ clean:
 	  set -- $(subst /, ,$@); echo "error: REC-007 '$@' belongs to variant $$4 of $$2 and is not there yet" >&2; \
 	  echo "  -> one variant: make $$2.$$5 VARIANT=$$4; a table with all it compares: make $$5-tables AGENT=$$2" >&2; exit 2;; esac
 	@echo "error: REC-007 there is no target '$@'" >&2
-	@echo "  -> $(if $(filter $(AGENTS:%=%.%),$@),artifacts: $$($(PYTHON) -SE -c 'from pipeline.workflow import dag; print(*dag.NODES)'),agents: $(AGENTS); a new one: make new AGENT=<name>); all else: make help" >&2; exit 2
+	@echo "  -> $(if $(filter $(AGENTS:%=%.%),$@),artifacts: $$(sed -n 's/^\.PHONY: [^.]*\.\([a-z_]*\) .*/\1/p' $(RULES) | tr '\n' ' '),agents: $(AGENTS); a new one: make new AGENT=<name>); all else: make help" >&2; exit 2

@@ -11,7 +11,7 @@ def damaged(where: str, why: str) -> InputError:
 
 def broken_metadata(where: str, why: str) -> InputError:
     """Return the error for invalid metadata, as after a change of the format."""
-    remedy = "export it from the phone again; if a newer app wrote it, report the app's version"
+    remedy = "export it again, or correct it if written by hand; if a newer app wrote it, report its version"
     return InputError("CAP-004", f"the recording's metadata cannot be used: {why}", where, remedy)
 
 
@@ -23,7 +23,7 @@ def no_depth(where: str, why: str) -> InputError:
 
 def no_frames(where: str, why: str) -> InputError:
     """Return the error for recordings without a complete frame."""
-    return InputError("CAP-007", f"no usable frames: {why}", where, "export it from the phone again")
+    return InputError("CAP-007", f"no usable frames: {why}", where, "record some seconds, export again")
 
 
 def wrong_depth(where: str, why: str) -> InputError:

@@ -30,6 +30,8 @@ from pipeline.recordings.upright import (
 JPEG = b"\xff\xd8"
 MAX_DEPTH_SIDE_PX = 640
 """larger depth was upsampled by the app; it is downsampled again"""
+MIN_FRAMES = 5
+"""minimum number of extracted frames: half a second"""
 MIN_TRACKED = 0.8
 """minimum share of frames with a device pose for poses to be used at all"""
 MEASURED, RELATIVE = "measured", "relative"

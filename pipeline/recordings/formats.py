@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 UNDERSTOOD = (
     "Record3D .r3d or EXR + JPG folder, Stray Scanner, Polycam raw data, NeRFCapture stream, TUM or 7-Scenes "
-    "folder, a folder with a video, depth/ and intrinsics.txt, a video alone for the walk-through"
+    "folder, a folder with a video, depth/ and intrinsics.txt, a video alone"
 )
 
 MAX_SCALE_SOURCES = 3

@@ -33,7 +33,7 @@ def table(
         numbers = [[float("nan" if ".#" in cell else cell) for cell in row] for row in cells]
         read = np.array(numbers).reshape(len(cells), columns)
     except ValueError as error:
-        why = f"not a table of {columns} columns of numbers"
+        why = f"not a table of {columns} columns of numbers (with decimal points)"
         raise errors.broken_metadata(container.place(name), why) from error
     if rows is not None and len(read) != rows:
         raise errors.broken_metadata(container.place(name), f"{len(read)} rows instead of {rows}")
@@ -71,7 +71,7 @@ def read_coefficients(container: Container, name: str) -> Float[np.ndarray, "4"]
     if len(numbers) in (9, 16):
         side = 3 if len(numbers) == 9 else 4
         return numbers.reshape(side, side)[[0, 1, 0, 1], [0, 1, 2, 2]]
-    why = f"{len(numbers)} numbers are neither fx fy cx cy nor a matrix"
+    why = f"{len(numbers)} numbers are neither fx fy cx cy nor a matrix (use decimal points)"
     raise errors.broken_metadata(container.place(name), why)
 
 

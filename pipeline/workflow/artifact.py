@@ -65,7 +65,7 @@ def opened(folder: Path, name: str) -> Manifest:
     manifest = read_manifest(folder)
     if manifest is None:
         what = f"{name} is missing or unfinished"
-        raise InputError("ART-001", what, str(folder), "build it first with `make`")
+        raise InputError("ART-001", what, str(folder), "build it first: make <agent>.<artifact>")
     _refuse_other_version(manifest, folder)
     return manifest
 

@@ -6,6 +6,7 @@ written. User file names go into `videos.json` and nowhere else. Standard librar
 
 import math
 import re
+import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +33,7 @@ _NEEDED: dict[Flow, tuple[tuple[Role, str], ...]] = {
 SHOWN_LETTERS, LONGEST_NAME_BYTES = 40, 200
 """of a recording's name: file systems allow 255 bytes, and sidecars append to it"""
 _ANIMAL = re.compile(r"[a-z][a-z0-9-]{0,30}\Z")
-_NAMED = re.compile(r"turnaround_([a-z][a-z0-9-]*)")
+_NAMED = re.compile(r"turnaround_([^\W_](?:[^\W_]|-)*)")
 TABLES = (".csv", ".npz")
 """Suffixes of tables of motion."""
 ICLOUD = ".icloud"
@@ -123,6 +124,7 @@ def remarks(
             raise InputError("CAP-041", what, str(folder), "rename it")
         sidecar = folder / f"{name}{SIDECAR}"
         table = config.read_table(sidecar) if sidecar.is_file() else {}
+        config.from_table(Remarks, table, where=str(sidecar))
         table = {**table, **overrides.get(name, {})}
         remark = config.from_table(Remarks, table, where=f"{where}: [videos.{name!r}]")
         if remark.offset_s is not None and not math.isfinite(remark.offset_s):
@@ -144,8 +146,9 @@ def assign(
     impossible remark), CAP-043 (two turnarounds that do not name two animals).
     """
     roles: dict[str, Role] = {name: role_of(name, remark, where) for name, remark in said.items()}
-    for role, what in missing_roles(list(roles.values()), flow):
-        raise InputError("CAP-040", f"there is no {role} among the recordings", where, f"add {what}")
+    if missing := [needed for needed in _NEEDED[flow] if needed[0] not in roles.values()]:
+        absent, wanted = (" and ".join(each) for each in zip(*missing, strict=True))
+        raise InputError("CAP-040", f"there is no {absent} among the recordings", where, f"add {wanted}")
     order = sorted(said, key=lambda name: (ROLES.index(roles[name]), name))
     splits = _splits([name for name in order if roles[name] == "session"], said, where)
     ids = _ids(order, known_ids)
@@ -179,11 +182,6 @@ def role_of(name: str, remark: Remarks, where: str) -> Role:
         return "session"
     what, remedy = f"{name!r} cannot have the role {remark.role!r}", f"roles: {', '.join(ROLES)}"
     raise InputError("CAP-041", what, where, remedy)
-
-
-def missing_roles(roles: Sequence[Role], flow: Flow = "recordings") -> list[tuple[Role, str]]:
-    """Return the roles that a build still needs beside recordings of these, each with what to add."""
-    return [(role, what) for role, what in _NEEDED[flow] if role not in roles]
 
 
 def builtin(
@@ -234,8 +232,8 @@ def _animals(turnarounds: Sequence[str], said: Mapping[str, Remarks], where: str
         return {}
     found: dict[str, str] = {}
     for name in turnarounds:
-        named = _NAMED.match(name.lower().split(".")[0])
-        animal = said[name].animal or (named.group(1) if named else None)
+        named = _NAMED.match(unicodedata.normalize("NFC", name.lower()).split(".")[0])
+        animal = said[name].animal or (named and named[1])
         if animal is None or not _ANIMAL.match(animal):
             what = f"{name!r} does not say which animal it shows, and there is another turnaround"
         elif animal in found.values():

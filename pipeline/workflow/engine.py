@@ -6,7 +6,6 @@ library only.
 
 import csv
 import functools
-import json
 import math
 import os
 import subprocess
@@ -63,7 +62,7 @@ def targets(homes: list[str]) -> list[str]:
     """Return the stamps that a build of these homes requests: those that no other of its jobs depends on."""
     wanted: dict[str, None] = {}
     for home in map(jobs.Home.parse, homes):
-        for job in json.loads(jobs.jobs_file(home).read_text()):
+        for job in jobs.read_jobs(home):
             _known[job["home"], job["id"]] = job
             wanted |= {} if job["on_demand"] else {job["stamp"]: None}
     dependencies = {each for job in _known.values() if job["stamp"] in wanted for each in job["after"]}

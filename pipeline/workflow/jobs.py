@@ -226,6 +226,14 @@ def jobs_file(home: Home) -> Path:
     return home.plan / "dag.json"
 
 
+def read_jobs(home: Home) -> list[dict[str, Any]]:
+    """Read all planned jobs. Raises RUN-001."""
+    try:
+        return json.loads(jobs_file(home).read_text())
+    except FileNotFoundError:
+        raise InputError("RUN-001", "is not planned yet", str(home), f"run `make {home}`") from None
+
+
 def read_job(home: Home, job_id: str) -> dict[str, Any]:
     """Read a planned job, parsing only its line of thousands. Raises RUN-001."""
     path = jobs_file(home)

@@ -135,10 +135,11 @@ def _write_key(plan: Plan, code: sources.Cache, name: str, trial: str | None) ->
 
 def mark_redo(home: Home, name: str) -> None:
     """Mark the artifact `name` of `home` to be made again by the next build."""
-    known = json.loads(jobs_file(home).read_text())
+    known = jobs.read_jobs(home)
     marked = [job for job in known if job["artifact"] == name]
     if not marked:
-        raise InputError("REC-007", f"no artifact {name!r}", str(home), f"artifacts: {', '.join(dag.NODES)}")
+        remedy = f"artifacts: {', '.join(dict.fromkeys(job['artifact'] for job in known))}"
+        raise InputError("REC-007", f"no artifact {name!r}", str(home), remedy)
     for job in marked:
         artifact.write_if_changed(jobs.redo_mark(job["home"], job["id"]), "made again by the next build\n")
         Path(job["stamp"]).unlink(missing_ok=True)
@@ -152,7 +153,7 @@ def inputs(home: Home, names: Sequence[str], *, together: bool = False) -> str:
     animals = [str(each.animal) for each in _animal_homes(home.base)]
     if home.animal and home.animal not in animals:
         raise InputError("REC-007", "no such animal", str(home), f"animals: {', '.join(animals) or 'one'}")
-    known = {job["artifact"]: Path(job["out"]) for job in json.loads(jobs_file(home).read_text())}
+    known = {job["artifact"]: Path(job["out"]) for job in jobs.read_jobs(home)}
     unknown = [name for name in names if name not in known]
     if unknown:
         remedy = f"artifacts: {', '.join(known)}"

@@ -7,7 +7,6 @@ has changed. The planner compares size and times of recordings; its cache is dro
 the same, so that the next build uses the new content. Exit code 2 if anything differs. Standard library only.
 """
 
-import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,17 +14,13 @@ from pathlib import Path
 from pipeline.core import videos
 from pipeline.core.errors import InputError, exit_code
 from pipeline.workflow import artifact
-from pipeline.workflow.jobs import Home, jobs_file
+from pipeline.workflow.jobs import Home, read_jobs
 from pipeline.workflow.sources import recording_digest
 
 
 def differences(home: Home) -> Iterator[InputError]:
     """Yield an error per damaged artifact and changed recording of `home`. Raises RUN-001 without a plan."""
-    try:
-        planned = json.loads(jobs_file(home).read_text())
-    except FileNotFoundError:
-        raise InputError("RUN-001", "is not planned yet", str(home), f"run `make {home}`") from None
-    for folder in dict.fromkeys(Path(job["out"]) for job in planned):
+    for folder in dict.fromkeys(Path(job["out"]) for job in read_jobs(home)):
         if changed := artifact.damaged(folder):
             more = f" (and {len(changed) - 1} more files)" if changed[1:] else ""
             what = f"has been damaged, changed or deleted since it was made{more}"

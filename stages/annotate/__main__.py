@@ -13,7 +13,7 @@ from pathlib import Path
 
 from pipeline.core import loopback, videos
 from pipeline.core.errors import exit_code
-from pipeline.workflow import artifact
+from pipeline.workflow import artifact, dag
 from stages.annotate import serving, stage
 
 ROLES = ("walkthrough", "session", "heldout")
@@ -47,9 +47,9 @@ def _session(build: Path, clicks: Path) -> serving.ClickSession:
     """Find frames and template of a build. Raises ART-001 if they are not finished."""
     artifact.opened(build / "scene_template", "scene_template")
     shown = [video for video in videos.read(build / "plan" / "videos.json") if video.role in ROLES]
-    for video in shown:
-        artifact.opened(build / "frames" / video.id, f"frames/{video.id}")
-    frames = {video.file: build / "frames" / video.id for video in shown}
+    frames = {video.file: build / dag.folder_of("frames", video) / video.id for video in shown}
+    for folder in frames.values():
+        artifact.opened(folder, f"{folder.parent.name}/{folder.name}")
     walkthrough = next(video.file for video in shown if video.role == "walkthrough")
     return stage.run(frames, build / "scene_template", walkthrough, clicks)
 

@@ -28,7 +28,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--recipe", type=Path, help=about)
     given = parser.parse_args(arguments)
     try:
-        files, refused = _files(given.folder, given.recipe or Path("agents", f"{given.folder.name}.toml"))
+        said, files, refused = _said(
+            given.folder, given.recipe or Path("agents", f"{given.folder.name}.toml")
+        )
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -40,30 +42,38 @@ def main(arguments: list[str]) -> int:
         named = printable(captures.named(given.folder / name))
         known = "not a recording of a known format (CAP-003); convert other videos to .mp4"
         print(f"{named}  left alone: {known}\n")
-    missing = captures.missing_roles([role for _, role in files])
-    for role, what in missing:
-        print(f"CAP-040 there is no {role} among the recordings\n    -> add {what}")
-    return 2 if unusable or missing else 0
+    try:
+        captures.assign(said, {}, dict.fromkeys(said), str(given.folder))
+    except InputError as error:
+        unusable += 1
+        print(f"{error.code} {error.what}\n    -> {error.remedy}")
+    return 2 if unusable else 0
 
 
-def _files(folder: Path, recipe: Path) -> tuple[list[tuple[Path, Role]], list[CaptureVerdict]]:
-    """Return recordings with roles, by names, sidecars and recipe, and those with a bad sidecar."""
+def _said(
+    folder: Path, recipe: Path
+) -> tuple[dict[str, captures.Remarks], list[tuple[Path, Role]], list[CaptureVerdict]]:
+    """Return what sidecars and recipe say, recordings with roles, and those with a bad sidecar."""
+    given = recipes.read(recipe)[0] if recipe.is_file() else {}
+    if recipes.flow(given.get(recipes.FLOW_TABLE, {}), str(recipe)) != "recordings":
+        raise InputError("CAP-042", "tables of motion are checked by the build", str(folder), "run make")
     names = captures.find(folder)
     if not names:
         captures.refuse_unknown_files(folder)
         what = "there are no recordings; make builds from the built-in capture"
         raise InputError("CAP-042", what, str(folder), "copy recordings there (README: your own animal)")
-    overrides = recipes.read(recipe)[0].get(recipes.VIDEOS_TABLE, {}) if recipe.is_file() else {}
+    overrides = given.get(recipes.VIDEOS_TABLE, {})
     config.refuse_unknown(overrides, names, where=f"{recipe}: [videos]", kind="recording")
-    files, refused = [], []
+    said, files, refused = {}, [], []
     for name in names:
         try:
             own = {name: overrides[name]} if name in overrides else {}
             remark = captures.remarks(folder, [name], own, str(recipe))[name]
             files.append((folder / name, captures.role_of(name, remark, str(folder))))
+            said[name] = remark
         except InputError as error:
             refused.append(stage.refused(folder / name, "session", error))
-    return files, refused
+    return said, files, refused
 
 
 if __name__ == "__main__":

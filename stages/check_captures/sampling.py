@@ -11,10 +11,10 @@ from pipeline.geometry import rigid
 from pipeline.geometry.subsampling import evenly
 from pipeline.mapping.picture_agreement import PictureAgreement
 from pipeline.recordings import errors, extraction
-from pipeline.recordings.extraction import ExtractionPlan
+from pipeline.recordings.extraction import MIN_FRAMES, ExtractionPlan
 from pipeline.recordings.recording import Recording
 
-SIDE_PX = 640
+RATE_HZ, SIDE_PX = 10.0, 640
 """of the pictures"""
 DEPTH_SIDE_PX = 192
 """longer side of the sampled depth"""
@@ -108,7 +108,7 @@ def sample(recording: Recording, count: int, *, max_depth_m: float) -> Recording
     """Read about ``count`` frames spread over a recording; `InputError` if it is unusable."""
     if recording.depth_size is None:
         return _look_at_pictures(recording, count)
-    plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=max_depth_m, max_side_px=SIDE_PX)
+    plan = extraction.understand(recording, rate_hz=RATE_HZ, max_depth_m=max_depth_m, max_side_px=SIDE_PX)
     rows, shots = evenly(len(plan.chosen), count, rounded=True), []
     sample = replace(plan, chosen=plan.chosen[rows])
     frames = extraction.frames(recording, sample, max_depth_m=max_depth_m)
@@ -143,8 +143,9 @@ def _shot(plan: ExtractionPlan, row: int, frame: extraction.ExtractedFrame, beyo
 
 
 def _look_at_pictures(recording: Recording, count: int) -> RecordingSample:
-    rows, shots = evenly(len(recording.index), count, rounded=True), []
-    for row in rows:
+    chosen, shots = extraction.choose_frames(recording.timestamp_s, RATE_HZ), []
+    rows = chosen[evenly(len(chosen), count, rounded=True)]
+    for row in rows.tolist():
         color = extraction.picture(recording, row)
         if color is not None:
             gray, statistics = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), extraction.picture_statistics(color)
@@ -156,3 +157,5 @@ def _look_at_pictures(recording: Recording, count: int) -> RecordingSample:
 def _refuse_empty(recording: Recording, shots: Sequence[SampledFrame]) -> None:
     if not shots:
         raise errors.damaged(recording.where, "none of the sampled pictures can be decoded")
+    if len(shots) < MIN_FRAMES:
+        raise errors.no_frames(recording.where, f"{len(shots)} pictures, {MIN_FRAMES} are the least")

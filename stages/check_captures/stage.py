@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.core.errors import InputError
 from pipeline.core.videos import Role
+from pipeline.recordings import errors
 from pipeline.recordings.formats import open_recording
 from stages.check_captures import alignment, moving_objects, overlap, parallax, sampling
 from stages.check_captures.overlap import DescribedFrame
@@ -46,14 +47,13 @@ def run(files: Sequence[tuple[Path, Role]]) -> Iterator[CaptureVerdict]:
             remedy = "export it again; if that does not help, report the traceback above"
             yield refused(path, role, InputError("CAP-012", what, str(path), remedy))
         else:
-            usable = sample.plan is not None or role != "heldout"
-            yield CaptureVerdict(usable, _described(path.name, role, seen))
+            yield CaptureVerdict(True, _described(path.name, role, seen))
 
 
 def refused(path: Path, role: Role, error: InputError) -> CaptureVerdict:
     """Return the verdict on a recording that cannot be used, and because of which file."""
-    file = error.where.removeprefix(str(path)).lstrip("/:") if error.where.startswith(str(path)) else ""
-    what = f"{file}: {error.what}" if file else error.what
+    file = error.where.removeprefix(f"{path.parent}/")
+    what = error.what if file in (path.name, str(path.parent)) else f"{file}: {error.what}"
     return CaptureVerdict(False, f"{path.name}  {role}\n  {error.code} {what}\n    -> {error.remedy}")
 
 
@@ -62,6 +62,8 @@ def _seen(
 ) -> CaptureMeasurements:
     """Measure what a role asks for; a walk-through's described frames are added to ``room``."""
     if sample.plan is None:
+        if role == "heldout":
+            raise errors.no_depth(sample.recording.where, "the held-out phone measures it")
         shifted = parallax.parallax(sample.shots) if role == "walkthrough" else None
         return CaptureMeasurements(sample, parallax=shifted)
     drift_m, misalignment = overlap.drift_m(sample.shots), alignment.misalignment(sample.shots)

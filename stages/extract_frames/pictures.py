@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.core.errors import InputError
 from pipeline.core.progress import log, track
 from pipeline.data import images, qa
 from pipeline.data.clips import PICTURES
@@ -12,7 +11,7 @@ from pipeline.geometry import cameras
 from pipeline.recordings import errors, extraction
 from pipeline.recordings.recording import Recording
 from stages.extract_frames.config import Config
-from stages.extract_frames.writing import BLURRED_SHARE, MAX_LOST, MIN_FRAMES, SHEET_FRAMES, thumbnail
+from stages.extract_frames.writing import BLURRED_SHARE, MAX_LOST, SHEET_FRAMES, thumbnail
 
 
 def write(folder: Path, recording: Recording, config: Config) -> None:
@@ -36,9 +35,9 @@ def write(folder: Path, recording: Recording, config: Config) -> None:
         raise errors.damaged(
             recording.where, f"{len(rows) - len(chosen)} of {len(rows)} pictures cannot be decoded"
         )
-    if len(chosen) < MIN_FRAMES:
-        what = f"{len(chosen)} pictures, {MIN_FRAMES} are the least"
-        raise InputError("CAP-007", what, recording.where, "record some seconds at least")
+    if len(chosen) < extraction.MIN_FRAMES:
+        what = f"{len(chosen)} pictures, {extraction.MIN_FRAMES} are the least"
+        raise errors.no_frames(recording.where, what)
     sharpness, brightness = np.array(statistics, np.float32).T
     time_s = recording.timestamp_s[chosen]
     PICTURES.save(

@@ -19,8 +19,6 @@ from stages.extract_frames.config import Config
 
 MAX_LOST = 0.5
 """maximum share of damaged pictures (0..1)"""
-MIN_FRAMES = 5
-"""minimum number of frames: half a second"""
 BLURRED_SHARE = 0.4
 """a frame less sharp than this share of the median is blurred"""
 SHEET_FRAMES = 12
@@ -71,9 +69,9 @@ def write_frames(
         usable[number] = True
     if lost > MAX_LOST * total:
         raise errors.damaged(where, f"{lost} of {total} pictures cannot be decoded")
-    if len(statistics) < MIN_FRAMES:
+    if len(statistics) < extraction.MIN_FRAMES:
         known = f"{config.min_depth_valid:.0%} of the depth is known in {len(statistics)} of {total} frames"
-        what = f"{known}; {MIN_FRAMES} are the least"
+        what = f"{known}; {extraction.MIN_FRAMES} are the least"
         remedy = "record some seconds at least, things within 5 m, in light, with the LiDAR camera"
         raise InputError("CAP-007", what, where, remedy)
     color_strip, depth_strip = (np.concatenate(pictures, axis=1) for pictures in zip(*strip, strict=True))

@@ -42,17 +42,16 @@ def scores(
         trials = [Samples(part) for part in np.split(goals, count, axis=1)]
         found |= {f"{protocol}/{name}": [SCORES[name](t, future) for t in trials] for name in GOAL_SCORES}
     context, future = data.windows(few)
-    if len(few):
-        samples = ats.sample(context, scoring.samples, rng)
-        found |= {f"end_to_end/{name}": [SCORES[name](samples, future)] for name in PLAN_SCORES}
-        paths = alone.paths(context, scoring.samples, rng)
-        found["networks/path_minade_m"] = [SCORES["path_minade_m"](paths, future)]
-        for protocol, made in (("end_to_end", samples), ("networks", paths)):
-            assert made.path is not None, "a behavior model samples paths"
-            found[f"{protocol}/solid"] = [ats.scenes.inside_solid(made.path, context.video).mean((1, 2))]
-        if family != "one_stage":  # has no levels to condition on the truth
-            fed = fed_with_truth(alone, context, future, scoring.samples, rng)
-            found |= {f"truth_fed/{name}": [SCORES[name](fed, future)] for name in PLAN_SCORES}
+    samples = ats.sample(context, scoring.samples, rng)
+    found |= {f"end_to_end/{name}": [SCORES[name](samples, future)] for name in PLAN_SCORES}
+    paths = alone.paths(context, scoring.samples, rng)
+    found["networks/path_minade_m"] = [SCORES["path_minade_m"](paths, future)]
+    for protocol, made in (("end_to_end", samples), ("networks", paths)):
+        assert made.path is not None, "a behavior model samples paths"
+        found[f"{protocol}/solid"] = [ats.scenes.inside_solid(made.path, context.video).mean((1, 2))]
+    if family != "one_stage":  # has no levels to condition on the truth
+        fed = fed_with_truth(alone, context, future, scoring.samples, rng)
+        found |= {f"truth_fed/{name}": [SCORES[name](fed, future)] for name in PLAN_SCORES}
     listed = {
         "goal_window": _listed(data, many),
         "plan_window": _listed(data, few),

@@ -33,7 +33,7 @@ def parse(path: Path, clip: Clip) -> Prompt:
     Coordinates are pixels of the stored picture, or fractions if none is above 1. Raises InputError MSK-001.
     """
     try:
-        table = tomllib.loads(path.read_text())
+        table = tomllib.loads(path.read_text("utf-8-sig"))
         unknown = table.keys() - {"frame", "time_s", "box", "click"}
         if unknown or ("frame" in table) == ("time_s" in table) or ("box" in table) == ("click" in table):
             given = ", ".join(table)

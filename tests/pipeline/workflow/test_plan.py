@@ -106,7 +106,13 @@ def test_turnarounds_of_several_animals_are_assigned_by_name():
 
 
 @pytest.mark.parametrize(
-    "names", [("turnaround_cat.r3d", "turnaround_cat.mp4"), ("turnaround.r3d", "turnaround_cat.r3d")]
+    "names",
+    [
+        ("turnaround_cat.r3d", "turnaround_cat.mp4"),
+        ("turnaround.r3d", "turnaround_cat.r3d"),
+        ("turnaround_m\u00fcsli.r3d", "turnaround_cat.r3d"),
+        ("turnaround_mu\u0308sli.r3d", "turnaround_cat.r3d"),
+    ],
 )
 def test_two_turnarounds_of_one_animal_are_refused(names):
     with pytest.raises(InputError, match="CAP-043"):
@@ -277,6 +283,10 @@ def test_variant_shares_unaffected_artifacts(small_checkout):
         ]
     refused = small_checkout.python("pipeline.workflow.plan", "inputs", "toy", "simulators")
     assert refused.returncode == 2 and refused.stderr.startswith("error: REC-007 ")
+    unplanned = small_checkout.python("pipeline.workflow.plan", "redo", "nosuch", "masks")
+    assert unplanned.returncode == 2 and unplanned.stderr.startswith("error: RUN-001 ")
+    listed = small_checkout.python("pipeline.workflow.plan", "redo", "toy", "pictures").stderr
+    assert "REC-007" in listed and " frames," in listed and " pictures" not in listed.split("->")[1]
 
 
 def key_files(small_checkout):

@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import shutil
 import threading
 from contextlib import contextmanager
 from dataclasses import replace
@@ -60,6 +61,16 @@ def folders(room, registration) -> BuildFolders:
 def click(page, view: str, pixel) -> None:
     box = page.locator(f"#{view} img").bounding_box()
     page.mouse.click(box["x"] + pixel[0] * box["width"], box["y"] + pixel[1] * box["height"])
+
+
+def test_sessions_without_depth_are_found_where_the_map_s_depth_is(room, tmp_path):
+    build = tmp_path / "build"
+    shutil.copytree(room.build, build)
+    videos = json.loads((build / "plan" / "videos.json").read_text())
+    (build / "plan" / "videos.json").write_text(json.dumps([videos[0], videos[1] | {"mapped": True}]))
+    (build / "estimated_frames").mkdir()
+    (build / "frames" / "v001").rename(build / "estimated_frames" / "v001")
+    assert front._session(build, tmp_path / "clicks.json")
 
 
 def test_seven_clicks_in_a_browser_measure_registration(room, tmp_path):

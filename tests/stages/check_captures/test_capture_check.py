@@ -1,6 +1,7 @@
 """Every problem of a recording is detected with its code; a good recording has none."""
 
 import dataclasses
+import re
 
 import cv2
 import numpy as np
@@ -326,7 +327,7 @@ def test_program_reports_all_problems_and_fails_like_a_build(tmp_path, capsys):
         "Record3D .r3d",
         "CAP-031",
         "CAP-001",
-        "CAP-004 metadata.json: ",
+        "CAP-004 exported/metadata.json: ",
         "notes.txt",
         "'.monday.mov.icloud' (only in iCloud: download it in Finder)",
         "CAP-003); convert other videos to .mp4",
@@ -334,6 +335,39 @@ def test_program_reports_all_problems_and_fails_like_a_build(tmp_path, capsys):
         "turnaround",
     ):
         assert expected in describe_capture, describe_capture
+
+
+def movie(path, frames: int) -> None:
+    written = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (64, 48))
+    for frame in range(frames):
+        written.write(np.full((48, 64, 3), 40 * frame % 255, np.uint8))
+    written.release()
+
+
+def test_check_refuses_what_the_build_refuses(tmp_path, capsys):
+    for name in ("walkthrough", "turnaround_cat", "turnaround_m\u00fcsli"):
+        _made(3.0).write(tmp_path / f"{name}.r3d")
+    movie(tmp_path / "heldout.mp4", 12)
+    movie(tmp_path / "short.mp4", 3)
+    (tmp_path / "turnaround_cat.r3d.toml").write_text("splt = 'test'")
+    assert front.main([str(tmp_path)]) == 2
+    output = capsys.readouterr().out
+    for expected in (
+        "heldout\n  CAP-006 ",
+        "session\n  CAP-007 no usable frames: 3 pictures",
+        "turnaround_cat.r3d.toml: unknown key",
+    ):
+        assert expected in output, output
+    (tmp_path / "turnaround_cat.r3d.toml").unlink()
+    assert front.main([str(tmp_path)]) == 2
+    assert "CAP-043" in capsys.readouterr().out
+
+
+def test_tables_of_motion_are_no_recordings(tmp_path, capsys):
+    (tmp_path / "a.csv").write_text("x")
+    (tmp_path / "luna.toml").write_text("[flow]\nbegins_at = 'trajectories'")
+    assert front.main([str(tmp_path), "--recipe", str(tmp_path / "luna.toml")]) == 2
+    assert re.search("CAP-042 .*tables of motion", capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("text", ["videos = 3", "[videos]\n'walkthrough.r3d' = 3"])

@@ -205,6 +205,13 @@ def test_other_moving_object_does_not_replace_a_prompted_animal(tmp_path):
     assert np.mean([mask.visible for mask in found[16:]]) < 0.2, "share of the frames without it"
 
 
+def test_a_prompt_may_begin_with_a_byte_order_mark(tmp_path):
+    poses, agent = scenery.turnaround(2)
+    scenery.record(tmp_path / "frames", poses, agent, poses)
+    (tmp_path / "prompt.toml").write_text("frame = 1\nclick = [0.5, 0.5]", "utf-8-sig")
+    assert prompts.parse(tmp_path / "prompt.toml", Clip.open(tmp_path / "frames")).frame == 1
+
+
 @pytest.mark.parametrize(
     "text",
     [
