@@ -67,7 +67,6 @@ def bootstrapped(
     episode: Int[np.ndarray, "window"],
     rng: np.random.Generator,
     *,
-    draws: int = BOOTSTRAP_DRAWS,
     median: bool = False,
 ) -> Interval:
     """Resample episodes with replacement; return the mean or median with percentiles 2.5 and 97.5."""
@@ -75,7 +74,7 @@ def bootstrapped(
     count = episode.max() + 1
     if count < 2:
         return Interval(middle, np.nan, np.nan)
-    chosen = rng.integers(0, count, (draws, count))
+    chosen = rng.integers(0, count, (BOOTSTRAP_DRAWS, count))
     if median:
         parts = [values[episode == number] for number in range(count)]
         drawn = [np.median(np.concatenate([parts[number] for number in row])) for row in chosen]

@@ -43,8 +43,8 @@ UNIT_VIEWS = 5
 """number of frames for checking the unit of depth"""
 NEAREST_TYPICAL_M, FARTHEST_TYPICAL = 0.1, 2.0
 """limits of the median depth: meters, and multiples of the maximum depth that is used"""
-MAX_STRETCHED = 0.03
-"""maximum relative difference in aspect ratio between pictures and depth"""
+MAX_STRETCHED, MAX_OFF_CENTER = 0.03, 0.15
+"""maximum relative differences: of aspect ratios of pictures and depth, of principal point and middle"""
 AGREEMENT_PAIRS, AGREEMENT_GAP_S, CLOCK_FRAMES = 40, 1.2, 2
 """pairs of pictures whose agreement is checked, seconds between the two, and frames of `Clock`"""
 SHARPNESS_WIDTH_PX = 240
@@ -179,10 +179,10 @@ def _upright(
 def _refuse_other_pictures(
     intrinsics: Float[np.ndarray, "frame 3 3"], color_size: tuple[int, int], where: str
 ) -> None:
-    """Raise CAP-004 for a principal point outside the picture: intrinsics of another size or rotation."""
+    """Raise CAP-004 for a principal point off the middle: intrinsics of another size or rotation."""
     (height, width), (x, y) = color_size, np.median(intrinsics[:, :2, 2], axis=0)
-    if not (0 < x < width and 0 < y < height):
-        why = f"the intrinsics' center, {x:.0f} {y:.0f}, lies outside of pictures of {width} x {height}"
+    if max(abs(x / width - 0.5), abs(y / height - 0.5)) > MAX_OFF_CENTER:
+        why = f"the intrinsics' center, {x:.0f} {y:.0f}, is off that of pictures of {width} x {height}"
         raise errors.broken_metadata(where, why)
 
 
@@ -217,7 +217,7 @@ def _tracked(recording: Recording) -> tuple[Int[np.ndarray, "used"], Float[np.nd
     everything = np.arange(len(recording.index))
     if recording.pose is None:
         return everything, None, ""
-    known = np.isfinite(recording.pose).all(1)
+    known = np.isfinite(recording.pose).all(1) & recording.pose[:, :4].any(1)
     lost = "" if known.all() else f"{100 * (1 - known.mean()):.0f} % of the frames have no device pose"
     used = known if known.mean() >= MIN_TRACKED else np.ones_like(known)
     return everything[used], recording.pose[used], lost

@@ -92,7 +92,7 @@ def open_recording(path: Path) -> Recording:
 
 
 def _edge_contrasts(readings: Sequence[Recording]) -> Float[np.ndarray, "frame reading"]:
-    """Return `edge_contrast` of frames spread over a recording, by its readings; no damaged pictures."""
+    """Return `edge_contrast` of frames spread over a recording, by its readings."""
     recording, found = readings[0], []
     for row in evenly(len(recording.index), FRAMES, rounded=True).tolist():
         color = extraction.picture(recording, row)

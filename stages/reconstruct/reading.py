@@ -106,7 +106,7 @@ def read_videos(
     """Read the walk-through, the turnaround and every registered session once into rays with their poses.
 
     Args:
-        only: read only the first registered one of these sessions (of all if empty) and the turnaround.
+        only: read only the first registered one of these sessions (of all if none is) and the turnaround.
         scratch: folder of unnamed files with the rays; None: the directory of temporary files.
         workers: sessions read in parallel.
 
@@ -115,7 +115,7 @@ def read_videos(
     """
     registered = inputs.registration
     sessions = [id for id in sorted(inputs.frames) if (registered / id / "poses.npz").exists()]
-    sessions = [id for id in sessions if not only or id in only]
+    sessions = [id for id in sessions if id in (only or ())] or sessions
     if not sessions:
         remedy = "see registration/summary.json for the reasons"
         raise InputError("RCN-001", "no session was registered", str(registered), remedy)

@@ -69,7 +69,7 @@ def motions(
         observed = known[frame.cpu()].numpy()
         root, bones = interpolate_gaps(video.timestamp_s, root, bones, observed)
         if video.camera_free and smoothing_s and observed.sum() > 1:
-            window = round(smoothing_s / np.median(np.diff(video.timestamp_s)))
+            window = max(1, round(smoothing_s / np.median(np.diff(video.timestamp_s))))
             root, bones = (wiener_filter(poses, observed, window) for poses in (root, bones))
         camera = table.world_from_camera(frame).double().cpu().numpy()
         camera[~np.isfinite(video.world_from_camera).all((1, 2))] = np.nan

@@ -61,7 +61,7 @@ def _read(
     inputs: Inputs, config: Config, videos: tuple[Video, ...], scratch: Path | None, workers: int
 ) -> list[assemble.RegisteredVideo]:
     """Read the recordings that are reconstructed together."""
-    by_role = {video.role: video.id for video in videos}
+    by_role = {video.role: video.id for video in reversed(videos)}  # the first of each
     only = None
     if config.sessions == "filmed_twice":
         only = [video.synchronized_with for video in videos if video.role == "heldout"]

@@ -91,7 +91,7 @@ def clean_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
 def interior_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
     """Read depth away from steps, holes and low confidence (meters, 0 = unknown)."""
     depth = clean_depth(clip, frame)
-    kernel = np.ones((2 * (depth.shape[1] // INNER_WIDTH_PX) + 1,) * 2, np.uint8)
+    kernel = np.ones((2 * (max(depth.shape) // INNER_WIDTH_PX) + 1,) * 2, np.uint8)
     low, high = cv2.erode(depth, kernel), cv2.dilate(depth, kernel)
     return np.where((low > 0) & (high - low < INNER_STEP_SHARE * depth), depth, 0).astype(np.float32)
 

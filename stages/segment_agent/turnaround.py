@@ -79,7 +79,7 @@ def find_standing(
     """
 
     def refused(what: str) -> InputError:
-        remedy = "circle the resting animal, pointing at it, with the ground in view, or give a prompt"
+        remedy = "circle the resting animal, with the ground in view, or (one animal) give a prompt"
         return InputError("MSK-003", what, str(clip.folder), remedy)
 
     if focus is None:

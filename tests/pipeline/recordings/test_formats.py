@@ -230,6 +230,16 @@ def test_odometry_timestamps_are_used():
     assert rows.coefficients[:, 0].tolist() == [1597.8, 1604.2]
 
 
+def test_a_pose_of_zeros_is_a_lost_one(tmp_path):
+    made = walk(20, rate_hz=RATE_HZ)
+    poses = made.poses().tolist()
+    poses[7] = [0.0] * 7
+    made.metadata["poses"] = poses
+    _, plan = _understand(made.write(tmp_path / "a.r3d"))
+    assert plan.odometry_from_camera is not None
+    assert 7 not in plan.chosen.tolist()
+
+
 def test_lost_tracking_drops_frames_or_all_poses(tmp_path):
     path = made_formats.seven_scenes(tmp_path / "a", walk(20))
     lost = sorted(path.glob("*.pose.txt"))[5:7]
@@ -501,6 +511,13 @@ def _intrinsics_of_another_size(path, made):
     return path
 
 
+def _intrinsics_of_half_the_size(path, made):
+    made_formats.video_and_depth(path, made)
+    fx, fy, cx, cy = made.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]] / 2
+    (path / "intrinsics.txt").write_text(f"{fx} {fy} {cx} {cy}")
+    return path
+
+
 def _constant_rows(path, made):
     made_formats.stray(path, made)
     for file in (path / "depth").iterdir():
@@ -569,6 +586,7 @@ FAULTS = {
     "CAP-007 ": _no_depth_anywhere,
     "CAP-008": _other_depth_size,
     "CAP-004  ": _intrinsics_of_another_size,
+    "CAP-004   ": _intrinsics_of_half_the_size,
     "CAP-008 ": _millimeters_as_meters,
     "CAP-008  ": _video_of_another_shape,
     "CAP-009": _constant_rows,

@@ -273,13 +273,11 @@ def test_intervals_widen_for_correlated_windows():
     start = np.arange(600)
     values = np.repeat(rng.normal(size=10), 60)
     blocks = episodes(start, np.zeros(600, int), 60)
-    wide = bootstrapped(values, blocks, np.random.default_rng(0), draws=500)
-    narrow = bootstrapped(values, start, np.random.default_rng(0), draws=500)
+    wide = bootstrapped(values, blocks, np.random.default_rng(0))
+    narrow = bootstrapped(values, start, np.random.default_rng(0))
     assert wide.high - wide.low > 3 * (narrow.high - narrow.low)
     assert wide.low <= wide.mean <= wide.high
-    skewed = bootstrapped(
-        np.append(values, 1e6), np.append(blocks, 0), np.random.default_rng(0), draws=500, median=True
-    )
+    skewed = bootstrapped(np.append(values, 1e6), np.append(blocks, 0), np.random.default_rng(0), median=True)
     assert wide.low - 0.5 < skewed.low <= skewed.mean <= skewed.high < wide.high + 0.5
 
 
