@@ -2,14 +2,12 @@
 motion.
 """
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from pipeline.baselines.predictors import Ats
 from pipeline.behavior.config import PlanSamplingConfig
-from pipeline.behavior.planning import SampledPlan
+from pipeline.behavior.planning import PlanCondition, SampledPlan
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import FUTURE, RATE_HZ
 from stages.tabulate_behavior import chaining
@@ -19,18 +17,17 @@ from tests.pipeline.behavior.wandering import REST, room, wandering
 class Breathing:
     """A sampler whose animal stays where it is and breathes."""
 
-    scaling = SimpleNamespace(body_mean=np.zeros(6 + 6 * len(REST)))
-
     def codes(self, observation, sampling, count=1):
-        return count * len(observation)
+        rows = count * len(observation)
+        return PlanCondition(np.zeros((rows, 1)), (), np.zeros((rows, 3)), sampling, None, count)
 
-    def goals(self, count, rng):
-        return np.zeros((count, 3))
+    def goals(self, codes, rng):
+        return np.zeros((len(codes.full), 3))
 
-    def paths(self, count, goal, rng):
-        return np.tile(0.002 * np.sin(np.arange(FUTURE))[:, None] * [0, 1, 0], (count, 1, 1))
+    def paths(self, codes, goal, rng):
+        return np.tile(0.002 * np.sin(np.arange(FUTURE))[:, None] * [0, 1, 0], (len(goal), 1, 1))
 
-    def plan(self, observation, sampling, rng, goal, path):
+    def draw_plans(self, codes, rng, goal, path):
         upright = np.concatenate([[1, 0, 0, 0, 1, 0], np.zeros(6 * len(REST))])
         return SampledPlan(goal, path, np.tile(upright, (len(path), FUTURE, 1)))
 
