@@ -23,10 +23,11 @@ AGENTS := $(filter-out $(COMMANDS),$(patsubst agents/%.toml,%,$(wildcard agents/
 WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 
 .PHONY: $(COMMANDS) FORCE
-# Variables that become part of a command line or a path may contain plain names only.
-ifeq ($(origin NAME),environment)  # some systems put the host's name there
+# Some systems put the host's name into the environment as NAME; make takes it from its command line only.
+ifeq ($(origin NAME),environment)
 NAME :=
 endif
+# Variables that become part of a command line or a path may contain plain names only.
 PLAIN := a b c d e f g h i j k l m n o p q r s t u v w x y z 0 1 2 3 4 5 6 7 8 9 _ -
 rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)
 $(foreach name,AGENT NAME ABSENT REPLAYED OTHER VARIANT FORMAT PLACES PROCESSES LOCK BODY,$(if $(call rest,$(PLAIN),$(value $(name))),$(error REC-004 \
