@@ -119,6 +119,8 @@ class AnimalBatch:
 
     def command(self, goal_world: Float[np.ndarray, "animal 3"]) -> None:
         """Set commanded goals (meters, world); NaN lets an animal choose its own."""
+        released = np.isnan(goal_world).any(1) & np.isfinite(self.goal_command).all(1)
+        self.intent_end = np.where(released, 0, self.intent_end)
         self.goal_command = np.array(goal_world, float)
 
     def step(

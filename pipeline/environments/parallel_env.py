@@ -76,7 +76,7 @@ class PersonAnimalEnv(ParallelEnv):
             wish = checked(np.asarray(actions[ANIMAL])[None], (1, 2)).clip(-1, 1)
             goal = to_world(GOAL_M * wish, self._animal_heading())[0]
             self.world.animals.command((root[:3, 3] + [goal[0], 0.0, goal[1]])[None])
-        outcome = self.world.step(np.asarray(actions[PERSON])[None])
+        outcome = self.world.step(np.asarray(actions.get(PERSON, ()))[None])
         self.frame += 1
         rewards, ended, out_of_time = self.world.judge(outcome, self.frame)
         reward, over, late, agents = float(rewards[0]), bool(ended[0]), bool(out_of_time), self.agents

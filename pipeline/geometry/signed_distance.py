@@ -16,6 +16,8 @@ from torch.nn import functional
 
 from pipeline.geometry.meshes import Mesh, RayCaster, area_normals
 
+SPACING_M = 0.015
+"""mean distance of surface samples"""
 R2_SEQUENCE = (0.7548776662466927, 0.5698402909980532)
 """1 / g and 1 / g^2 of the plastic number g: multiples of them, modulo 1, are even and repeatable"""
 RAYS = np.array(
@@ -86,12 +88,7 @@ def voxel_centers(
 
 
 def from_mesh(
-    mesh: Mesh,
-    low: Float[np.ndarray, "3"],
-    high: Float[np.ndarray, "3"],
-    *,
-    voxel_m: float = 0.04,
-    spacing_m: float = 0.015,
+    mesh: Mesh, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], *, voxel_m: float = 0.04
 ) -> SignedDistance:
     """Compute the signed distance of a mesh with outward faces, in a box between two corners.
 
@@ -99,14 +96,14 @@ def from_mesh(
     filter corrects it. Surfaces with solid on both sides, which fusion leaves in walls, are ignored, since
     their gradient would lead deeper.
     """
-    grid, surface = voxel_centers(low, high, voxel_m), surface_points(mesh, spacing_m)
+    grid, surface = voxel_centers(low, high, voxel_m), surface_points(mesh, SPACING_M)
     centers, shape = grid.reshape(-1, 3), grid.shape[:3]
     inside, coarse_m = _inside(mesh, centers).reshape(shape), _distance_to_points(surface, grid, voxel_m)
     solid = _majority(inside, coarse_m, voxel_m)
     surface = _without_interior(surface, solid, np.asarray(low, np.float64), voxel_m)
     distance = _distance_to_points(surface, grid, voxel_m).reshape(-1)
     near = np.flatnonzero(distance < 3 * voxel_m)
-    distance[near] = _distance_to_patches(surface, centers[near], spacing_m)
+    distance[near] = _distance_to_patches(surface, centers[near], SPACING_M)
     values = torch.from_numpy(np.where(solid, -1.0, 1.0) * distance.reshape(shape)).float()
     return SignedDistance(values, torch.from_numpy(np.asarray(low, np.float64)).float(), voxel_m)
 

@@ -41,6 +41,8 @@ CONVENTIONS = {"units": "metres, radians, seconds", "up": [0, 1, 0], "rate_hz": 
 """Conventions stored with a model; one with others is from another version."""
 JUMP_M = 0.1
 """A leg whose ends differ in height by more than this is a jump."""
+MOVING_M = 0.3
+"""A displacement in two seconds that counts as locomotion."""
 TURN_PERCENTILE = 99
 """Percentile taken as the fastest turn: jumps of the reconstruction are outliers."""
 SWEEPS = 2
@@ -211,10 +213,8 @@ class LongTerm:
         return BodyMotion(bodies.world_from_agent, bones)
 
 
-def measure_motion_prior(
-    stretches: list[BodyMotion], scenes: list[MotionScene], *, moving_m: float = 0.3
-) -> MotionPrior:
-    """Measure motion statistics; ``moving_m`` is the displacement in two seconds that counts as locomotion.
+def measure_motion_prior(stretches: list[BodyMotion], scenes: list[MotionScene]) -> MotionPrior:
+    """Measure motion statistics; locomotion is a displacement by `MOVING_M` in two seconds.
 
     Half a turn per second is always allowed, even for a body that was only recorded at rest.
     """
@@ -230,9 +230,9 @@ def measure_motion_prior(
         displacements.append(displacement)
         rotation = stretch.world_from_agent[:, :3, :3]
         turn.append(rigid.rotation_angle(rotation[:-1], rotation[1:]))
-    moves = np.concatenate(displacements) > moving_m
+    moves = np.concatenate(displacements) > MOVING_M
     moves = moves if moves.any() else ~moves
     medians = (float(np.median(np.concatenate(each)[moves])) for each in (clearance, displacements, above))
     clearance_m, pace_m, above_m = medians
     turn_rad = max(float(np.percentile(np.concatenate(turn), TURN_PERCENTILE)), np.pi / RATE_HZ)
-    return MotionPrior(clearance_m, max(pace_m, moving_m), above_m, turn_rad)
+    return MotionPrior(clearance_m, max(pace_m, MOVING_M), above_m, turn_rad)

@@ -27,18 +27,17 @@ def quarter_turns_from_gravity(
     odometry_from_camera: Float[np.ndarray, "frame 4 4"],
     *,
     up_odometry: tuple[float, float, float] | Float[np.ndarray, "3"] = (0.0, 1.0, 0.0),
-    margin: float = 0.1,
 ) -> int:
     """Return the clockwise quarter turns (0..3) after which world up points up in the pictures, on average.
 
-    It is 0 unless another turn is better by ``margin`` (mean cosine): a phone may look down.
+    It is 0 unless another turn is better by 0.1 (mean cosine): a phone may look down.
     """
     up_in_picture = [
         -(cameras.turn_camera(odometry_from_camera, turns)[:, :3, 1] @ np.asarray(up_odometry)).mean()
         for turns in range(4)
     ]
     best = int(np.argmax(up_in_picture))
-    return best if up_in_picture[best] > up_in_picture[0] + margin else 0
+    return best if up_in_picture[best] > up_in_picture[0] + 0.1 else 0
 
 
 def up_from_room(

@@ -19,6 +19,7 @@ from numba import njit
 from scipy.spatial import KDTree
 from skimage import measure
 
+from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip, Masks
 from pipeline.geometry import cameras, rigid
 from pipeline.geometry.flying_pixels import supported
@@ -36,6 +37,8 @@ OUTLIER_FACTOR, OUTLIER_QUANTILE = 1.6, 0.98
 """outliers are farther from the middle than this factor times this quantile"""
 MIN_DISTANCE = 0.05
 """least magnitude of the signed distance of voxels, in units of the truncation"""
+MIN_CELLS = 200
+"""least number of voxels of a body, a few for each of 25 bones"""
 AGGRESSIVENESS = 4
 """aggressiveness of edge collapse: lower keeps shape better"""
 OFF_BODY_M = 0.025
@@ -162,6 +165,7 @@ def extract(
     """Extract the largest body of the fused volume, smoothed at constant volume and simplified.
 
     Fused depth counts unless most frames see through a voxel; others are inside if hardly any frame does.
+    Raises InputError AGT-001 if hardly any voxel is left.
     """
     fused = volume.weight > 0
     outside = below_ground | (share_off_mask > np.where(fused, MAX_FREE_FUSED, MAX_FREE))
@@ -170,6 +174,10 @@ def extract(
     group, count = cast("tuple[np.ndarray, int]", scipy.ndimage.label(distance < 0))
     own = group == (np.bincount(group.ravel())[1:].argmax() + 1 if count else -1)
     own = np.asarray(scipy.ndimage.binary_fill_holes(own))
+    if own.sum() < MIN_CELLS:
+        what = f"the turnaround's depth and masks leave {own.sum()} voxels of the animal"
+        remedy = "film it again, in better light; see the pictures of its masks"
+        raise InputError("AGT-001", what, "turnaround", remedy)
     distance = np.where(own, np.minimum(distance, -MIN_DISTANCE), np.maximum(distance, MIN_DISTANCE))
     distance = scipy.ndimage.gaussian_filter(distance, SMOOTH_VOXELS)
     cells = int((own & scipy.ndimage.binary_dilation(distance < 0)).sum())

@@ -18,6 +18,8 @@ def clean(source: str, target: str, min_faces: int) -> None:
     meshes.meshing_remove_duplicate_faces()
     meshes.meshing_remove_null_faces()
     meshes.meshing_remove_connected_component_by_face_number(mincomponentsize=min_faces, removeunref=True)
+    if not meshes.current_mesh().face_number():
+        return  # no component is large enough
     meshes.meshing_repair_non_manifold_edges()
     meshes.apply_coord_taubin_smoothing(stepsmoothnum=3)
     meshes.meshing_remove_unreferenced_vertices()

@@ -107,19 +107,19 @@ def align_frames(
     return optimized.world_from_camera, gap
 
 
-def clean(mesh: Mesh, workspace: Path, island_faces: int) -> Mesh:
-    """Clean a mesh with MeshLab in a separate process. Raises InputError MAP-003 when that fails."""
+def clean(mesh: Mesh, workspace: Path, island_faces: int) -> Mesh | None:
+    """Clean a mesh with MeshLab in a separate process; None if nothing is left. Raises InputError MAP-003."""
     source, target = workspace / "raw.ply", workspace / "clean.ply"
     mesh_files.write_ply(source, mesh)
     program = Path(__file__).with_name("clean_mesh.py")
     environment = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "PATH": "/usr/bin:/bin"}
     command = [sys.executable, program, source, target, str(island_faces)]
     completed = subprocess.run(command, env=environment, capture_output=True, text=True)
-    if completed.returncode or not target.exists():
+    if completed.returncode:
         last = (completed.stderr.strip().splitlines() or ["no message"])[-1]
         remedy = "install its libraries: apt-get install libgl1 libopengl0"
         raise InputError("MAP-003", f"pymeshlab failed: {last}", program.name, remedy)
-    return mesh_files.read_ply(target)
+    return mesh_files.read_ply(target) if target.exists() else None
 
 
 def vertex_features(

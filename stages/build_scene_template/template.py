@@ -78,6 +78,8 @@ def build(
     poses, gap = fuse.align_frames(clip, mesh, upright_from_world @ poses, config.fusion, frames)
     mesh = fuse.fuse(clip, np.arange(len(clip)), poses, config.fusion)
     mesh = fuse.clean(mesh, workspace, config.fusion.island_faces)
+    if mesh is None:
+        raise _no_surface_error(clip)
     log(f"{len(mesh.faces)} faces; median gap of depth from the surface {np.nanmedian(gap) * 100:.1f} cm")
     built = SceneTemplate(
         mesh=mesh,

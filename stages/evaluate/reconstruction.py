@@ -241,10 +241,10 @@ def track_distances(
     return distances
 
 
-def _at_rest(turnaround: RecordingWithTruth, frames: TruthAlignment, every: int = 8) -> Iterator[np.ndarray]:
+def _at_rest(turnaround: RecordingWithTruth, frames: TruthAlignment) -> Iterator[np.ndarray]:
     """Yield the true surface of some frames of the turnaround, in our agent frame."""
     truth = turnaround.truth
-    for frame in range(0, len(turnaround.clip), every):
+    for frame in range(0, len(turnaround.clip), 8):
         in_agent = rigid.apply(rigid.inverse(truth.world_from_agent[frame]), truth.vertices_world(frame))
         yield rigid.apply(frames.agent_from_true_agent, in_agent)
 

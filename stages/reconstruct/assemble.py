@@ -26,6 +26,7 @@ from stages.reconstruct.problem import (
     TemplateSurface,
     frame_table,
     prior_precision,
+    stretch_table,
 )
 from stages.reconstruct.rays import RayStore, Views, join
 
@@ -153,6 +154,7 @@ def build(
         body=body,
         motion=motion,
         video=frame_table(lengths),
+        stretch=stretch_table([video.timestamp_s for video in videos]),
         has_scene=has_scene,
         surface=surface,
         joints=joints,

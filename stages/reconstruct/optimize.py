@@ -97,9 +97,9 @@ def optimize(problem: Problem, plan: OptimizationPlan) -> dict[str, FitRecord]:
 
 
 def split_segments(problem: Problem, length: int) -> Iterable[Int[Tensor, "frame"]]:
-    """Cut each video's frames into segments of up to ``length`` that hold at least one usable frame."""
-    for video in range(int(problem.video.max()) + 1):
-        frames = torch.nonzero(problem.video == video)[:, 0]
+    """Cut each stretch's frames into segments of up to ``length`` that hold at least one usable frame."""
+    for stretch in range(int(problem.stretch.max()) + 1):
+        frames = torch.nonzero(problem.stretch == stretch)[:, 0]
         for part in frames.split(length):
             if torch.isin(part, problem.agent_frames).any():
                 yield part

@@ -21,6 +21,8 @@ TRUSTED = 0.1
 MAX_PRECISE = 100.0
 """prior precision of a camera registered with certainty, relative to one at even odds; losses alone err by a
 millimeter and 0.05 degrees"""
+PAUSE_STEPS = 2.5
+"""a longer time between frames, in median times between frames, is a pause: a single lost frame is none"""
 MAX_JOINTS = 4
 """maximum number of joints per bone"""
 SOLE, SOLES = 0.07, 32
@@ -44,6 +46,8 @@ class Problem:
     motion: MotionTable
     video: Int[Tensor, "frame"]
     """index of each frame's video"""
+    stretch: Int[Tensor, "frame"]
+    """index of each frame's stretch of a video between pauses of the recording; priors of motion end there"""
     has_scene: Bool[Tensor, "frame"]
     """False for the turnaround: its world is the agent"""
     surface: "TemplateSurface"
@@ -92,14 +96,14 @@ class Problem:
         )
 
     def runs(self, length: int) -> Int[Tensor, "run"]:
-        """Return first frames of runs of usable frames of one video; only trusted ones if there are any."""
+        """Return first frames of runs of usable frames of one stretch; only trusted ones if there are any."""
         first = self.agent_frames.cpu()
         trusted = self.trust.cpu()[first] > TRUSTED
         first = first[trusted] if trusted.any() else first
         usable = torch.zeros(len(self.video) + length, dtype=torch.bool)
         usable[first] = True
-        video = torch.cat([self.video.cpu(), torch.full((length,), -1)])
-        good = [usable[first + k] & (video[first + k] == video[first]) for k in range(length)]
+        stretch = torch.cat([self.stretch.cpu(), torch.full((length,), -1)])
+        good = [usable[first + k] & (stretch[first + k] == stretch[first]) for k in range(length)]
         return first[torch.stack(good).all(0)]
 
 
@@ -202,6 +206,13 @@ def prior_precision(motion: MotionTable, confidence: Float[np.ndarray, "frame"])
 def pick(count: int, number: int, generator: Generator, device: torch.device) -> Int[Tensor, "sample"]:
     """Choose indices below ``count`` at random, with repetition."""
     return torch.randint(count, (number,), generator=generator).to(device)
+
+
+def stretch_table(timestamp_s: Sequence[Float[np.ndarray, "frame"]]) -> Int[Tensor, "frame"]:
+    """Return the index of each frame's stretch: a new one begins with a video and after a pause."""
+    steps = [np.diff(times) for times in timestamp_s]
+    begins = [np.append(True, step > PAUSE_STEPS * np.median(step)) for step in steps]
+    return torch.from_numpy(np.cumsum(np.concatenate(begins)) - 1)
 
 
 def frame_table(lengths: Sequence[int]) -> Int[Tensor, "frame"]:

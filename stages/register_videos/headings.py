@@ -108,15 +108,13 @@ def weights(candidates: list[RootHypotheses]) -> Float[np.ndarray, "observation"
     return np.minimum(share / ENOUGH_SHARE, 1.0) / (1 + excess**2)
 
 
-def motion_cues(
-    timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypotheses], span: int = 3
-) -> MotionCues:
-    """Measure motion between ``span`` observations before and after each one."""
+def motion_cues(timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypotheses]) -> MotionCues:
+    """Measure motion between the third observations before and after each one."""
     center = np.stack([each.center_world for each in candidates]) * (1, 0, 1)
     camera = np.stack([each.eye_world for each in candidates])
     time = timestamp_s[[each.frame for each in candidates]]
-    before = np.maximum(np.arange(len(time)) - span, 0)
-    after = np.minimum(np.arange(len(time)) + span, len(time) - 1)
+    before = np.maximum(np.arange(len(time)) - 3, 0)
+    after = np.minimum(np.arange(len(time)) + 3, len(time) - 1)
     elapsed_s = np.maximum(time[after] - time[before], 1e-3)[:, None]
     velocity = (center[after] - center[before]) / elapsed_s
     moved = np.linalg.norm(velocity, axis=1) + CAMERA_SHARE * np.linalg.norm(

@@ -266,6 +266,8 @@ def test_intent_moves_with_the_companion_at_the_goal_and_ends_with_the_horizon(s
     animals.command(np.ones((1, 3)))
     assert np.isnan(animals._intent(first)).all(), "commanded"
     animals.command(np.full((1, 3), np.nan))
+    assert np.isnan(animals._intent(first)).all(), "released: where it was sent is no intent of its own"
+    animals.intent_end[0] = animals.plan_frames
     animals.played[0] = animals.plan_frames - animals.chaining.blend_frames
     assert np.isnan(animals._intent(first)).all(), "its horizon has passed"
     animals.played[0], animals.companions = 5, None

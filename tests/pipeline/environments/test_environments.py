@@ -144,6 +144,8 @@ def test_nonfinite_goals_are_refused():
     env.reset(seed=0)
     with pytest.raises(InputError, match="SIM-012"):
         env.step({"person": np.zeros(3), "animal": np.array([np.nan, 0.0])})
+    with pytest.raises(InputError, match="SIM-012"):
+        env.step({"animal": np.zeros(2)})
 
 
 def test_plans_are_followed_for_several_steps():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from pipeline.core.errors import InputError
 from pipeline.geometry.tsdf import Volume
 from stages.build_agent_template.config import Config
 from stages.build_agent_template.fuse import TRUNCATION_M, extract
@@ -21,6 +22,13 @@ def ball(options: Config, middle: np.ndarray, scrap: bool) -> Volume:
         volume.distance[cells // 2, cells // 2 : -4, cells // 2 : cells // 2 + 3] = -0.1
     volume.weight[:] = 1
     return volume
+
+
+def test_animal_of_hardly_any_voxel_is_refused():
+    volume = ball(Config(), np.zeros(3), scrap=False)
+    seen_through = np.ones(volume.weight.shape)
+    with pytest.raises(InputError, match="AGT-001"):
+        extract(volume, seen_through, seen_through < 1, 2500)
 
 
 @pytest.mark.parametrize("scrap", [False, True])

@@ -181,10 +181,13 @@ def test_cleaning_removes_islands_and_keeps_colors(tmp_path):
     volume.color[:] = (200, 30, 90)
     mesh = volume.surface(0.0)
     cleaned = fuse.clean(mesh, tmp_path, island_faces=200)
+    assert cleaned is not None
     assert len(cleaned.faces) < len(mesh.faces)
     assert np.linalg.norm(cleaned.vertices - 0.9, axis=1).max() < 0.6, "the small sphere is gone"
     assert (cleaned.color == (200, 30, 90)).all()
     mesh_files.write_ply(tmp_path / "again.ply", Mesh(cleaned.vertices, cleaned.faces, cleaned.color))
+    (tmp_path / "only_islands").mkdir()
+    assert fuse.clean(mesh, tmp_path / "only_islands", island_faces=len(mesh.faces)) is None
 
 
 def test_failure_of_the_cleaner_is_reported(tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ import torch
 from pipeline.data.motion import MotionTable
 from pipeline.geometry import rigid
 from stages.reconstruct import assemble, rays
+from stages.reconstruct.optimize import split_segments
 from stages.reconstruct.problem import MAX_PRECISE, prior_precision
 from tests.stages.reconstruct.test_optimize import WIDE, film, problem
 
@@ -76,6 +77,17 @@ def test_dropped_frames_are_down_weighted_and_excluded_from_the_joint_phase():
         torch.isin(torch.tensor([0, 2, 6]), runs).all()
         and not torch.isin(torch.tensor([3, 4, 5]), runs).any()
     )
+
+
+def test_runs_and_segments_end_at_pauses():
+    _, videos = problem()
+    times = videos[0].timestamp_s + np.where(np.arange(12) >= 7, 3.0, 0.0)
+    built, _ = problem(videos=[dataclasses.replace(videos[0], timestamp_s=times), videos[1]])
+    starts = built.runs(3)
+    assert not torch.isin(torch.tensor([5, 6]), starts).any()
+    assert torch.isin(torch.tensor([4, 7]), starts).all()
+    segments = [frames.tolist() for frames in split_segments(built, 10)]
+    assert segments == [list(range(7)), list(range(7, 12)), list(range(12, 18))]
 
 
 def test_masks_are_weighted_by_visibility(monkeypatch):
