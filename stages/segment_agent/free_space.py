@@ -83,14 +83,9 @@ class Votes:
     """mean color (0..255) of those surfaces"""
 
 
-def clean_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
-    """Read usable depth without flying pixels at depth steps (meters, 0 = unknown)."""
-    return usable_depth(clip, frame, keep_steps=False)
-
-
 def interior_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
     """Read depth away from steps, holes and low confidence (meters, 0 = unknown)."""
-    depth = clean_depth(clip, frame)
+    depth = usable_depth(clip, frame, keep_steps=False)
     kernel = np.ones((2 * (max(depth.shape) // INNER_WIDTH_PX) + 1,) * 2, np.uint8)
     low, high = cv2.erode(depth, kernel), cv2.dilate(depth, kernel)
     return np.where((low > 0) & (high - low < INNER_STEP_SHARE * depth), depth, 0).astype(np.float32)
@@ -130,7 +125,7 @@ def sample(
 def gather(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], count: int) -> References:
     """Read the ``count`` depth pictures that vote."""
     frames = subsampling.evenly(len(clip), count, rounded=True)
-    depth = np.stack([clean_depth(clip, frame) for frame in frames])
+    depth = np.stack([usable_depth(clip, frame, keep_steps=False) for frame in frames])
     size = clip.depth_size[::-1]
     small = (cv2.resize(clip.color(frame), size, interpolation=cv2.INTER_AREA) for frame in frames)
     color = np.stack([cv2.GaussianBlur(each, (5, 5), BLUR_PX) for each in small])

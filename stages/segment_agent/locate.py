@@ -8,11 +8,12 @@ from jaxtyping import Bool, Float, Shaped
 
 from pipeline.data.clips import Clip
 from pipeline.geometry import cameras
+from pipeline.geometry.flying_pixels import supported
 from stages.segment_agent import free_space, identity, movers
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.free_space import References, Votes
 from stages.segment_agent.movers import Candidate, PlacedPrompt
-from stages.segment_agent.windows import Sphere, supported_depth
+from stages.segment_agent.windows import Sphere, snap_depth_steps
 
 COARSE_PX, FINE_PX = 111, 222
 """square root of the number of depth samples per frame, without and with known appearance"""
@@ -96,8 +97,11 @@ def _candidates(
     ``known`` are the log-odds of its appearance and against other animals, if any.
     """
     appearance, margin_of = known
-    wanted_px = COARSE_PX if appearance is None else FINE_PX
-    whole = free_space.interior_depth(clip, frame) if appearance is None else supported_depth(clip, frame)
+    if appearance is None:
+        wanted_px, whole = COARSE_PX, free_space.interior_depth(clip, frame)
+    else:  # thin things too
+        wanted_px, sharp = FINE_PX, snap_depth_steps(clip.depth(frame))
+        whole = np.where(supported(sharp), sharp, 0)
     points, area, chosen = free_space.sample(clip, frame, world_from_camera, whole, wanted_px)
     if appearance is not None:
         log_ratio = resample_nearest(appearance(frame), clip.depth_size, chosen)
@@ -122,8 +126,8 @@ def _candidates(
 
 
 def opened_motion(votes: Votes, share: float) -> Bool[np.ndarray, "row column"]:
-    """Return the surely moving samples after morphological opening."""
-    reliable = movers.surely_moving(votes, share)
+    """Return the samples in space that is free at a good share of other times, morphologically opened."""
+    reliable = (votes.free > movers.MIN_VOTES) & (votes.free >= share * votes.occupied)
     opened = cv2.dilate(cv2.erode(reliable.astype(np.uint8), OPENING), OPENING[::-1, ::-1], anchor=(0, 0))
     return reliable & (opened > 0)
 

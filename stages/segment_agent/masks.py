@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipeline.core.errors import InputError
-from pipeline.data.clips import Clip
+from pipeline.data.clips import Clip, usable_depth
 from pipeline.geometry import subsampling
 from stages.segment_agent import free_space, movers, people, prompts
 from stages.segment_agent.appearance import Appearance, Example, learn
@@ -208,7 +208,8 @@ def _label_room(
     An undetected resting animal is outweighed by the frames in which it moves.
     """
     clip, pose = segmenter.clip, segmenter.world_from_camera[frame]
-    points = free_space.world_points(clip, frame, pose, free_space.clean_depth(clip, frame), STATIC_STRIDE)
+    depth = usable_depth(clip, frame, keep_steps=False)
+    points = free_space.world_points(clip, frame, pose, depth, STATIC_STRIDE)
     moving = movers.moving(free_space.vote(references, points, frame))
     size, near = working_size(clip, segmenter.height_px), cv2.dilate(moving.astype(np.uint8), DILATION)
     return cv2.resize(near, size[::-1], interpolation=cv2.INTER_NEAREST) * np.uint8(128)

@@ -85,11 +85,6 @@ def moving(votes: Votes) -> Bool[np.ndarray, "*shape"]:
     return votes.free >= MIN_VOTES + MIN_SHARE * votes.occupied
 
 
-def surely_moving(votes: Votes, share: float) -> Bool[np.ndarray, "*shape"]:
-    """Return which points lie in space that is free at a good share of other times, for training."""
-    return (votes.free > MIN_VOTES) & (votes.free >= share * votes.occupied)
-
-
 def clearly_moving(votes: Votes) -> Bool[np.ndarray, "*shape"]:
     """Return points that clearly more references saw through than saw a surface at."""
     return votes.free - votes.occupied > MIN_VOTES

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.core.progress import log
 from pipeline.data.clips import Clip
-from pipeline.geometry import rigid, subsampling
+from pipeline.geometry import subsampling
 from stages.segment_agent import free_space, movers
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.free_space import References
@@ -62,14 +62,6 @@ class People:
         axes = axes[np.isfinite(axes[:, 0])]
         off = np.linalg.norm(points_world[..., None, ::2] - axes, axis=-1)
         return (off < REACH_M).any(-1) & (points_world[..., 1] > self.floor_m + ABOVE_FLOOR_M)
-
-    def feet_in_camera(
-        self, world_from_camera: Float[np.ndarray, "frame 4 4"]
-    ) -> Float[np.ndarray, "frame person 3"]:
-        """Return the places on the floor where people stand, camera frame, meters; NaN where not seen."""
-        x, z = self.axis_world[..., 0].T, self.axis_world[..., 1].T
-        feet = np.stack([x, np.full_like(x, self.floor_m), z], axis=-1)
-        return rigid.apply(rigid.inverse(world_from_camera)[:, None], feet[..., None, :])[..., 0, :]
 
 
 def find_people(

@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.core.errors import InputError
-from pipeline.data.clips import Clip
+from pipeline.data.clips import Clip, usable_depth
 from pipeline.geometry import cameras, rigid
-from stages.segment_agent.free_space import clean_depth
 from stages.segment_agent.movers import PlacedPrompt
 
 FORESHORTENED, MIN_BOX_M = 1.5, 0.02
@@ -74,7 +73,8 @@ def position(
     center = np.array([x0 + x1, y0 + y1]) / 2 * scale
     half = np.maximum(np.array([x1 - x0, y1 - y0]) / 6 * scale, 2)
     low, high = np.maximum(np.floor(center - half), 0).astype(int), np.ceil(center + half).astype(int)
-    depth = clean_depth(clip, prompt.frame)[low[1] : high[1] + 1, low[0] : high[0] + 1]
+    depth = usable_depth(clip, prompt.frame, keep_steps=False)
+    depth = depth[low[1] : high[1] + 1, low[0] : high[0] + 1]
     if not (depth > 0).any():
         what = "the prompt lies where depth is unknown"
         remedy = "point at another part of the animal or another frame"

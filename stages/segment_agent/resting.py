@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.core.errors import InputError
-from pipeline.data.clips import Clip
+from pipeline.data.clips import Clip, usable_depth
 from pipeline.geometry import cameras, rigid
 from stages.segment_agent import free_space, movers
 from stages.segment_agent.evidence import EvidenceOf
@@ -36,7 +36,7 @@ def is_resting(
     prompt: PlacedPrompt,
 ) -> bool:
     """Return whether the prompted object stays there: few other frames see through it."""
-    depth = free_space.clean_depth(clip, prompt.frame)
+    depth = usable_depth(clip, prompt.frame, keep_steps=False)
     points = cameras.back_project(depth, clip.depth_intrinsics[prompt.frame])[depth > 0]
     points = rigid.apply(world_from_camera[prompt.frame], points)
     points = points[np.linalg.norm(points - prompt.center_world, axis=1) < PROMPT_RADIUS_M]

@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.data.clips import Clip, back_project_pixels
+from pipeline.data.clips import Clip, back_project_pixels, usable_depth
 from pipeline.data.flow import STRIDE_PX, open_flow
 from pipeline.geometry import cameras
 from pipeline.geometry.align import ransac_rigid
 from pipeline.mapping.icp import depth_views
 from pipeline.mapping.odometry import align_gravity, chain_alignments, correct_drift
-from stages.segment_agent.free_space import clean_depth
 
 DEPTH_STRIDE = 3
 INLIER_M, ITERATIONS = 0.03, 200
@@ -31,7 +30,7 @@ class CameraPath:
 
 def estimate_trajectory(clip: Clip, flow: Path, rng: np.random.Generator) -> CameraPath:
     """Return drift-corrected poses; without odometry, frame-to-frame motion is chained first."""
-    view = depth_views(partial(clean_depth, clip), clip.depth_intrinsics, DEPTH_STRIDE)
+    view = depth_views(partial(usable_depth, clip, keep_steps=False), clip.depth_intrinsics, DEPTH_STRIDE)
     poses = clip.odometry_from_camera
     if poses is None:
         forward = open_flow(flow, 1)
@@ -51,7 +50,7 @@ def motion_from_flow(
     height, width = flow.shape[:2]
     pixel = cameras.pixel_grid(height, width) * STRIDE_PX
     first, second = (
-        back_project_pixels(clip, row, at.reshape(-1, 2), clean_depth(clip, row))
+        back_project_pixels(clip, row, at.reshape(-1, 2), usable_depth(clip, row, keep_steps=False))
         for row, at in ((frame, pixel), (frame + 1, pixel + flow))
     )
     known = np.isfinite(first[:, 0]) & np.isfinite(second[:, 0])

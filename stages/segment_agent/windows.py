@@ -7,10 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.data.clips import Clip
+from pipeline.data.clips import Clip, usable_depth
 from pipeline.geometry import cameras, rigid
-from pipeline.geometry.flying_pixels import supported
-from stages.segment_agent.free_space import clean_depth
 
 STEP_M = 0.05
 """difference of neighboring depths above which they form a step"""
@@ -93,17 +91,11 @@ def crop_window(
     grid = cameras.pixel_grid(*size)[rows, columns]
     at = grid * np.divide(clip.depth_size, size)[::-1]
     z = cameras.sample_nearest(snap_depth_steps(clip.depth(frame)), at)
-    trusted = cameras.sample_nearest(clean_depth(clip, frame), at) > 0
+    trusted = cameras.sample_nearest(usable_depth(clip, frame, keep_steps=False), at) > 0
     points_camera = cameras.unproject(grid, intrinsics) * z[..., None]
     points = rigid.apply(world_from_camera, points_camera.reshape(-1, 3)).reshape(*z.shape, 3)
     points[z == 0] = np.nan
     return Window(rows, columns, np.ascontiguousarray(color[rows, columns]), points, trusted)
-
-
-def supported_depth(clip: Clip, frame: int) -> Float[np.ndarray, "height width"]:
-    """Read depth with sharp steps, including thin things that neighbors support (0 = unknown)."""
-    depth = snap_depth_steps(clip.depth(frame))
-    return np.where(supported(depth), depth, 0)
 
 
 def snap_depth_steps(depth: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:

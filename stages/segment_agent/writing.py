@@ -11,6 +11,7 @@ from pipeline.core.progress import log, track
 from pipeline.data import images, npz, plots, qa
 from pipeline.data.clips import PEOPLE, Clip, Masks
 from pipeline.data.qa import Check
+from pipeline.geometry import rigid
 from stages.segment_agent import overlap
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.masks import Segmentation
@@ -66,9 +67,11 @@ def write_masks(folder: Path, masks: Iterable[Mask], count: int) -> Summary:
 
 
 def write_people(folder: Path, clip: Clip, found: Segmentation) -> None:
-    """Write ``people.npz`` of a session with depth."""
+    """Write ``people.npz`` of a session with depth: where people stand on the floor, camera frame, meters."""
     if found.people is not None and found.path is not None:
-        feet_camera = found.people.feet_in_camera(found.path.world_from_camera)
+        feet = np.insert(np.swapaxes(found.people.axis_world, 0, 1), 1, found.people.floor_m, axis=-1)
+        camera_from_world = rigid.inverse(found.path.world_from_camera)
+        feet_camera = rigid.apply(camera_from_world[:, None], feet[..., None, :])[..., 0, :]
         time_s, height_m = clip.timestamp_s, found.people.height_m
         PEOPLE.save(folder / "people.npz", timestamp_s=time_s, feet_camera=feet_camera, height_m=height_m)
 
@@ -82,13 +85,6 @@ def overlay(
     return plots.outlined(picture.astype(np.uint8), labels == 255, GREEN)
 
 
-def area_jumps(area: Float[np.ndarray, "frame"]) -> float:
-    """Return the share of frame steps at which the area more than doubles, halves, starts or ends."""
-    shown = (area[:-1] > 0) | (area[1:] > 0)
-    jumps = np.abs(np.diff(np.log2(np.maximum(area, 1e-6)))) > 1
-    return float(jumps[shown].mean()) if shown.any() else np.nan
-
-
 def checks_of(
     summary: Summary, residual_m: float = np.nan, estimated: Float[np.ndarray, "frame"] | None = None
 ) -> list[Check]:
@@ -100,8 +96,10 @@ def checks_of(
         Check("frames of low confidence", _percent(unsure), "%", warn=12, fail=30),
     ]
     if estimated is None:
-        jumps = 100 * area_jumps(np.array(summary.area))
-        return [*checks, Check("area doubles, halves or is gone", jumps, "%", warn=6, fail=15)]
+        area = np.array(summary.area)
+        jumps = np.abs(np.diff(np.log2(np.maximum(area, 1e-6)))) > 1
+        share = _percent(jumps[(area[:-1] > 0) | (area[1:] > 0)])
+        return [*checks, Check("area doubles, halves or is gone", share, "%", warn=6, fail=15)]
     counted = estimated[np.isfinite(estimated)]
     iou = float(counted.mean()) if len(counted) else np.nan
     return [
