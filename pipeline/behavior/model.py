@@ -14,46 +14,12 @@ from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import nn
 
-from pipeline.behavior.body_denoiser import (
-    CONTROL_CHANNELS,
-    ROOT_CHANNELS,
-    BodyDenoiser,
-    GaussianPrior,
-    OneStageDenoiser,
-)
-from pipeline.behavior.config import (
-    AblatedInput,
-    Control,
-    Ego,
-    Family,
-    Guided,
-    ObservedPast,
-    PlanSamplingConfig,
-    SceneEncoder,
-)
-from pipeline.behavior.denoisers import (
-    EMBEDDING,
-    ConcatenationUNet,
-    ControlUNet,
-    TrailingLinear,
-    UncontrolledUNet,
-)
+from pipeline.behavior import body_denoiser, config, denoisers, path_encoding
+from pipeline.behavior.body_denoiser import CONTROL_CHANNELS, ROOT_CHANNELS
 from pipeline.behavior.diffusion import SOLVER_STEPS, STANDARD, Schedule
 from pipeline.behavior.encoders import ATTENDED_CHANNELS, HEADS
 from pipeline.behavior.goal_denoiser import GoalMLP
-from pipeline.behavior.path_encoding import (
-    GOAL_LENGTH_POWER,
-    GOAL_TOLERANCE_M,
-    GOAL_TOLERANCE_SHARE,
-    MIN_SQUARED_M2,
-    PATH_CHANNELS,
-    REST_DAMPING,
-    REST_SPEED_M_S,
-    VELOCITY_POWER,
-    path_from_velocity_channels,
-    warped_path,
-    with_powered_length,
-)
+from pipeline.behavior.path_encoding import path_from_velocity_channels, warped_path, with_powered_length
 from pipeline.behavior.perception import (
     GRID_CELL_M,
     GRID_SHAPE,
@@ -72,9 +38,9 @@ class Architecture:
     """All that determines the shapes of the networks and the meaning of their channels."""
 
     bones: int
-    ego: Ego = "yaw"
-    scene: SceneEncoder = "pillars"
-    observed_past: ObservedPast = "positions"
+    ego: config.Ego = "yaw"
+    scene: config.SceneEncoder = "pillars"
+    observed_past: config.ObservedPast = "positions"
     scene_width: int = 32
     scene_block: int = 4
     scene_channels: int = 16
@@ -83,7 +49,7 @@ class Architecture:
     observer_radius_m: float = 4.0
     companions: bool = False
     """whether it was recorded with companions; then goals read the positions of others"""
-    ablated_input: AblatedInput = "nothing"
+    ablated_input: config.AblatedInput = "nothing"
     body_components: int = 0
     """principal components of bones that the UNet of bodies corrects (`GaussianPrior`); 0: it
     denoises all channels, without a fitted prior"""
@@ -91,13 +57,13 @@ class Architecture:
     unet_multipliers: tuple[int, ...] = (1, 2, 4)
     goal_hidden: int = 128
     goal_layers: int = 6
-    family: Family = "diffusion"
-    control: Control = "unet"
+    family: config.Family = "diffusion"
+    control: config.Control = "unet"
     past: int = PAST
     future: int = FUTURE
     rate_hz: float = RATE_HZ
     ensemble_size: int = 3
-    guided: Guided = "observer"
+    guided: config.Guided = "observer"
     """conditions that guidance amplifies: all if trained with `joint_dropout`"""
 
     @property
@@ -166,11 +132,11 @@ class Scaling:
 
     def scaled_goal(self, goal: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
         """Convert goals in meters to the units of diffusion and of the control of paths."""
-        return (with_powered_length(goal, GOAL_LENGTH_POWER) / self.goal_std).astype(np.float32)
+        return (with_powered_length(goal, path_encoding.GOAL_LENGTH_POWER) / self.goal_std).astype(np.float32)
 
     def goal(self, scaled: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
         """Undo `scaled_goal`."""
-        return with_powered_length(scaled * self.goal_std, 1 / GOAL_LENGTH_POWER)
+        return with_powered_length(scaled * self.goal_std, 1 / path_encoding.GOAL_LENGTH_POWER)
 
     def path(
         self, scaled: Float[np.ndarray, "plan 4 frame"], start: Float[np.ndarray, "plan 3"]
@@ -221,22 +187,22 @@ class BehaviorNets(nn.Module):
         sizes = (a.code_length, widths, schedule)
         match a.control:
             case "unet":
-                self.path = ControlUNet(PATH_CHANNELS, 3, *sizes)
-                body = ControlUNet(corrected, CONTROL_CHANNELS, *sizes, outputs=corrected + gates)
+                self.path = denoisers.ControlUNet(path_encoding.PATH_CHANNELS, 3, *sizes)
+                body = denoisers.ControlUNet(corrected, CONTROL_CHANNELS, *sizes, outputs=corrected + gates)
             case "concatenation":
-                self.path = ConcatenationUNet(PATH_CHANNELS, 3, *sizes)
+                self.path = denoisers.ConcatenationUNet(path_encoding.PATH_CHANNELS, 3, *sizes)
                 along = CONTROL_CHANNELS * a.future
-                body = ConcatenationUNet(corrected, along, *sizes, outputs=corrected + gates)
+                body = denoisers.ConcatenationUNet(corrected, along, *sizes, outputs=corrected + gates)
             case _:
                 assert_never(a.control)
         if a.family == "one_stage":  # one network for path and body, without control
-            read = TrailingLinear(a.code_length, EMBEDDING)
-            corrected += PATH_CHANNELS
-            body = UncontrolledUNet(corrected, read, *sizes[1:], outputs=corrected + gates)
-            denoiser, leading = OneStageDenoiser, PATH_CHANNELS + ROOT_CHANNELS
+            read = denoisers.TrailingLinear(a.code_length, denoisers.EMBEDDING)
+            corrected += path_encoding.PATH_CHANNELS
+            body = denoisers.UncontrolledUNet(corrected, read, *sizes[1:], outputs=corrected + gates)
+            denoiser, leading = body_denoiser.OneStageDenoiser, path_encoding.PATH_CHANNELS + ROOT_CHANNELS
         else:
-            denoiser, leading = BodyDenoiser, ROOT_CHANNELS
-        prior = GaussianPrior(leading, bones, components, a.future, schedule)
+            denoiser, leading = body_denoiser.BodyDenoiser, ROOT_CHANNELS
+        prior = body_denoiser.GaussianPrior(leading, bones, components, a.future, schedule)
         self.body = denoiser(body, prior, a.body_channels, a.future, schedule, a.rate_hz)
 
 
@@ -292,7 +258,7 @@ def contract(
     """Return the content of `behavior.json`, for samplers in other languages."""
     bone = ["rotation_x", "rotation_y", "rotation_z", "shift_x", "shift_y", "shift_z"]
     root = ["right_x", "right_y", "right_z", "up_x", "up_y", "up_z"]
-    sampling = PlanSamplingConfig(schedule.method, schedule.sampled_steps, sequence_steps=SOLVER_STEPS)
+    sampling = config.PlanSamplingConfig(schedule.method, schedule.sampled_steps, sequence_steps=SOLVER_STEPS)
     return {
         "units": "metres, radians, seconds",
         "up": [0, 1, 0],
@@ -326,14 +292,14 @@ def contract(
             "order": "channel, x, y, z",
         },
         "path_encoding": {
-            "channels": PATH_CHANNELS,
-            "velocity_power": VELOCITY_POWER,
-            "goal_length_power": GOAL_LENGTH_POWER,
-            "rest_damping": REST_DAMPING,
-            "min_squared_m2": MIN_SQUARED_M2,
-            "rest_speed_m_s": REST_SPEED_M_S,
-            "goal_tolerance_m": GOAL_TOLERANCE_M,
-            "goal_tolerance_share": GOAL_TOLERANCE_SHARE,
+            "channels": path_encoding.PATH_CHANNELS,
+            "velocity_power": path_encoding.VELOCITY_POWER,
+            "goal_length_power": path_encoding.GOAL_LENGTH_POWER,
+            "rest_damping": path_encoding.REST_DAMPING,
+            "min_squared_m2": path_encoding.MIN_SQUARED_M2,
+            "rest_speed_m_s": path_encoding.REST_SPEED_M_S,
+            "goal_tolerance_m": path_encoding.GOAL_TOLERANCE_M,
+            "goal_tolerance_share": path_encoding.GOAL_TOLERANCE_SHARE,
         },
         "scaling": {name: np.asarray(value, float).tolist() for name, value in vars(scaling).items()},
         "schedule": {**asdict(schedule), "alpha_bar": schedule.alpha_bar.tolist()},

@@ -13,16 +13,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import nn
 
+from pipeline.behavior import model
 from pipeline.behavior.config import Ego, Guided, PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule, guided, sample
-from pipeline.behavior.model import (
-    ROOT_CHANNELS,
-    BehaviorNets,
-    Scaling,
-    channels_from_bones,
-    other_channels,
-    past_channels,
-)
 from pipeline.behavior.path_encoding import PATH_CHANNELS, goal_error, snapped_to_goal
 from pipeline.behavior.perception import FeatureVolume, world_from_ego
 from pipeline.behavior.scenes import SceneConstraint, Scenes
@@ -37,7 +30,7 @@ Denoise = Callable[[Array, float], Array]
 class TorchNetworks:
     """The four networks, on any device, on NumPy arrays of float32, batch first."""
 
-    def __init__(self, nets: BehaviorNets, device: str = "cpu"):
+    def __init__(self, nets: model.BehaviorNets, device: str = "cpu"):
         self.nets, self.device = nets.eval().to(device), device
 
     def _run(self, module: nn.Module, *arguments: Array) -> Array:
@@ -100,7 +93,7 @@ class SampledPlan:
         self, world_from_ego: Float[np.ndarray, "batch 4 4"]
     ) -> Float[np.ndarray, "batch frame 4 4"]:
         """Return the root's poses in the world."""
-        ego_from_agent = rigid.make(rigid.rotation_from_6d(self.body[..., :ROOT_CHANNELS]), self.path)
+        ego_from_agent = rigid.make(rigid.rotation_from_6d(self.body[..., : model.ROOT_CHANNELS]), self.path)
         return world_from_ego[:, None] @ ego_from_agent
 
 
@@ -114,9 +107,9 @@ def observe(
     if companions is not None:
         companions = nearest(companions, context.world_from_agent[:, -1, :3, 3])
         companions[..., :3] = rigid.apply(ego_from_world[:, None], companions[..., :3])
-    others = other_channels(ego_from_world[:, None] @ context.world_from_observer, companions)
-    bones = channels_from_bones(context.agent_from_bone, rest)
-    past = past_channels(ego_from_world[:, None] @ context.world_from_agent, bones)
+    others = model.other_channels(ego_from_world[:, None] @ context.world_from_observer, companions)
+    bones = model.channels_from_bones(context.agent_from_bone, rest)
+    past = model.past_channels(ego_from_world[:, None] @ context.world_from_agent, bones)
     scenes = scenes if isinstance(scenes, Scenes) else Scenes.of(scenes)
     constraint = SceneConstraint(scenes, frame, context.video)
     return Observation(scenes.around(frame, context.video), others, past, constraint)
@@ -163,7 +156,7 @@ class Sampler:
 
     networks: TorchNetworks
     schedule: Schedule
-    scaling: Scaling
+    scaling: model.Scaling
     guided: Guided = "observer"
     """conditions that guidance amplifies"""
 

@@ -17,15 +17,9 @@ from pipeline.geometry import align, cameras, rigid
 from pipeline.geometry.subsampling import evenly
 from pipeline.mapping import picture_agreement
 from pipeline.mapping.picture_agreement import Clock, PictureAgreement, PosedPicture
-from pipeline.recordings import conventions, errors
+from pipeline.recordings import conventions, errors, upright
 from pipeline.recordings.conventions import PoseCheck
 from pipeline.recordings.recording import Picture, Recording, grid_size, reproject
-from pipeline.recordings.upright import (
-    quarter_turns_from_gravity,
-    quarter_turns_from_room,
-    quarter_turns_from_surfaces,
-    up_from_room,
-)
 
 JPEG = b"\xff\xd8"
 MAX_DEPTH_SIDE_PX = 640
@@ -161,18 +155,18 @@ def _upright(
 
     turns = recording.quarter_turns
     if pose is None:
-        return None, turns or quarter_turns_from_surfaces(room()), False
+        return None, turns or upright.quarter_turns_from_surfaces(room()), False
     odometry_from_camera = conventions.odometry_from_pose(pose, check.convention)
     if recording.up is not None:
         turned = align.rotation_between(np.array(recording.up), np.array([0.0, 1.0, 0.0]))
         odometry_from_camera = rigid.make(turned, np.zeros(3)) @ odometry_from_camera
-        up = up_from_room(odometry_from_camera, room())
+        up = upright.up_from_room(odometry_from_camera, room())
         if up is not None and up[1] < np.cos(np.radians(MAX_TILT_DEG)):
-            turns = quarter_turns_from_gravity(odometry_from_camera, up_odometry=up)
+            turns = upright.quarter_turns_from_gravity(odometry_from_camera, up_odometry=up)
             return cameras.turn_camera(odometry_from_camera, turns), turns, False
-        turns = quarter_turns_from_gravity(odometry_from_camera)
+        turns = upright.quarter_turns_from_gravity(odometry_from_camera)
     elif not turns:
-        turns = quarter_turns_from_room(odometry_from_camera, room())
+        turns = upright.quarter_turns_from_room(odometry_from_camera, room())
     return cameras.turn_camera(odometry_from_camera, turns), turns, recording.up is not None
 
 

@@ -19,15 +19,8 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from pipeline.data import npz
-from stages.segment_agent.appearance import (
-    LOGIT_SCALE,
-    RATE,
-    WEIGHT_DECAY,
-    Appearance,
-    Example,
-    normalized,
-    to_batch,
-)
+from stages.segment_agent import appearance
+from stages.segment_agent.appearance import Appearance, Example, normalized, to_batch
 from stages.segment_agent.identities.config import Config
 
 FILE, PORTRAITS = "identities.safetensors", "portraits.npz"
@@ -101,7 +94,7 @@ class Identities(Appearance):
         self, color: Float[Tensor, "batch 3 height width"]
     ) -> Float[Tensor, "batch class height width"]:
         """Return the classes' logits of pictures whose colors are -1..1 and sides multiples of 16."""
-        return LOGIT_SCALE * self.out(self.trunk(color))
+        return appearance.LOGIT_SCALE * self.out(self.trunk(color))
 
     @torch.no_grad()
     def predict(self, color: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "class height width"]:
@@ -170,8 +163,8 @@ def learn_identities(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(rng.integers(2**31)))
         network = Identities(names)
-    optimizer = torch.optim.AdamW(network.parameters(), RATE, weight_decay=WEIGHT_DECAY)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=config.steps)
+    optimizer = torch.optim.AdamW(network.parameters(), appearance.RATE, weight_decay=appearance.WEIGHT_DECAY)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, appearance.RATE, total_steps=config.steps)
     own = [[each for each in portraits if each.animal == index] for index in range(len(names))]
     for step in range(config.steps):
         network.train()

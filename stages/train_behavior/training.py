@@ -13,15 +13,9 @@ from pipeline.behavior.model import ROOT_CHANNELS, Architecture, BehaviorNets, S
 from pipeline.behavior.perception import POSITION, VolumeScene
 from pipeline.core import distributed
 from pipeline.core.training import FitRecord, fit
+from stages.train_behavior import batches
 from stages.train_behavior.baseline_losses import gaussian_losses, one_stage_losses
-from stages.train_behavior.batches import (
-    TrainingWindows,
-    WindowStatistics,
-    draw_batch,
-    largest_turn_rad,
-    statistics_from_windows,
-    windows_from_data,
-)
+from stages.train_behavior.batches import TrainingWindows, WindowStatistics, draw_batch
 from stages.train_behavior.config import AugmentationConfig, BehaviorOptimizerConfig, BehaviorTrainingConfig
 from stages.train_behavior.homes import TrainingHomes
 from stages.train_behavior.objective import TrainingPhase, losses
@@ -69,8 +63,8 @@ def train(
     """
     losses_of = {"diffusion": losses, "gaussian": gaussian_losses, "one_stage": one_stage_losses}
     family_losses = losses_of[architecture.family]
-    windows = windows_from_data(homes, architecture)
-    statistics = statistics_from_windows(windows, largest_turn_rad(settings.augmentation))
+    windows = batches.windows_from_data(homes, architecture)
+    statistics = batches.statistics_from_windows(windows, batches.largest_turn_rad(settings.augmentation))
     nets = initial_nets(architecture, schedule, statistics, seed).to(device)
     scene = SceneSampler(homes.scenes, architecture.scene_stride, device)
     optimization, augmentation = settings.optimization, settings.augmentation

@@ -14,16 +14,10 @@ from pipeline.baselines import longterm_networks
 from pipeline.baselines.longterm_networks import AblatedNetworks
 from pipeline.core.errors import InputError
 from pipeline.core.training import FitRecord
+from pipeline.longterm import examples
 from pipeline.longterm.clip_channels import Clips
 from pipeline.longterm.config import LongTermSizes
 from pipeline.longterm.contacts import find_contact_vertices
-from pipeline.longterm.examples import (
-    MotionDataset,
-    encode_selection,
-    fit_pose_space,
-    sample_static_bodies,
-    select_clips,
-)
 from pipeline.longterm.motion_synthesis import LongTerm, measure_motion_prior
 from pipeline.longterm.networks import PointNet, PoseNet, RouteNet, StaticBody
 from stages.train_longterm import training
@@ -45,7 +39,7 @@ class TrainedLongTerm:
 
 
 def train_networks(
-    dataset: MotionDataset,
+    dataset: examples.MotionDataset,
     config: Config,
     *,
     sizes: LongTermSizes = DEFAULT_SIZES,
@@ -54,11 +48,11 @@ def train_networks(
     """Train StaticBody, RouteNet, PoseNet and the ablations that ``config`` names."""
     rng = np.random.default_rng(config.seed)
     sizes = replace(sizes, shape=len(dataset.body.shape))
-    poses = fit_pose_space(dataset.stretches, dataset.body.agent_from_bone_rest, sizes.pose)
+    poses = examples.fit_pose_space(dataset.stretches, dataset.body.agent_from_bone_rest, sizes.pose)
     contacts = find_contact_vertices(dataset.body, list(dataset.stretches), dataset.distances)
-    chosen = select_clips(dataset, rng, stride=config.clip_stride)
-    clips = encode_selection(dataset, chosen, poses, sizes.points, rng)
-    stills = sample_static_bodies(dataset, poses, sizes.points, rng, most=config.max_bodies)
+    chosen = examples.select_clips(dataset, rng, stride=config.clip_stride)
+    clips = examples.encode_selection(dataset, chosen, poses, sizes.points, rng)
+    stills = examples.sample_static_bodies(dataset, poses, sizes.points, rng, most=config.max_bodies)
     trainer = NetworkTrainer(poses, LongTermLossWeights(), config.seed, resume)
     static = initialized(lambda: StaticBody(sizes), config)
     route = initialized(lambda: RouteNet(sizes, with_scene=config.scene), config)

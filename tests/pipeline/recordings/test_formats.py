@@ -676,7 +676,7 @@ def test_polycam_mesh_is_in_the_frame_of_its_cameras(tmp_path):
 def test_up_direction_that_contradicts_the_floor_is_ignored(tmp_path, monkeypatch, up_deg, known):
     """An app may export z up in a format with y up."""
     up = np.array([0, np.cos(np.radians(up_deg)), np.sin(np.radians(up_deg))])
-    monkeypatch.setattr(extraction, "up_from_room", lambda *_: up)
+    monkeypatch.setattr(extraction.upright, "up_from_room", lambda *_: up)
     recording, plan = _understand(walk(60).write(tmp_path / "a.r3d"))
     assert plan.gravity_known == known
     assert ("gravity is not used" in extraction.summary(recording, plan)) == (not known)
