@@ -4,14 +4,13 @@ companions and avoids them. Any of them may be a replayed recording instead.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.behavior.avoidance import clearance_of
-from pipeline.behavior.simulator import SimulatorState
+from pipeline.behavior.simulator import Simulator, SimulatorState
 from pipeline.behavior.trajectories import RATE_HZ, TRAIN, BehaviorData, Trajectory, as_companions
 from pipeline.data import images
 from pipeline.geometry import views
@@ -29,45 +28,19 @@ PALE = 0.45
 """Share of the room's colors that is left under what is drawn over it."""
 
 
-class HomeAnimal(Protocol):
-    """What `Simulator` and `ReplayedAnimal` have in common."""
-
-    data: BehaviorData
-
-    def begin(
-        self,
-        window: Int[np.ndarray, "1"],
-        rng: np.random.Generator,
-        observer: Float[np.ndarray, "3"] | None = None,
-        companions: Companions = None,
-    ) -> SimulatorState:
-        """Begin at a window of ``data``."""
-        ...
-
-    def step(self, observer: Float[np.ndarray, "3"], companions: Companions = None) -> SimulatorState:
-        """Let 0.1 s pass."""
-        ...
-
-    @property
-    def past_world(self) -> Float[np.ndarray, "past_frame 3"]:
-        """Return where it has been, now last; meters."""
-        ...
-
-
 class ReplayedAnimal:
-    """A recorded animal: plays from its window to the end of the unbroken stretch, then loops it."""
+    """A recorded animal: plays from its window to the end of the unbroken stretch, then loops it.
+
+    Stands in for a `Simulator`.
+    """
 
     def __init__(self, data: BehaviorData):
         self.data = data
 
     def begin(
-        self,
-        window: Int[np.ndarray, "1"],
-        rng: np.random.Generator,
-        observer: Float[np.ndarray, "3"] | None = None,
-        companions: Companions = None,
+        self, window: Int[np.ndarray, "1"], rng: np.random.Generator, *, companions: Companions = None
     ) -> SimulatorState:
-        """Begin at a window; observer and companions have no effect."""
+        """Begin at a window; companions have no effect."""
         self.track, start = recorded_at(self.data, window)
         broken = np.flatnonzero(~self.track.valid)
         first = int(broken[broken < start].max(initial=-1)) + 1
@@ -96,7 +69,7 @@ class ReplayedAnimal:
 class SharedHome:
     """Simulator of all animals of a home, by name; the action is the person's position in the world."""
 
-    def __init__(self, animals: Mapping[str, HomeAnimal]):
+    def __init__(self, animals: Mapping[str, Simulator | ReplayedAnimal]):
         self.animals = animals
 
     def reset(self, seed: int) -> dict[str, SimulatorState]:

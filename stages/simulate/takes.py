@@ -34,7 +34,7 @@ from stages.simulate.inputs import Inputs
 from stages.simulate.live import LiveAppearance, LiveView
 from stages.simulate.observers import UNKNOWN_OBSERVER_M, Observer, scripted
 from stages.simulate.rollout import rollout, write_take
-from stages.simulate.shared_home import HomeAnimal, ReplayedAnimal, SharedHome, rollout_of_all, write_takes
+from stages.simulate.shared_home import ReplayedAnimal, SharedHome, rollout_of_all, write_takes
 
 MOVED_M = 0.25
 """A sub-goal reached at a distance of more than this counts as moved."""
@@ -117,7 +117,7 @@ def of_home(inputs: Inputs, animals: Path, c: Config, device: str) -> FinishedTa
     if unknown or not names:
         what = f"there is no animal {unknown[0]!r}" if unknown else "nobody is left"
         raise InputError("SIM-013", what, str(animals), f"known: {', '.join(known)}")
-    living: dict[str, HomeAnimal] = {}
+    living: dict[str, Simulator | ReplayedAnimal] = {}
     for name in names:
         needed = ("reconstruction", "behavior_data", *(() if name in c.replayed else ("behavior",)))
         for artifact in needed:
