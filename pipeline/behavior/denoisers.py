@@ -78,14 +78,10 @@ class Embedding(nn.Module):
 class TemporalBlock(nn.Module):
     """Residual block: two temporal convolutions with group norm, the embedding added between them."""
 
-    def __init__(self, inner: int, outer: int, embedding: int, kernel: int = 5):
+    def __init__(self, inner: int, outer: int, embedding: int):
         super().__init__()
-        self.first = nn.Sequential(
-            nn.Conv1d(inner, outer, kernel, padding=kernel // 2), nn.GroupNorm(8, outer), nn.SiLU()
-        )
-        self.second = nn.Sequential(
-            nn.Conv1d(outer, outer, kernel, padding=kernel // 2), nn.GroupNorm(8, outer), nn.SiLU()
-        )
+        self.first = nn.Sequential(nn.Conv1d(inner, outer, 5, 1, 2), nn.GroupNorm(8, outer), nn.SiLU())
+        self.second = nn.Sequential(nn.Conv1d(outer, outer, 5, 1, 2), nn.GroupNorm(8, outer), nn.SiLU())
         self.embedding = nn.Linear(embedding, outer)
         self.shortcut = nn.Conv1d(inner, outer, 1) if inner != outer else nn.Identity()
 

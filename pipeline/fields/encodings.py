@@ -60,16 +60,14 @@ class PositionalMLP(nn.Module):
     middle: Float[Tensor, "3"]
     frequency: Float[Tensor, "octave"]
 
-    def __init__(
-        self, low_m: Sequence[float], high_m: Sequence[float], finest_m: float, width: int, layers: int = 3
-    ):
+    def __init__(self, low_m: Sequence[float], high_m: Sequence[float], finest_m: float, width: int):
         super().__init__()
         low, high = torch.tensor(low_m, dtype=torch.float32), torch.tensor(high_m, dtype=torch.float32)
         self.register_buffer("middle", (low + high) / 2, persistent=False)
         longest = float((high - low).max())
         octaves = max(1, math.ceil(math.log2(longest / finest_m)))
         self.register_buffer("frequency", math.pi / longest * 2 ** torch.arange(octaves), persistent=False)
-        sizes = [3 + 6 * octaves] + [width] * layers
+        sizes = [3 + 6 * octaves] + [width] * 3
         self.network = nn.Sequential(
             *(part for pair in pairwise(sizes) for part in (nn.Linear(*pair), nn.ReLU()))
         )

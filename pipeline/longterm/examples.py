@@ -153,22 +153,16 @@ def encode_selection(
 
 
 def sample_static_bodies(
-    dataset: MotionDataset,
-    poses: PoseSpace,
-    points: int,
-    rng: np.random.Generator,
-    *,
-    most: int,
-    level: float = LEVEL_SHARE,
+    dataset: MotionDataset, poses: PoseSpace, points: int, rng: np.random.Generator, *, most: int
 ) -> StaticBodies:
-    """Sample static bodies from the motion; a share ``level`` of their places is as imprecise as a user's."""
+    """Sample static bodies from the motion; `LEVEL_SHARE` of their places are as imprecise as a user's."""
     stride = max(1, int(np.ceil(sum(map(len, dataset.stretches)) / most)))
     frames = [stretch[::stride] for stretch in dataset.stretches]
     root = np.concatenate([part.world_from_agent for part in frames])
     bones = np.concatenate([part.agent_from_bone for part in frames])
     scene = np.repeat(dataset.scene_of, [len(part) for part in frames])
     given = root.copy()
-    loose = rng.random(len(root)) < level
+    loose = rng.random(len(root)) < LEVEL_SHARE
     given[loose] = world_from_ego(root[loose], "yaw")
     given[loose, 1, 3] += rng.normal(0, LEVEL_HEIGHT_M, loose.sum())
     places = encode_places(given, scene, dataset.scenes, points, rng)

@@ -29,9 +29,7 @@ NAMES = (
 )
 
 
-def physical_metrics(
-    data: BehaviorData, ours: Predictor, reconstruction: Path, *, seed: int, windows: int = WINDOWS
-) -> Metrics:
+def physical_metrics(data: BehaviorData, ours: Predictor, reconstruction: Path, *, seed: int) -> Metrics:
     """Score recorded motion and one plan of ours on some evenly spread test windows."""
     metrics, test = Metrics(), data.indices(TEST)
     sessions = sorted({data.videos[video] for video in data.video[data.split == TRAIN]})
@@ -43,7 +41,7 @@ def physical_metrics(
     scene = MotionScene.reconstructed(reconstruction, data.trajectories.values()).distance
     contacts = find_contact_vertices(body, learned, [scene] * len(learned))
     meter = PlausibilityMeter(body, contacts, scene)
-    chosen = test[subsampling.evenly(len(test), windows)]
+    chosen = test[subsampling.evenly(len(test), WINDOWS)]
     metrics.put("behavior/physical_windows", len(chosen))
     context, future = data.windows(chosen)
     made = ours.sample(context, 1, np.random.default_rng(seed))

@@ -20,8 +20,8 @@ from pipeline.longterm.plausibility import Plausibility
 from pipeline.longterm.short_motions import RATE_HZ, BodyMotion
 from pipeline.metrics.intervals import finite
 
-FOCAL = 0.9
-"""Focal length of the frames in units of their width."""
+FRAME_SIZE, FOCAL = (360, 480), 0.9
+"""Height and width of the frames, pixels, and their focal length in units of the width."""
 SMOOTHED_FRAMES, TURNED_FRAMES = 12.0, 20.0
 """Standard deviations of the Gaussians that smooth the camera's target and its direction, frames."""
 ASIDE_M, ABOVE_M, OFF_CENTER_M = 1.3, [0.0, 1.4, 0.05], 0.3
@@ -67,18 +67,10 @@ def write_metrics(folder: Path, before: Plausibility, after: Plausibility, **abo
     (folder / "take.json").write_text(json.dumps({**about, **metrics}, indent=1, allow_nan=False) + "\n")
 
 
-def write_frames(
-    folder: Path,
-    motion: BodyMotion,
-    body: SkinnedBody,
-    scene: Mesh,
-    *,
-    rate_hz: float,
-    width: int = 480,
-    height: int = 360,
-) -> None:
+def write_frames(folder: Path, motion: BodyMotion, body: SkinnedBody, scene: Mesh, *, rate_hz: float) -> None:
     """Write `frames/%06d.jpg`: renderings of animal and scene by a camera that follows from above."""
     (folder / "frames").mkdir()
+    height, width = FRAME_SIZE
     caster, surface = RayCaster(scene), PosedSurface(body)
     intrinsics = np.array([[FOCAL * width, 0, width / 2], [0, FOCAL * width, height / 2], [0, 0, 1.0]])
     cameras = follow_camera(motion.world_from_agent[:, :3, 3], np.median(scene.vertices, axis=0))

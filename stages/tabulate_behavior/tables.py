@@ -19,16 +19,14 @@ CONTRASTS = (
 """Figures, each the paired difference of two scores per approach or window."""
 
 
-def figures(
-    found: Mapping[str, MethodScores], ours: str, *, seed: int, draws: int = BOOTSTRAP_DRAWS
-) -> dict[str, float | None]:
+def figures(found: Mapping[str, MethodScores], ours: str, *, seed: int) -> dict[str, float | None]:
     """Return all figures with intervals, and paired differences to ours where the windows are the same."""
     table: dict[str, float | None] = {}
     for method, scores in found.items():
         for name, values in scores.values.items():
             window, frames = scores.windows_of(name), scores.past + scores.future
             figure = name.removeprefix(f"{UNPREFIXED}/").replace("/", "_")
-            interval_of = partial(interval, window=window, frames=frames, draws=draws, seed=seed)
+            interval_of = partial(interval, window=window, frames=frames, seed=seed)
             table |= interval_of(values).as_figures(f"behavior/{method}/{figure}")
             baseline = found[ours].values.get(name)
             if (
@@ -40,19 +38,17 @@ def figures(
                 paired = slice(both if both > 1 else None)  # one seed alone is paired with all others
                 difference = interval_of(baseline[paired] - values[paired])
                 table |= difference.as_figures(f"behavior/{ours}_minus_{method}/{figure}")
-        _add_contrasts(table, method, scores, draws, seed)
+        _add_contrasts(table, method, scores, seed)
         table[f"behavior/{method}/seeds"] = len(next(iter(scores.values.values())))
     return table
 
 
-def _add_contrasts(
-    table: dict[str, float | None], method: str, scores: MethodScores, draws: int, seed: int
-) -> None:
+def _add_contrasts(table: dict[str, float | None], method: str, scores: MethodScores, seed: int) -> None:
     """Add the contrasts within one method: `CONTRASTS`, and paths given the true goal against end to end."""
     for name, first, second in CONTRASTS:
         if first in scores.values and second in scores.values:
             difference, frames = scores.values[first] - scores.values[second], scores.past + scores.future
-            found = interval(difference, scores.windows_of(first), frames, draws, seed)
+            found = interval(difference, scores.windows_of(first), frames, seed)
             table |= found.as_figures(f"behavior/{method}/{name}")
     given_goal, end_to_end = (
         scores.values.get(f"{protocol}/path_minade_m") for protocol in ("truth_fed", UNPREFIXED)
@@ -62,11 +58,7 @@ def _add_contrasts(
 
 
 def interval(
-    values: Float[np.ndarray, "seed window"],
-    window: Int[np.ndarray, "window 2"],
-    frames: int,
-    draws: int,
-    seed: int,
+    values: Float[np.ndarray, "seed window"], window: Int[np.ndarray, "window 2"], frames: int, seed: int
 ) -> Interval:
     """Return the mean and its 95 % bootstrap interval over seeds and episodes of ``frames`` frames.
 
@@ -79,8 +71,8 @@ def interval(
         return Interval(float(values.mean()), np.nan, np.nan)
     total = np.stack([np.bincount(episode, row, count) for row in values])
     size = np.bincount(episode, minlength=count)
-    means = np.empty(draws)
-    for draw in range(draws):
+    means = np.empty(BOOTSTRAP_DRAWS)
+    for draw in range(BOOTSTRAP_DRAWS):
         chosen, drawn = rng.integers(0, count, count), rng.integers(0, len(values), len(values))
         means[draw] = total[drawn][:, chosen].sum() / (size[chosen].sum() * len(values))
     return Interval(float(values.mean()), *(float(bound) for bound in np.percentile(means, (2.5, 97.5))))

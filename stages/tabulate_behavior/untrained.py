@@ -15,19 +15,17 @@ WINDOWS_AT_ONCE = 64
 """Bounds the memory of sampled bones."""
 
 
-def scores(
-    data: BehaviorData, like: MethodScores, *, trials: int, seed: int, samples: int = SAMPLES
-) -> dict[str, MethodScores]:
+def scores(data: BehaviorData, like: MethodScores, *, trials: int, seed: int) -> dict[str, MethodScores]:
     """Fit each baseline to the training windows and score it on the windows of ``like``."""
     context, future = data.windows(data.indices(TRAIN)[::FIT_STRIDE])
     return {
-        name: _scores(baseline.fit(context, future), data, like, samples, trials, seed)
+        name: _scores(baseline.fit(context, future), data, like, trials, seed)
         for name, baseline in BASELINES.items()
     }
 
 
 def _scores(
-    method: Predictor, data: BehaviorData, like: MethodScores, samples: int, trials: int, seed: int
+    method: Predictor, data: BehaviorData, like: MethodScores, trials: int, seed: int
 ) -> MethodScores:
     rng, found = np.random.default_rng(seed), {}
     for windows, names in ((like.goal_window, GOAL_SCORES), (like.plan_window, PLAN_SCORES)):
@@ -35,7 +33,7 @@ def _scores(
         for some in np.array_split(_numbers(data, windows), max(len(windows) // WINDOWS_AT_ONCE, 1)):
             context, future = data.windows(some)
             count = trials if names == GOAL_SCORES else 1
-            drawn = [method.sample(context, samples, rng) for _ in range(count)]
+            drawn = [method.sample(context, SAMPLES, rng) for _ in range(count)]
             known = names if names == GOAL_SCORES or drawn[0].path is not None else ()
             parts.append(
                 {name: np.mean([SCORES[name](each, future) for each in drawn], axis=0) for name in known}

@@ -148,14 +148,15 @@ def test_motion_prior_is_that_of_the_data(dataset, model):
     assert min(ends) - 0.05 < model.motion_prior.pace_m < max(ends) + 0.05
 
 
-def test_moving_clips_are_kept_and_waypoints_are_level(dataset, model):
+def test_moving_clips_are_kept_and_waypoints_are_level(dataset, model, monkeypatch):
     rng = np.random.default_rng(0)
     cuts = select_clips(dataset, rng, stride=10, resting=0.0)
     ways = [
         np.linalg.norm((p.world_from_agent[-1] - p.world_from_agent[0])[:3, 3]) for p in cuts.parts(dataset)
     ]
     assert min(ways) > 0.5
-    stills = sample_static_bodies(dataset, model.poses, SIZES.points, rng, most=50, level=1.0)
+    monkeypatch.setattr("pipeline.longterm.examples.LEVEL_SHARE", 1.0)
+    stills = sample_static_bodies(dataset, model.poses, SIZES.points, rng, most=50)
     assert len(stills.scene) <= 60
     torch.testing.assert_close(
         stills.places.place[:, 1:],

@@ -39,7 +39,7 @@ def test_body_below_the_floor_penetrates(tmp_path: Path) -> None:
         tuple(tracks),
     )
     sunk = Sunk(data.windows(data.indices(TEST))[1], 0.1)
-    values = physical.physical_metrics(data, sunk, tmp_path, windows=2, seed=0).values
+    values = physical.physical_metrics(data, sunk, tmp_path, seed=0).values
     assert set(values) == set(physical.NAMES) and values["behavior/physical_windows"] == 2
     assert (
         values["behavior/recorded/penetration_m"] < 0.003 < 0.01 < values["behavior/ats/penetration_m"] < 0.1
@@ -53,4 +53,4 @@ def test_body_below_the_floor_penetrates(tmp_path: Path) -> None:
     nobody = BehaviorData(
         tracks, small_world.rest(), videos, starts, np.full(4, TRAIN, np.uint8), tuple(tracks)
     )
-    assert set(physical.physical_metrics(nobody, sunk, tmp_path, windows=2, seed=0).values.values()) == {None}
+    assert set(physical.physical_metrics(nobody, sunk, tmp_path, seed=0).values.values()) == {None}

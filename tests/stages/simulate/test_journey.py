@@ -85,7 +85,7 @@ def test_sub_goals_that_are_no_numbers_are_refused(tmp_path, line):
         read(tmp_path / "goals.toml", f"[[subgoal]]\n{line}\n")
 
 
-def test_journey_is_generated_and_written(world, tmp_path):
+def test_journey_is_generated_and_written(world, tmp_path, monkeypatch):
     goals = [Subgoal(np.array([-1.2, np.nan, -1.0])), Subgoal(np.array([1.2, np.nan, -1.0]))]
     made = journeys.travel(world, goals, SETTINGS, np.random.default_rng(0))
     again = journeys.travel(world, goals, SETTINGS, np.random.default_rng(0))
@@ -94,9 +94,8 @@ def test_journey_is_generated_and_written(world, tmp_path):
     np.testing.assert_allclose(made.subgoals_world[:, [0, 2]], [[-1.2, -1], [1.2, -1]], atol=1e-6)
     assert made.arrival_s[-1] == pytest.approx(made.timestamp_s[-1])
     journey_files.write_journey(tmp_path, made, world.body)
-    journey_files.write_frames(
-        tmp_path, made.motion[:30], world.body, strider.room(), rate_hz=10.0, width=64, height=48
-    )
+    monkeypatch.setattr(journey_files, "FRAME_SIZE", (48, 64))
+    journey_files.write_frames(tmp_path, made.motion[:30], world.body, strider.room(), rate_hz=10.0)
     take = npz.load(tmp_path / "take.npz")
     assert take["agent_from_bone"].shape == (len(made.motion), 5, 4, 4)
     about = json.loads((tmp_path / "take.json").read_text())

@@ -19,8 +19,8 @@ def scores(values):
 def test_intervals_include_the_variance_between_seeds():
     rng = np.random.default_rng(0)
     windows = rng.normal(1, 0.01, (3, 640))
-    alike = tables.interval(windows, WINDOWS, 64, 300, 0)
-    apart = tables.interval(windows + np.array([[-0.3], [0], [0.3]]), WINDOWS, 64, 300, 0)
+    alike = tables.interval(windows, WINDOWS, 64, 0)
+    apart = tables.interval(windows + np.array([[-0.3], [0], [0.3]]), WINDOWS, 64, 0)
     assert alike.mean == pytest.approx(apart.mean)
     assert apart.high - apart.low > 10 * (alike.high - alike.low)
 
@@ -28,7 +28,7 @@ def test_intervals_include_the_variance_between_seeds():
 def test_differences_are_paired_per_window():
     rng = np.random.default_rng(1)
     hard = np.repeat(rng.gamma(1, 1, 10), 64)[None] * np.ones((2, 1))
-    found = tables.figures({"ats": scores(hard), "baseline": scores(hard + 0.1)}, "ats", draws=300, seed=0)
+    found = tables.figures({"ats": scores(hard), "baseline": scores(hard + 0.1)}, "ats", seed=0)
     assert found["behavior/ats_minus_baseline/goal_minde_m_ci95_high"] == pytest.approx(-0.1, abs=1e-9)
     assert found["behavior/ats/goal_minde_m_ci95_high"] > found["behavior/baseline/goal_minde_m_ci95_low"]
     assert found["behavior/ats/flees_seen"] == 1
@@ -42,7 +42,7 @@ def test_flight_rate_is_compared_with_that_of_the_animal():
         "flees/true": np.ones((2, 40)),
         "flees/unseen": np.tile([0.0, 1.0], (2, 20)),
     }
-    found = tables.figures({"ats": MethodScores(WINDOWS, WINDOWS, values)}, "ats", draws=300, seed=0)
+    found = tables.figures({"ats": MethodScores(WINDOWS, WINDOWS, values)}, "ats", seed=0)
     assert found["behavior/ats/flees_seen_minus_true_ci95_high"] == -0.25
     assert found["behavior/ats/flees_seen_minus_unseen"] == 0.25
     assert found["behavior/ats/flees_seen_minus_unseen_ci95_low"] < 0.2
@@ -55,7 +55,7 @@ def test_plateau_detection():
     assert found["behavior/b/goal_loss_still_falls"] > 0.1
 
 
-def test_untrained_baselines_use_the_same_windows():
+def test_untrained_baselines_use_the_same_windows(monkeypatch):
     data = wandering()
     test = np.flatnonzero(data.split == 1)[::5]
     like = MethodScores(
@@ -63,11 +63,12 @@ def test_untrained_baselines_use_the_same_windows():
         np.stack([data.video[test[::2]], data.start[test[::2]]], 1),
         {},
     )
-    found = untrained.scores(data, like, samples=16, trials=2, seed=0)
+    found = untrained.scores(data, like, trials=2, seed=0)
     assert found["stand_still"].values["end_to_end/path_minade_m"].shape == (1, len(test[::2]))
     assert found["location_prior"].values["end_to_end/goal_minde_m"].shape == (1, len(test))
     assert "end_to_end/path_minade_m" not in found["location_prior"].values
-    again = untrained.scores(data, like, samples=64, trials=2, seed=0)
+    monkeypatch.setattr(untrained, "SAMPLES", 64)
+    again = untrained.scores(data, like, trials=2, seed=0)
     better = [
         again[name].values["end_to_end/goal_minde_m"].mean()
         < found[name].values["end_to_end/goal_minde_m"].mean()
