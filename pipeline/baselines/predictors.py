@@ -75,8 +75,10 @@ class StandStill:
 
     @classmethod
     def fit(cls, context: Context, future: Future) -> Self:
-        """Fit the noise to the residuals of training windows."""
-        return cls(_rms(future.path_world - cls.mean(context, future.path_world.shape[1])))
+        """Fit the noise to the residuals of training windows, horizontal axes pooled."""
+        residual = future.path_world - cls.mean(context, future.path_world.shape[1])
+        level = np.sqrt((residual[..., ::2] ** 2).mean((0, 2)))
+        return cls(np.stack([level, np.sqrt((residual[..., 1] ** 2).mean(0)), level], axis=-1))
 
     @classmethod
     def mean(cls, context: Context, frames: int) -> Float[np.ndarray, "window frame 3"]:
@@ -103,12 +105,6 @@ class ConstantVelocity(StandStill):
         position = context.world_from_agent[..., :3, 3]
         step = (position[:, -1] - position[:, 0]) / (position.shape[1] - 1)
         return super().mean(context, frames) + step[:, None] * np.arange(1, frames + 1)[:, None]
-
-
-def _rms(residual: Float[np.ndarray, "window frame 3"]) -> Float[np.ndarray, "frame 3"]:
-    """Return the root mean square per frame and axis, horizontal axes pooled."""
-    level = np.sqrt((residual[..., ::2] ** 2).mean((0, 2)))
-    return np.stack([level, np.sqrt((residual[..., 1] ** 2).mean(0)), level], axis=-1)
 
 
 BASELINES = {

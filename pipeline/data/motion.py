@@ -134,15 +134,11 @@ class MotionTable(nn.Module):
         self.root = nn.Parameter(torch.zeros(len(world_from_camera), 6))
         self.bone = nn.Parameter(torch.zeros(len(world_from_camera), len(agent_from_bone_rest), 6))
 
-    def camera_correction(self, frame: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch 6"]:
-        """Return the corrections of cameras as twists (rotation vector, translation)."""
+    def world_from_camera(self, frame: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch 4 4"]:
+        """Return camera poses, corrected by twists that are interpolated between knots."""
         share = self.knot_share[frame][..., None]
         mixed = (1 - share) * self.camera[self.knot[frame]] + share * self.camera[self.knot[frame] + 1]
-        return mixed * self.camera_free[frame][..., None]
-
-    def world_from_camera(self, frame: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch 4 4"]:
-        """Return camera poses."""
-        return self.initial_camera[frame] @ rigid_torch.se3_exp(self.camera_correction(frame))
+        return self.initial_camera[frame] @ rigid_torch.se3_exp(mixed * self.camera_free[frame][..., None])
 
     def world_from_agent(self, frame: Int[Tensor, "*batch"]) -> Float[Tensor, "*batch 4 4"]:
         """Return the agent's root poses."""

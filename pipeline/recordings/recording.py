@@ -33,11 +33,6 @@ class DepthCamera:
     depth_from_color: Float[np.ndarray, "4 4"]
     """rigid, meters"""
 
-    @property
-    def baseline_m(self) -> float:
-        """Distance between the two cameras, meters."""
-        return float(np.linalg.norm(self.depth_from_color[:3, 3]))
-
 
 @dataclass(frozen=True)
 class Recording:

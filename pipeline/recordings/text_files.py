@@ -104,6 +104,7 @@ def depth_camera(
 
 def depth_camera_remark(camera: DepthCamera, color_intrinsics: Float[np.ndarray, "3 3"]) -> str:
     """Describe the two cameras, for capture-check and the log."""
-    depth_fx, color_fx, apart_mm = camera.intrinsics[0, 0], color_intrinsics[0, 0], 1000 * camera.baseline_m
+    depth_fx, color_fx = camera.intrinsics[0, 0], color_intrinsics[0, 0]
+    apart_mm = 1000 * np.linalg.norm(camera.depth_from_color[:3, 3])
     apart = f"{apart_mm:.0f} mm from the color camera (fx {color_fx:g})"
     return f"depth camera fx {depth_fx:g}, {apart}: depth is reprojected"

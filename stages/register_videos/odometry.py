@@ -79,14 +79,6 @@ def consistent_votes(
     return inliers
 
 
-def anchored_frames(
-    votes: FrameVotes, inliers: Bool[np.ndarray, "vote"], motion: Odometry
-) -> Bool[np.ndarray, "frame"]:
-    """Return which frames are in a segment with an inlier vote; the others are interpolated."""
-    segment = np.cumsum(motion.jumps)
-    return np.isin(segment, segment[votes.frame[inliers]])
-
-
 def propagate_votes(
     votes: FrameVotes,
     inliers: Bool[np.ndarray, "vote"],

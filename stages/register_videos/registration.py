@@ -215,7 +215,8 @@ def _initialize(clip, votes, motion, config) -> _InitialPoses | None:
     if not inliers.any():
         return None
     poses = odometry.propagate_votes(votes, inliers, clip.timestamp_s, motion)
-    return _InitialPoses(poses, inliers, odometry.anchored_frames(votes, inliers, motion))
+    segment = np.cumsum(motion.jumps)
+    return _InitialPoses(poses, inliers, np.isin(segment, segment[votes.frame[inliers]]))
 
 
 def rejection_reason(

@@ -93,7 +93,11 @@ def find_agreement(
     if gravity_known:
         tilt = np.arccos(np.clip(proposals[:, 1, 1], -1, 1))
         weight[tilt > np.deg2rad(config.max_tilt_deg)] = 0
-        proposals = align_yaw(proposals, odometry[:, :3, 3], voted[:, :3, 3])
+        # rotations restricted to yaw still map each camera to its voted place
+        yaw = np.arctan2(proposals[:, 0, 2] - proposals[:, 2, 0], proposals[:, 0, 0] + proposals[:, 2, 2])
+        rotation = rigid.rotation_from_yaw(yaw)
+        moved = np.einsum("vij,vj->vi", rotation, odometry[:, :3, 3])
+        proposals = rigid.make(rotation, voted[:, :3, 3] - moved)
     sampled = subsampling.evenly(len(proposals), MAX_PROPOSALS)
     inlier_sets = np.stack([are_close(proposals[i] @ odometry, voted, config) for i in sampled])
     inlier_sets &= weight > 0
@@ -107,17 +111,6 @@ def find_agreement(
         transform = rigid.make(rotation, np.average(offset, axis=0, weights=weight[inliers]))
         inliers = are_close(transform @ odometry, voted, config) & (weight > 0)
     return Agreement(transform, inliers) if inliers.any() else None
-
-
-def align_yaw(
-    proposals: Float[np.ndarray, "vote 4 4"],
-    from_points: Float[np.ndarray, "vote 3"],
-    to_points: Float[np.ndarray, "vote 3"],
-) -> Float[np.ndarray, "vote 4 4"]:
-    """Restrict each transform's rotation to yaw, such that it still maps its point to the same place."""
-    yaw = np.arctan2(proposals[:, 0, 2] - proposals[:, 2, 0], proposals[:, 0, 0] + proposals[:, 2, 2])
-    rotation = rigid.rotation_from_yaw(yaw)
-    return rigid.make(rotation, to_points - np.einsum("vij,vj->vi", rotation, from_points))
 
 
 def are_close(

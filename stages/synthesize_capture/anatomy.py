@@ -102,11 +102,6 @@ class Anatomy:
         """Heads of the bones at rest."""
         return np.array([bone.head for bone in self.bones], float)
 
-    @cached_property
-    def tails(self) -> Float[np.ndarray, "bone 3"]:
-        """Tails of the bones at rest."""
-        return np.array([bone.tail for bone in self.bones], float)
-
     def balls(self) -> tuple[tuple[str, Point, float], ...]:
         """Return the balls that cast the soft shadow on the ground."""
         found = tuple(

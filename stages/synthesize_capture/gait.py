@@ -77,7 +77,8 @@ class Rig:
         return rigid.rotation_from_vector(0.25 * turn)
 
     def _axis(self, name: str) -> Float[np.ndarray, "3"]:
-        return self.anatomy.tails[INDEX[name]] - self.anatomy.heads[INDEX[name]]
+        bone = self.anatomy.bones[INDEX[name]]
+        return np.array(bone.tail, float) - np.array(bone.head, float)
 
 
 def poses(

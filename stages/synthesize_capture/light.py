@@ -110,7 +110,8 @@ def _irradiance(
 ) -> Float[np.ndarray, "point 3"]:
     total = np.zeros((len(points), 3))
     openness = np.zeros(len(points))
-    spread = _hemisphere(rng, 12)
+    sine = np.sqrt((np.arange(12) + rng.random(12)) / 12)  # of stratified, cosine-weighted polar angles
+    spread = np.stack([sine, np.sqrt(1 - sine**2)], axis=-1)
     for direction in spread:
         turn = rng.uniform(0, 2 * np.pi, len(points))
         rays = _around(normals, direction, turn)
@@ -146,12 +147,6 @@ def _from_source(
     blocked = caster.cast(points[clear], ray[clear]).distance < distance[clear] - 0.05
     factor[clear] *= ~blocked
     return factor
-
-
-def _hemisphere(rng: np.random.Generator, count: int) -> Float[np.ndarray, "ray 2"]:
-    """Return stratified (sine, cosine) of cosine-weighted polar angles."""
-    sine = np.sqrt((np.arange(count) + rng.random(count)) / count)
-    return np.stack([sine, np.sqrt(1 - sine**2)], axis=-1)
 
 
 def _around(normals: np.ndarray, sine_cosine: np.ndarray, turn: np.ndarray) -> np.ndarray:

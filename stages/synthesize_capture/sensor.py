@@ -101,7 +101,9 @@ def picture(
     image = _smeared(linear, blur_px)
     height, width, _ = image.shape
     gains = (exposure.gain * gain * exposure.white_balance).astype(np.float32)
-    image = image * gains * _vignette(height, width)
+    y, x = np.linspace(-1, 1, height)[:, None], np.linspace(-width / height, width / height, width)[None]
+    vignette = (1 - 0.14 * (x * x + y * y)).astype(np.float32)
+    image = image * gains * vignette[..., None]
     noise = rng.standard_normal(image.shape, dtype=np.float32)
     image += exposure.noise * np.sqrt(0.02 + image) * noise
     return _TONE[np.clip(image * (4095 / 2.5), 0, 4095).astype(np.uint16)].astype(np.uint8)
@@ -177,11 +179,6 @@ def _smeared(linear: np.ndarray, blur_px: np.ndarray) -> np.ndarray:
                 if i + di < size and j + dj < size:
                     kernel[i + di, j + dj] += (1 - abs(y - i - di)) * (1 - abs(x - j - dj))
     return cv2.filter2D(linear, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
-
-
-def _vignette(height: int, width: int) -> Float[np.ndarray, "height width 1"]:
-    y, x = np.linspace(-1, 1, height)[:, None], np.linspace(-width / height, width / height, width)[None]
-    return (1 - 0.14 * (x * x + y * y)).astype(np.float32)[..., None]
 
 
 def _slow(rng: np.random.Generator, timestamp_s: np.ndarray, seconds: float) -> Float[np.ndarray, "frame"]:

@@ -60,7 +60,7 @@ def test_sidecar_describes_the_depth_camera(tmp_path):
     (folder / "depth_intrinsics.txt").write_text("30 30 12 16")
     (folder / "depth_from_color.txt").write_text("1 0 0 0.03\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
     recording = open_recording(folder)
-    assert recording.depth_camera.baseline_m == pytest.approx(0.03)
+    assert recording.depth_camera.depth_from_color[0, 3] == 0.03
     assert any("30 mm from the color camera" in remark for remark in recording.remarks)
     plan = extraction.understand(recording, rate_hz=10.0, max_depth_m=6.0, max_side_px=640)
     frame = next(iter(extraction.frames(recording, plan, max_depth_m=6.0)))
