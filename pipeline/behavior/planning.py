@@ -234,7 +234,7 @@ class Sampler:
     def draw_paths(
         self, codes: PlanCondition, goal: Float[np.ndarray, "plan 3"], rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Draw a path to each goal (Eq. 8) with guidance; meters, ego frame."""
+        """Draw a path to each goal (Eq. 9) with guidance; meters, ego frame."""
         control = self.scaling.scaled_goal(goal)
 
         def denoise(code: Array, keep: float = 0.0) -> Denoise:

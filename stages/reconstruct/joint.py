@@ -51,7 +51,7 @@ class JointLoss:
         begun: int = 0,
     ):
         """``steps``: of both phases, of which ``begun`` are done; ``rendered``: uniform and importance
-        samples, not samples around measured depth (001, A.1).
+        samples, not samples around measured depth (ATS, A.1).
         """
         self.problem, self.weights, self.batches, self.steps = problem, weights, batches, steps
         self.begun = begun

@@ -227,7 +227,7 @@ class SceneLoss:
         self, problem: Problem, weights: LossWeights, batches: RayBatches, steps: int, rendered: bool = False
     ):
         """``steps``: of both phases, over which codes are annealed; ``rendered``: differentiable rendering
-        alone, with uniform and importance samples (001, A.1).
+        alone, with uniform and importance samples (ATS, A.1).
         """
         self.problem, self.weights, self.batches, self.steps = problem, weights, batches, steps
         self.rendered = rendered
