@@ -106,7 +106,10 @@ class SimulatedDevice(TorchFunctionMode):
         return _marked(result, target)
 
     def _run(self, func, name: str, args: tuple, kwargs: dict):
-        tensors = [leaf for leaf in _pytree.tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
+        given = (
+            args[0] if name == "__deepcopy__" else (args, kwargs)
+        )  # its memo holds all that was copied before
+        tensors = [leaf for leaf in _pytree.tree_leaves(given) if isinstance(leaf, torch.Tensor)]
         on_device = any(map(is_on_device, tensors))
         if on_device and name in ("numpy", "__array__", "from_numpy"):
             raise MixedDevicesError(f"{name} of a tensor on {DEVICE}")
