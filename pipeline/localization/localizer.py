@@ -196,7 +196,7 @@ def save(folder: Path, localizer: Localizer, report: dict) -> None:
 
 
 def load(folder: Path, device: str = "cpu") -> Localizer:
-    """Load a localizer, its descriptor network on ``device``. Raises InputError MOD-001 to MOD-003."""
+    """Load a localizer, its networks on ``device``. Raises InputError MOD-001 to MOD-003."""
     metadata = json.loads((folder / "localizer.json").read_text())
     arrays = load_file(folder / "localizer.safetensors")
     basis = PcaBasis(arrays.pop("basis.mean"), arrays.pop("basis.components"))
@@ -207,7 +207,7 @@ def load(folder: Path, device: str = "cpu") -> Localizer:
         case "regression":
             model = PoseRegressor(**metadata["arguments"])
             model.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
-            model.eval()
+            model.to(device).eval()
         case _:
             assert_never(kind)
     sampling = PatchSampling(**{**metadata["sampling"], "radii_px": tuple(metadata["sampling"]["radii_px"])})

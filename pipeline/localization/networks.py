@@ -82,11 +82,11 @@ class PoseRegressor(nn.Module):
 
         ``anchor_camera`` is the point whose map position is regressed, camera frame, meters.
         """
-        rotation, position, log_error = self(torch.from_numpy(on_grid(query, cell))[None])
-        matrix = rotation[0].double().numpy()
-        return rigid.make(matrix, position[0].double().numpy() - matrix @ anchor_camera), float(
-            torch.exp(-torch.exp(log_error[0]))
-        )
+        grid = torch.from_numpy(on_grid(query, cell))[None].to(self.extent.device)
+        rotation, position, log_error = (value[0].cpu() for value in self(grid))
+        matrix = rotation.double().numpy()
+        certainty = float(torch.exp(-torch.exp(log_error)))
+        return rigid.make(matrix, position.double().numpy() - matrix @ anchor_camera), certainty
 
 
 def on_grid(

@@ -44,7 +44,7 @@ class PoseSamples:
         patches, map_from_camera = draw(rng)
         drawn = _sample(basis.project(patches.descriptors), patches, map_from_camera, target)
         for ring, value in zip((self.grids, self.rotation, self.position), drawn, strict=True):
-            ring[self.oldest] = torch.from_numpy(value)
+            ring[self.oldest] = torch.from_numpy(value).to(ring.device)
         self.oldest = (self.oldest + 1) % len(self.grids)
 
 
@@ -62,11 +62,12 @@ def train_regressor(
     config: NetworkConfig,
     seed: int,
     draw: DrawPatches | None = None,
+    device: str = "cpu",
 ) -> PoseRegressor:
-    """Train the paper's regressor (Eq. 5) on the described views, or on new ones from ``draw``."""
+    """Train the paper's regressor (Eq. 5) on a device, on the described views or new ones from ``draw``."""
     torch.manual_seed(seed)
-    net = PoseRegressor(described.descriptors.shape[1], config.pose_width)
-    samples = _samples(described, target)
+    net = PoseRegressor(described.descriptors.shape[1], config.pose_width).to(device)
+    samples = _samples(described, target, device)
     net.middle.copy_(samples.position.mean(0))  # so that the raw outputs are of order one
     net.extent.copy_(samples.position.std(0).norm())
     optimizer = torch.optim.AdamW(net.parameters(), config.rate, weight_decay=WEIGHT_DECAY)
@@ -78,10 +79,10 @@ def train_regressor(
                 samples.replace(described.basis, draw, target, rng)
         chosen = torch.randint(
             len(samples.grids), (distributed.share(config.batch_views),), generator=generator
-        )
+        ).to(device)
         grids = samples.grids[chosen]
         visible = torch.rand(len(chosen), 1, *grids.shape[2:], generator=generator) > PATCH_DROPOUT
-        rotation, position, log_error = net(grids * visible)
+        rotation, position, log_error = net(grids * visible.to(device))
         error, likelihood = pose_loss(
             rotation, position, log_error, samples.rotation[chosen], samples.position[chosen]
         )
@@ -98,10 +99,10 @@ def train_regressor(
     return net.eval()
 
 
-def _samples(described: DescribedViews, target: Target) -> PoseSamples:
+def _samples(described: DescribedViews, target: Target, device: str) -> PoseSamples:
     parts = np.split(described.descriptors, np.cumsum(described.counts)[:-1])
     poses = described.map_from_camera[described.view]
     views = zip(parts, described.patches, poses, strict=True)
     columns = zip(*(_sample(*view, target) for view in views), strict=True)
-    grids, rotation, position = (torch.from_numpy(np.stack(column)) for column in columns)
+    grids, rotation, position = (torch.from_numpy(np.stack(column)).to(device) for column in columns)
     return PoseSamples(grids, rotation, position)

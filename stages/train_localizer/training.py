@@ -132,7 +132,7 @@ def train(
         case "regression":
             draw = _fresh_patches(data, describe) if config.network.fresh_views else None
             seed = int(rng.integers(MAX_SEED))
-            model = networks.train_regressor(described, data.target, config.network, seed, draw)
+            model = networks.train_regressor(described, data.target, config.network, seed, draw, device)
         case _:
             assert_never(config.kind)
     uncalibrated = localizers.Localizer(

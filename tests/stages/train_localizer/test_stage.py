@@ -18,20 +18,21 @@ from tests.pipeline.backends import small_checkpoints
 from tests.stages.textured_room import noise_color
 
 
-@pytest.fixture(scope="module")
-def template(tmp_path_factory):
-    """An animal of two boxes with a random texture."""
+def textured_boxes() -> Mesh:
+    """Return an animal of two boxes with a random texture."""
     boxes = [
         trimesh.creation.box(size, trimesh.transformations.translation_matrix(at))
         for size, at in (((0.16, 0.16, 0.4), (0, 0, 0)), ((0.12, 0.13, 0.14), (0, 0.12, 0.24)))
     ]
     whole = trimesh.util.concatenate(boxes)
     vertices, faces = trimesh.remesh.subdivide_to_size(whole.vertices, whole.faces, 0.03, max_iter=10)
+    return Mesh(vertices.astype(np.float32), faces.astype(np.int32), noise_color(vertices * 3, 1))
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory):
     folder = tmp_path_factory.mktemp("agent_template")
-    ply.write_ply(
-        folder / "agent.ply",
-        Mesh(vertices.astype(np.float32), faces.astype(np.int32), noise_color(vertices * 3, 1)),
-    )
+    ply.write_ply(folder / "agent.ply", textured_boxes())
     return folder
 
 
