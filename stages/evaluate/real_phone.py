@@ -30,7 +30,7 @@ PARTS_WITHOUT_MASKS = tuple(name for name in NAMES if name.endswith(("_agent", "
 
 
 def cameras_of(
-    folders: BuildFolders, video: Video, clicked: Clicked | None
+    folders: BuildFolders, video: Video, clicked: Clicked | None, device: str
 ) -> tuple[Float[np.ndarray, "frame 4 4"], str] | None:
     """Return ``world_from_camera`` of all frames (NaN: unknown) and its source; None if unplaced."""
     clip = Clip.open(folders.frames[video.id])
@@ -39,7 +39,7 @@ def cameras_of(
         return placed, f"clicked correspondences in {int(clicked.trusted.sum())} frames"
     if clip.odometry_from_camera is None:
         return None
-    model = localizers.load(folders.scene_localizer)
+    model = localizers.load(folders.scene_localizer, device)
     votes = []
     for frame in subsampling.evenly(len(clip), LOCALIZED).tolist():
         answers = model.localize(

@@ -56,7 +56,7 @@ def against_clicks(
         metrics.add(clicked.clicked_metrics(cameras, folders, videos))
     seen, sources = [], []
     for video in (video for video in videos if video.role == "heldout" and video.synchronized_with):
-        placed = real_phone.cameras_of(folders, video, cameras.get(video.id))
+        placed = real_phone.cameras_of(folders, video, cameras.get(video.id), device)
         sources.append(placed[1] if placed else real_phone.UNPLACED)
         shots = real_phone.shots(folders, video, placed[0], config.heldout_frames) if placed else []
         seen.append((video.synchronized_with, shots))
@@ -81,7 +81,7 @@ def against_truth(
     metrics.add(_registration(folders, sessions, frames))
     progress.log("evaluate: single frames")
     walkthrough = reading.of_role(known, "walkthrough")[0]
-    metrics.add(_single_frames(folders, walkthrough, sessions, frames, config))
+    metrics.add(_single_frames(folders, walkthrough, sessions, frames, config, device))
     progress.log("evaluate: masks and flow")
     metrics.add(_perception(folders, sessions, reading.of_role(known, "turnaround")[0]))
     progress.log("evaluate: reconstruction")
@@ -117,12 +117,13 @@ def _single_frames(
     sessions: Sequence[RecordingWithTruth],
     frames: TruthAlignment,
     config: Config,
+    device: devices.Device,
 ) -> Metrics:
     """Place single frames by our localizer and by its baseline."""
     cameras = SceneCameras.open(folders.scene_template)
     known = np.flatnonzero(cameras.registered)
     mapped = known[subsampling.evenly(len(known), MAP_FRAMES)].tolist()
-    ours = localizers.load(folders.scene_localizer)
+    ours = localizers.load(folders.scene_localizer, device)
     sift = localizing.sift_map(walkthrough.clip, cameras.world_from_camera, mapped)
     errors: dict[str, list[PoseErrors]] = {"localizer/": [], "localizer/sift_only_": []}
     probabilities = []

@@ -12,8 +12,7 @@ from pipeline.metrics.lpips import ALEXNET_FILE, CHANNELS_FILE, CONVOLUTIONS, Lp
 RNG = np.random.default_rng(0)
 
 
-@pytest.fixture
-def weights(tmp_path: Path) -> Path:
+def write_weights(folder: Path) -> None:
     """Write random weights in the published format of both files."""
     generator, inner, features = torch.Generator().manual_seed(0), 3, {}
     for index, channels, kernel, *_ in CONVOLUTIONS:
@@ -22,9 +21,14 @@ def weights(tmp_path: Path) -> Path:
         features[f"features.{index}.bias"] = torch.zeros(channels)
         inner = channels
     features["classifier.1.weight"] = torch.zeros(4, 4)  # the file of torchvision has further weights
-    torch.save(features, tmp_path / ALEXNET_FILE)
+    torch.save(features, folder / ALEXNET_FILE)
     lin = {f"lin{n}.model.1.weight": torch.rand(1, each[1], 1, 1) for n, each in enumerate(CONVOLUTIONS)}
-    torch.save(lin, tmp_path / CHANNELS_FILE)
+    torch.save(lin, folder / CHANNELS_FILE)
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    write_weights(tmp_path)
     return tmp_path
 
 
