@@ -1,4 +1,4 @@
-"""The Gaussian rasterizer for CUDA: gsplat, an optional dependency."""
+"""The Gaussian rasterizer for CUDA: gsplat 1.5.3, an optional dependency."""
 
 import importlib
 
@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.core.errors import InputError
-from pipeline.fields.footprints import BLUR_PX2
+from pipeline.fields.footprints import BLUR_PX2, NEAREST_M
 
 
 def draw(
@@ -24,7 +24,7 @@ def draw(
     try:
         gsplat = importlib.import_module("gsplat")
     except ImportError as error:
-        remedy = f"pip install gsplat, or {tiles}"
+        remedy = f"pip install gsplat==1.5.3, or {tiles}"
         raise InputError("DEP-001", "gsplat is not installed", where, remedy) from error
     if not torch.cuda.is_available():
         raise InputError("DEP-001", "gsplat needs a CUDA device", where, tiles)
@@ -32,6 +32,6 @@ def draw(
         raise InputError("DEP-001", "gsplat found no compiler (nvcc) for its kernels", where, tiles)
     image, coverage, _ = gsplat.rasterization(
         means_world, torch.nn.functional.normalize(rotation, dim=-1), log_scale.exp(), opacity, values,
-        camera_from_world[None], intrinsics[None], width, height, near_plane=0.1, eps2d=BLUR_PX2,
+        camera_from_world[None], intrinsics[None], width, height, near_plane=NEAREST_M, eps2d=BLUR_PX2,
     )  # fmt: skip
     return image[0], coverage[0, ..., 0]

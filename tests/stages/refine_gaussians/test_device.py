@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from pipeline.fields.gaussians import Splats
@@ -10,6 +11,7 @@ from stages.refine_gaussians import refine, stage
 from stages.refine_gaussians.config import GaussianWeights
 from stages.refine_gaussians.refine import FrameLoss, MotionDeltas
 from stages.refine_gaussians.views import DrawnVideo
+from tests.pipeline.fields import gsplat_stand_in
 from tests.simulated_device import DEVICE, is_on_device, simulated_device
 from tests.stages.refine_gaussians.test_cover import SIZE, film
 from tests.stages.refine_gaussians.test_splats import ball
@@ -30,13 +32,15 @@ def session() -> DrawnVideo:
     return replace(plain, masks=masks, flow=flow, motion=motion)
 
 
-def test_refinement_runs_on_another_device(tmp_path):
+@pytest.mark.parametrize("backend", ["dense", "gsplat"])
+def test_refinement_runs_on_another_device(backend, tmp_path, monkeypatch):
+    gsplat_stand_in.install(monkeypatch)
     sequence = session()
     agent = ball(0.2, 60)
     splats = Splats(ball(0.5, 60), agent, torch.ones(60, 1), torch.eye(4)[None], videos=1)
     with simulated_device():
         splats, deltas = splats.to(DEVICE), MotionDeltas(4, 1).to(DEVICE)
-        loss = FrameLoss(splats, deltas, [sequence], GaussianWeights(), 32, "dense")
+        loss = FrameLoss(splats, deltas, [sequence], GaussianWeights(), 32, backend)
         record = refine.refine(loss, 3, 0, tmp_path / "resume", 2)
         assert set(record.terms) == {"color", "depth", "silhouette", "flow", "motion"}
         assert np.isfinite(record.total()).all() and all(map(is_on_device, splats.parameters()))
