@@ -128,6 +128,12 @@ def undefined(table: symtable.SymbolTable, known: set[str]) -> set[str]:
     return (here - known).union(*(undefined(inner, known) for inner in table.get_children()))
 
 
+@pytest.mark.parametrize("stage", sorted({node.stage for node in dag.FLOW if node.gpu}))
+def test_stages_with_a_gpu_are_tested_on_a_simulated_device(stage):
+    path = ROOT.joinpath("tests", "stages", *stage.split("."), "test_device.py")
+    assert path.exists() and "with simulated_device():" in path.read_text(), f"{name_of(path)} is missing"
+
+
 @pytest.mark.parametrize("path", FILES, ids=name_of)
 def test_every_name_is_defined(path):
     """The linter cannot check this: array shapes in annotations look like undefined names."""
