@@ -53,7 +53,7 @@ def begin(problem: Problem, videos: Sequence[RegisteredVideo], folder: Path) -> 
     sizes, ART-007 if another version wrote it.
     """
     with other_versions_refused("reconstruction", str(folder)):
-        loaded = fields.load(folder)
+        loaded = fields.load(folder, str(problem.device))
     former = {video.id: found for video in videos if (found := _former_motion(folder, video)) is not None}
     try:
         _load_fields(problem, loaded, scene_ids(videos))
@@ -63,14 +63,14 @@ def begin(problem: Problem, videos: Sequence[RegisteredVideo], folder: Path) -> 
     frames, roots, bones = [], [], []
     for index, video in enumerate(scene_first(videos)):
         if video.id in former:
-            frame = torch.nonzero(problem.video.cpu() == index)[:, 0]
+            frame = torch.nonzero(problem.video == index)[:, 0]
             _load_cameras(problem, frame, former[video.id])
             frames.append(frame)
             roots.append(_twists(problem.motion.initial_agent[frame], former[video.id].world_from_agent))
             rest = problem.motion.agent_from_bone_rest.expand(len(frame), -1, -1, -1)
             bones.append(_twists(rest, former[video.id].agent_from_bone))
     count = len(problem.motion.agent_from_bone_rest)
-    nothing = torch.zeros(0, dtype=torch.long), torch.zeros(0, 6), torch.zeros(0, count, 6)
+    nothing = problem.video[:0], torch.zeros(0, 6), torch.zeros(0, count, 6)
     parts = zip(nothing, (frames, roots, bones), strict=True)
     return KnownMotion(*(torch.cat([empty, *found]) for empty, found in parts))
 

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.data import motion as motion_files
 from pipeline.fields import fields, marching_cubes
 from pipeline.fields.fields import Reconstruction
 from pipeline.fields.render import Renderer, render_depth
-from stages.reconstruct import assemble, optimize, results
+from stages.reconstruct import assemble, former, optimize, results
 from stages.reconstruct.config import LearningRates, LossWeights, PhaseSteps, RayBatches
 from tests.simulated_device import DEVICE, is_on_device, simulated_device
 from tests.stages.reconstruct.test_fuse import fused_scene
@@ -53,3 +54,23 @@ def test_all_phases_run_on_another_device(form, tmp_path):
         if form == "fused":
             Renderer(loaded, "v002", 0.04).draw(camera, intrinsics, 12, 16, *pose)
         assert torch.get_default_dtype() == torch.float32
+
+
+@pytest.mark.slow
+def test_warm_start_runs_on_another_device(tmp_path):
+    rng = np.random.default_rng(0)
+    videos = [film(id, 6, id != "v001", rng, UPRIGHT) for id in ("v003", "v002", "v001")]
+    (tmp_path / "v002").mkdir()
+    with simulated_device():
+        problem = assemble.build(videos, template(RADIUS_M), SHAPES, 0, DEVICE)
+        ids = assemble.scene_ids(videos)
+        fields.save(tmp_path, Reconstruction(problem.scene, problem.agent, problem.body, ids))
+        motion_files.save(tmp_path / "v002" / "motion.npz", results.motions(problem, videos, 0.75)["v002"])
+        known = former.begin(problem, videos, tmp_path)
+        assert len(known.frame) == 6 and all(map(is_on_device, problem.scene.parameters()))
+        steps, resume = former.shorter(STEPS), tmp_path / "resume"
+        plan = optimize.OptimizationPlan(
+            steps, LossWeights(), BATCHES, LearningRates(), 0, resume, known=known
+        )
+        records = optimize.optimize(problem, plan)
+    assert all(np.isfinite(records[phase].total()).all() for phase in ("scene", "joint"))

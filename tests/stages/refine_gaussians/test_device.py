@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pipeline.fields.gaussians import Splats
-from stages.refine_gaussians import refine, stage
+from stages.refine_gaussians import pictures, refine, stage
 from stages.refine_gaussians.config import GaussianWeights
 from stages.refine_gaussians.refine import FrameLoss, MotionDeltas
 from stages.refine_gaussians.views import DrawnVideo
@@ -45,4 +45,5 @@ def test_refinement_runs_on_another_device(backend, tmp_path, monkeypatch):
         assert set(record.terms) == {"color", "depth", "silhouette", "flow", "motion"}
         assert np.isfinite(record.total()).all() and all(map(is_on_device, splats.parameters()))
         stage.write(tmp_path, splats, deltas, [sequence])
-    assert (tmp_path / "v0" / "motion.npz").exists() and (tmp_path / "scene.ply").exists()
+        pictures.report_quality(tmp_path, loss, [sequence], record)
+    assert (tmp_path / "v0" / "motion.npz").exists() and (tmp_path / "qa.json").exists()
