@@ -106,9 +106,7 @@ class SimulatedDevice(TorchFunctionMode):
         return _marked(result, target)
 
     def _run(self, func, name: str, args: tuple, kwargs: dict):
-        given = (
-            args[0] if name == "__deepcopy__" else (args, kwargs)
-        )  # its memo holds all that was copied before
+        given = args[0] if name == "__deepcopy__" else (args, kwargs)  # its memo holds all copies
         tensors = [leaf for leaf in _pytree.tree_leaves(given) if isinstance(leaf, torch.Tensor)]
         on_device = any(map(is_on_device, tensors))
         if on_device and name in ("numpy", "__array__", "from_numpy"):
@@ -120,7 +118,7 @@ class SimulatedDevice(TorchFunctionMode):
             raise MixedDevicesError(f"{name} of tensors on {DEVICE} and cpu")
         if "device" in kwargs and kwargs["device"] is not None:
             on_device = _names_device(kwargs["device"])
-            kwargs["device"] = "cpu"
+            kwargs["device"] = "cpu" if on_device else kwargs["device"]
         if on_device and kwargs.get("generator") is not None:
             raise MixedDevicesError(f"{name} on {DEVICE} with a generator of the cpu")
         if on_device and name in _FLOATS_ONLY and not any(part.is_floating_point() for part in tensors):
