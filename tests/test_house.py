@@ -130,6 +130,7 @@ def undefined(table: symtable.SymbolTable, known: set[str]) -> set[str]:
 
 @pytest.mark.parametrize("stage", sorted({node.stage for node in dag.FLOW if node.gpu}))
 def test_stages_with_a_gpu_are_tested_on_a_simulated_device(stage):
+    """`tests/stages/<stage>/test_device.py` runs what the stage does on its device."""
     path = ROOT.joinpath("tests", "stages", *stage.split("."), "test_device.py")
     assert path.exists() and "with simulated_device():" in path.read_text(), f"{name_of(path)} is missing"
 
