@@ -1,6 +1,8 @@
 """Environments: checks of the libraries, seeding, collision of persons with walls, and batching."""
 
 import shutil
+import subprocess
+import sys
 import warnings
 
 import numpy as np
@@ -10,6 +12,7 @@ from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import BehaviorNets
 from pipeline.behavior.perception import FeatureVolume
 from pipeline.core.errors import InputError
+from pipeline.environments import NAME
 from pipeline.environments.floor import PersonFloor, to_local, to_world
 from pipeline.environments.rewards import REWARDS, StepOutcome
 from pipeline.environments.world import AnimalWorld
@@ -43,13 +46,24 @@ def build(tmp_path_factory):
 def test_gymnasium_checker_passes(build, embodiment):
     from gymnasium.utils.env_checker import check_env
 
-    import pipeline.environments.registration  # noqa: F401
-
     how = {"config": QUICK, "embodiment": embodiment, "episode_s": 3.0}
-    env = gymnasium.make("AgentToSim/Cat-v0", build=str(build), **how)
+    env = gymnasium.make(NAME, build=str(build), **how)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env.unwrapped)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        'import gymnasium; gymnasium.make("pipeline.environments:AgentToSim/Cat-v0", build="missing")',
+        'import gymnasium, pipeline.environments; gymnasium.make("AgentToSim/Cat-v0", build="missing")',
+        'import gymnasium; gymnasium.make_vec("pipeline.environments:AgentToSim/Cat-v0", build="missing")',
+    ],
+)
+def test_gymnasium_finds_the_environment_in_a_new_process(lines):
+    done = subprocess.run([sys.executable, "-c", lines], capture_output=True, text=True)
+    assert "InputError: ART-003 missing" in done.stderr, "the environment is found, the build is not"
 
 
 def test_pettingzoo_checks_pass():
@@ -70,13 +84,9 @@ def small_world_like(world):
 
 
 def test_vectorized_episodes_restart_and_are_seeded(build):
-    import pipeline.environments.registration  # noqa: F401
-
     lives = []
     for _ in range(2):
-        env = gymnasium.make_vec(
-            "AgentToSim/Cat-v0", num_envs=4, build=str(build), config=QUICK, episode_s=1.0
-        )
+        env = gymnasium.make_vec(NAME, num_envs=4, build=str(build), config=QUICK, episode_s=1.0)
         seen, _ = env.reset(seed=3)
         ends = np.zeros(4, int)
         for _ in range(25):
@@ -90,19 +100,17 @@ def test_vectorized_episodes_restart_and_are_seeded(build):
 
 
 def test_animal_can_live_in_another_home(build, tmp_path):
-    import pipeline.environments.registration  # noqa: F401
-
     own, other = write(tmp_path / "own"), write(tmp_path / "other")
     shutil.copytree(build / "behavior", own / "behavior")
     wandering().save(own / "behavior_data")
-    env = gymnasium.make("AgentToSim/Cat-v0", build=str(own), home=str(other), config=QUICK)
+    env = gymnasium.make(NAME, build=str(own), home=str(other), config=QUICK)
     _, info = env.reset(seed=0, options={"split": "test"})
     assert info["share_known"] == 1.0, "the same room"
     for _ in range(15):
         seen, *_ = env.step(env.action_space.sample())
     assert env.observation_space.contains(seen)
     with pytest.raises(InputError, match="ART-003.*nowhere"):
-        gymnasium.make("AgentToSim/Cat-v0", build=str(own), home="nowhere", config=QUICK)
+        gymnasium.make(NAME, build=str(own), home="nowhere", config=QUICK)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import BehaviorNets
 from pipeline.core.errors import InputError
 from pipeline.data import npz, ply
+from pipeline.environments import NAME
 from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.homes import open_homes
 from pipeline.environments.rgbd import FAR_M, INTRINSICS, PITCH_RAD, RgbdCamera
@@ -64,18 +65,11 @@ def builds(tmp_path_factory):
 
 @pytest.mark.slow
 def test_episodes_start_in_every_home_and_plan_in_one_batch(builds):
-    import pipeline.environments.registration  # noqa: F401
-
     own, other = builds
     lives = []
     for _ in range(2):
         env = gymnasium.make_vec(
-            "AgentToSim/Cat-v0",
-            num_envs=6,
-            build=str(own),
-            homes=[str(own), str(other)],
-            config=QUICK,
-            episode_s=0.5,
+            NAME, num_envs=6, build=str(own), homes=[str(own), str(other)], config=QUICK, episode_s=0.5
         )
         seen, info = env.reset(seed=1)
         homes = [info["home"].copy()]
@@ -111,10 +105,8 @@ def test_joined_homes_keep_their_start_states_and_volumes(builds):
 def test_gymnasium_accepts_image_observations(builds, observations):
     from gymnasium.utils.env_checker import check_env
 
-    import pipeline.environments.registration  # noqa: F401
-
     how = {"homes": [str(build) for build in builds], "config": QUICK, "observations": observations}
-    env = gymnasium.make("AgentToSim/Cat-v0", build=str(builds[0]), episode_s=3.0, **how)
+    env = gymnasium.make(NAME, build=str(builds[0]), episode_s=3.0, **how)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env.unwrapped)
