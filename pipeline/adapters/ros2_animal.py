@@ -74,7 +74,10 @@ def main() -> None:
     parser.add_argument("--home", type=Path)
     parser.add_argument("--seed", type=int, default=0)
     asked, for_ros = parser.parse_known_args()
-    rclpy, messages = import_module("rclpy"), import_module("geometry_msgs.msg")
+    try:
+        rclpy, messages = import_module("rclpy"), import_module("geometry_msgs.msg")
+    except ModuleNotFoundError as error:
+        parser.exit(2, f"{error}: source the setup file of ROS 2 (/opt/ros/.../setup.bash) first\n")
     animal = LiveAnimal.open(asked.build, home=asked.home, seed=asked.seed)
     rclpy.init(args=for_ros)
     node = rclpy.create_node("animal")

@@ -2,12 +2,14 @@
 program.
 """
 
+import sys
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from pipeline.adapters import ros2_animal
 from pipeline.adapters.live_animal import ZUP_FROM_WORLD, LiveAnimal
 from pipeline.adapters.ros2_animal import AnimalNode
 from pipeline.behavior.perception import FeatureVolume
@@ -128,6 +130,15 @@ class FakeNode:
 
     def get_clock(self):
         return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=lambda: "now"))
+
+
+def test_missing_ros_is_one_line(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["ros2_animal", "build/missing"])
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    with pytest.raises(SystemExit, match="2"):
+        ros2_animal.main()
+    said = capsys.readouterr().err
+    assert "rclpy" in said and "source the setup file of ROS 2" in said and said.count("\n") == 1
 
 
 def test_ros_messages_have_the_axes_of_rep_103(animal):
