@@ -5,12 +5,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from jaxtyping import Float
 from pettingzoo import ParallelEnv
 
 from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.environments.floor import to_local, to_world
-from pipeline.environments.rendering import bird_view
+from pipeline.environments.rendering import bird_view, known_mode
 from pipeline.environments.spaces import (
     FAR,
     person_action_space,
@@ -41,7 +40,7 @@ class PersonAnimalEnv(ParallelEnv):
     def __init__(self, build: str | Path | AnimalWorld, *, render_mode: str | None = None, **opening: Any):
         """Open a build (`build/<agent>`); ``opening`` is what `AnimalWorld.opened` takes."""
         self.world = AnimalWorld.opened(build, **opening)
-        self.config, self.render_mode = self.world.config, render_mode
+        self.config, self.render_mode = self.world.config, known_mode(render_mode, self.metadata)
         self.possible_agents = [PERSON, ANIMAL]
         self.agents: list[str] = []
         self.observation_spaces = {
@@ -69,14 +68,14 @@ class PersonAnimalEnv(ParallelEnv):
         self.world.begin(1, self.rng, (options or {}).get("split", "train"))
         return self._observations(), {agent: {} for agent in self.agents}
 
-    def step(self, actions: dict[str, Float[np.ndarray, "_"]]):
-        """Let 0.1 s pass; actions in -1..1 are parts of the highest speeds, or of the farthest goal."""
+    def step(self, actions: dict[str, Any]):
+        """Let 0.1 s pass; actions (2 or 3 in -1..1) are parts of highest speeds, or of the farthest goal."""
         root = self.world.animals.past[-1].root[0, 0]
         if ANIMAL in actions:
-            wish = checked(np.asarray(actions[ANIMAL])[None], (1, 2)).clip(-1, 1)
+            wish = checked([actions[ANIMAL]], (1, 2)).clip(-1, 1)
             goal = to_world(GOAL_M * wish, self._animal_heading())[0]
             self.world.animals.command((root[:3, 3] + [goal[0], 0.0, goal[1]])[None])
-        outcome = self.world.step(np.asarray(actions.get(PERSON, ()))[None])
+        outcome = self.world.step([actions.get(PERSON, ())])
         self.frame += 1
         rewards, ended, out_of_time = self.world.judge(outcome, self.frame)
         reward, over, late, agents = float(rewards[0]), bool(ended[0]), bool(out_of_time), self.agents

@@ -5,10 +5,9 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from jaxtyping import Float
 
 from pipeline.behavior.trajectories import RATE_HZ
-from pipeline.environments.rendering import PictureWindow, bird_view
+from pipeline.environments.rendering import PictureWindow, bird_view, known_mode
 from pipeline.environments.spaces import person_action_space, person_observation, person_observation_space
 from pipeline.environments.world import AnimalWorld
 
@@ -25,7 +24,7 @@ class PersonEnv(gymnasium.Env):
     def __init__(self, build: str | Path | AnimalWorld, *, render_mode: str | None = None, **opening: Any):
         """Open a build (`build/<agent>`); ``opening`` is what `AnimalWorld.opened` takes."""
         self.world = AnimalWorld.opened(build, **opening)
-        self.config, self.render_mode = self.world.config, render_mode
+        self.config, self.render_mode = self.world.config, known_mode(render_mode, self.metadata)
         self.observation_space = person_observation_space(self.config.observations)
         self.action_space = person_action_space(self.world)
         self.window: PictureWindow | None = None
@@ -42,9 +41,9 @@ class PersonEnv(gymnasium.Env):
         }
         return self._observation(), info
 
-    def step(self, action: Float[np.ndarray, "action"]):
-        """Let 0.1 s pass; an action in -1..1 is a part of the highest speeds."""
-        outcome = self.world.step(np.asarray(action)[None])
+    def step(self, action: Any):
+        """Let 0.1 s pass; an action (2 or 3 numbers in -1..1) is a part of the highest speeds."""
+        outcome = self.world.step([action])
         self.frame += 1
         reward, over, late = self.world.judge(outcome, self.frame)
         self._show()

@@ -1,9 +1,12 @@
 """Top-down view of a pair: blocked cells gray, person green, animal blue, its plan and goal orange."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from pipeline.core.errors import InputError
 from pipeline.environments.world import AnimalWorld
 
 SIDE_PX, SIDE_M = 400, 8.0
@@ -41,6 +44,15 @@ def bird_view(world: AnimalWorld, row: int) -> UInt8[np.ndarray, "400 400 3"]:
     cv2.line(picture, pixel(center), pixel(center + 0.5 * ahead), PERSON, 2)
     cv2.circle(picture, pixel(center), 8, PERSON, -1)
     return picture
+
+
+def known_mode(mode: str | None, metadata: dict[str, Any]) -> str | None:
+    """Return a render mode that an environment has. Raises REC-002 for others."""
+    known = (None, *metadata["render_modes"])
+    if mode not in known:
+        what = f"{mode!r} is no mode of this environment"
+        raise InputError("REC-002", what, "environment: render_mode", f"one of {known}")
+    return mode
 
 
 class PictureWindow:

@@ -45,8 +45,8 @@ class PersonStableVecEnv(VecEnv):
         self.world.begin(self.num_envs, self.rng, self.split)
         return person_observation(self.world)
 
-    def step_async(self, actions: Float[np.ndarray, "person action"]) -> None:
-        """Keep the actions for `step_wait`."""
+    def step_async(self, actions: Any) -> None:
+        """Keep the actions (person x command) for `step_wait`."""
         self.actions = actions
 
     def step_wait(self):

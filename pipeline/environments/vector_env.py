@@ -6,11 +6,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.vector.utils import batch_space
-from jaxtyping import Float
 
 from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.environments.spaces import person_action_space, person_observation, person_observation_space
-from pipeline.environments.world import AnimalWorld
+from pipeline.environments.world import AnimalWorld, checked
 
 
 class PersonVectorEnv(gymnasium.vector.VectorEnv):
@@ -41,10 +40,11 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
         info = {"distance_m": world.distance_m, "share_known": world.share_known, "home": world.home}
         return person_observation(world), info
 
-    def step(self, actions: Float[np.ndarray, "person action"]):
-        """Let 0.1 s pass everywhere; where an episode had ended, another begins instead."""
+    def step(self, actions: Any):
+        """Let 0.1 s pass everywhere (actions: person x command); where an episode ended, begin another."""
         again = np.flatnonzero(self.ended)
-        outcome = self.world.step(np.where(self.ended[:, None], 0.0, actions))
+        numbers = checked(actions, (self.num_envs, self.world.action_size))
+        outcome = self.world.step(np.where(self.ended[:, None], 0.0, numbers))
         if len(again):
             self.world.restart(again, self.split)
         self.frame = np.where(self.ended, 0, self.frame + 1)

@@ -135,9 +135,9 @@ class AnimalWorld:
         """Begin some pairs of person and animal anew, by their indices."""
         self.animals.restart(some, self._drawn(some, split))
 
-    def step(self, action: Float[np.ndarray, "person command"]) -> StepOutcome:
-        """Move the persons by their actions (-1..1 of the highest speeds) and let the animals
-        live for 0.1 s.
+    def step(self, action: Any) -> StepOutcome:
+        """Move the persons by their actions (person x command, -1..1 of the highest speeds) and let the
+        animals live for 0.1 s.
 
         Raises SIM-012 for actions that are no finite numbers, or not as many as there are.
         """
@@ -291,13 +291,14 @@ class AnimalWorld:
         return self.scenes.number(np.arange(count), count).tolist()
 
 
-def checked(
-    action: Float[np.ndarray, "person command"], shape: tuple[int, int]
-) -> Float[np.ndarray, "person command"]:
+def checked(action: Any, shape: tuple[int, int]) -> Float[np.ndarray, "person command"]:
     """Return actions as numbers. Raises SIM-012 where they are not finite or of another shape."""
-    numbers = np.asarray(action, float)
+    try:
+        numbers, received = np.asarray(action, float), ""
+    except (TypeError, ValueError) as error:
+        numbers, received = np.empty(0), str(error)
     if numbers.shape != shape or not np.isfinite(numbers).all():
-        received = f"shape {numbers.shape}" if numbers.shape != shape else f"{numbers.tolist()}"
+        received = received or (str(numbers.tolist()) if numbers.shape == shape else f"shape {numbers.shape}")
         what = f"actions are no {shape[0]} x {shape[1]} finite numbers: {received}"
         remedy = "look for what made the policy diverge: learning rate, rewards, observations"
         raise InputError("SIM-012", what, "step", remedy)

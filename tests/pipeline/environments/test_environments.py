@@ -135,14 +135,38 @@ def test_an_unknown_split_is_refused():
         PersonEnv(small_world()).reset(seed=0, options={"split": "valid"})
 
 
-@pytest.mark.parametrize("action", [[np.nan, 0.0, 0.0], [0.0, np.inf, 0.0], [0.0, 0.0]])
+def test_an_unknown_render_mode_is_refused():
+    from pipeline.environments.parallel_env import PersonAnimalEnv
+    from pipeline.environments.person_env import PersonEnv
+
+    for environment in (PersonEnv, PersonAnimalEnv):
+        with pytest.raises(InputError, match="REC-002.*'foo'"):
+            environment(small_world(), render_mode="foo")
+
+
+@pytest.mark.parametrize(
+    "actions", [["ahead"] * 4, np.zeros((3, 3)), np.full((4, 3), "1,0"), [[0.0] * 3, [0.0]], [None] * 4]
+)
+def test_unusable_actions_of_many_are_refused(actions):
+    from pipeline.environments.vector_env import PersonVectorEnv
+
+    env = PersonVectorEnv(small_world(), 4)
+    env.reset(seed=0)
+    with pytest.raises(InputError, match="SIM-012"):
+        env.step(actions)
+
+
+@pytest.mark.parametrize(
+    "action",
+    [[np.nan, 0.0, 0.0], [0.0, np.inf, 0.0], [0.0, 0.0], "ahead", [0, 0, [1]], {"turn": 1}, [1j] * 3],
+)
 def test_nonfinite_actions_are_refused(action):
     from pipeline.environments.person_env import PersonEnv
 
     env = PersonEnv(small_world())
     env.reset(seed=0)
     with pytest.raises(InputError, match="SIM-012"):
-        env.step(np.array(action, np.float32))
+        env.step(action)
 
 
 def test_nonfinite_goals_are_refused():
