@@ -54,15 +54,17 @@ def shown(
     size: tuple[int, int] = (480, 320),
     script: str = "",
     timeout_s: float = 60,
+    every_frame: bool = False,
     **more: Any,
 ) -> Iterator[tuple[Page, list[str]]]:
     """Yield the page at an address once it is ready or has failed, and a list of its errors. `script` runs
-    before the page; `more` are options of the browser context.
+    before the page, which draws fewer frames than it could without `every_frame`; `more` are options of the
+    browser context.
     """
     home = address.rsplit("/", 1)[0]
     context = browser.new_context(viewport={"width": size[0], "height": size[1]}, **more)
     page = context.new_page()
-    page.add_init_script(FEWER_FRAMES + script)
+    page.add_init_script(script if every_frame else FEWER_FRAMES + script)
     wrong: list[str] = []
     page.on(
         "console",
@@ -87,12 +89,18 @@ def shown(
 
 @contextmanager
 def opened(
-    file: Path, query: str = "", size: tuple[int, int] = (480, 320), timeout_s: float = 60
+    file: Path,
+    query: str = "",
+    size: tuple[int, int] = (480, 320),
+    timeout_s: float = 60,
+    every_frame: bool = False,
 ) -> Iterator[tuple[Page, list[str]]]:
     """Yield a page from disk in a new browser."""
     with (
         chromium() as browser,
-        shown(browser, file.resolve().as_uri() + query, size=size, timeout_s=timeout_s) as page_and_wrong,
+        shown(
+            browser, file.resolve().as_uri() + query, size=size, timeout_s=timeout_s, every_frame=every_frame
+        ) as page_and_wrong,
     ):
         yield page_and_wrong
 
