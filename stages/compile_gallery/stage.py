@@ -15,8 +15,10 @@ from pipeline.data import qa
 from pipeline.metrics import bars, words
 
 _WORDS = {"ok": "all checks fine", "warn": "checks to look at", "fail": "checks failed", "none": "no checks"}
-PICTURES = ("simulator/qa/visits.webp", "simulator/qa/heat_maps.webp", "splats/qa/frames.webp")
+PICTURES = ("*simulator/qa/visits*.webp", "simulator/qa/heat_maps.webp", "splats/qa/frames.webp")
 """Candidate pictures for a build's card, the best first; all of them are in its report."""
+_SIMULATORS = {"simulator": "walk with it", "home_simulator": "walk with them"}
+"""Pages of one animal and of a home of several, and what their links say."""
 METRICS = (
     "behavior/ats/goal_minde_m",
     "reconstruction/agent_root_m_median",
@@ -50,7 +52,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Card:
-    """One animal."""
+    """One animal, or a home of several."""
 
     name: str
     folder: str
@@ -61,15 +63,16 @@ class Card:
     figures: tuple[Figure, ...]
     links: tuple[Link, ...]
     """the first one to its simulator"""
+    home: bool
 
 
 def run(root: Path) -> str:
-    """Return the page for all builds in `root`, variants and animals of homes too. Raises ART-003 without."""
+    """Return the page for all builds in `root`: animals, homes, variants. Raises ART-003 without any."""
     folders = [
         folder
         for pattern in ("*", "*/animals/*", "*/variants/*")
         for folder in root.glob(pattern)
-        if (folder / "simulator/manifest.json").is_file() and (folder / "simulator/index.html").is_file()
+        if _simulator(folder)
     ]
     if not folders:
         raise InputError("ART-003", "has no finished simulator", str(root), "build one: make cat")
@@ -84,27 +87,35 @@ def run(root: Path) -> str:
 
 def card(folder: Path, root: Path) -> Card:
     """Read the build in `folder`, whose simulator is finished, for a gallery in `root`."""
-    contract = json.loads((folder / "simulator/simulator.json").read_bytes())
+    simulator = _simulator(folder)
+    contract = json.loads((folder / simulator / "simulator.json").read_bytes())
     files = [*folder.glob("*/qa.json"), *folder.glob("*/*/qa.json")]
     states = [check["status"] for file in files for check in json.loads(file.read_bytes())["checks"]]
     file = folder / "evaluation/metrics.json"
     metrics = json.loads(file.read_bytes()) if file.is_file() else {}
-    pictures = [folder / name for name in PICTURES if (folder / name).is_file()]
-    pages = [("walk with it", folder / "simulator/index.html"), ("report", folder / "report/index.html")]
+    pictures = [file for name in PICTURES for file in sorted(folder.glob(name))]
+    pages = [(_SIMULATORS[simulator], folder / simulator / "index.html")]
+    pages.append(("report", folder / "report/index.html"))
     homes = sorted(folder.glob("homes/*/simulator/index.html"))
     pages += [(f"in the home of {home.parents[1].name}", home) for home in homes]
-    checks = json.loads((folder / "simulator/qa.json").read_bytes())["checks"]
+    checks = json.loads((folder / simulator / "qa.json").read_bytes())["checks"]
     figures = [Figure(one["name"], one["value"], one["unit"]) for one in checks if one["name"] in _CHECKS]
     measured = [(words.describe(key), value) for key in METRICS if (value := metrics.get(key)) is not None]
     figures += [Figure(found.text, value, found.unit) for found, value in measured]
     return Card(
-        name=str(contract["name"]),
+        name=folder.name if folder.parent.name == "animals" else str(contract["name"]),
         folder=folder.relative_to(root).as_posix(),
         thumbnail=_thumbnail(pictures[0]) if pictures else None,
         status=qa.worst([*states, bars.worst(bars.judge(metrics, {}))]) if states else "none",
         figures=tuple(figures),
         links=tuple(Link(to, page.relative_to(root).as_posix()) for to, page in pages if page.is_file()),
+        home=simulator == "home_simulator",
     )
+
+
+def _simulator(folder: Path) -> str:
+    """Return which finished simulator a folder has; empty where none."""
+    return next((name for name in _SIMULATORS if (folder / name / "manifest.json").is_file()), "")
 
 
 def _thumbnail(file: Path) -> str:
