@@ -25,10 +25,11 @@ _STEPS = 4096.0
 
 @dataclass(frozen=True)
 class Asset:
-    """What differs between builds: some content, and how many bytes its records have."""
+    """What differs between builds: some content, how many bytes its records have, and what it is part of."""
 
     content: bytes
     record: int = 1
+    part: str = "room"
 
 
 def clip_rows(motions: list[SessionClip]) -> bytes:
@@ -43,19 +44,16 @@ def clip_rows(motions: list[SessionClip]) -> bytes:
     return (np.rint(np.concatenate(frames) * _STEPS) / _STEPS).astype("<f4").tobytes()
 
 
-def page(*, contract: Mapping[str, Any], assets: Mapping[str, Asset]) -> str:
-    """Return the page with everything in it; `assets` go by the names that the script asks for."""
-    files = compressed(contract, assets)
+def page(contract: Mapping[str, Any], assets: Mapping[str, Asset], files: Mapping[str, bytes]) -> str:
+    """Return the page with all files in it, `compressed`, by the names that the script asks for."""
     tags = [_tag(name, assets, content=base64.b64encode(file).decode()) for name, file in files.items()]
     return _assembled(contract, tags, connect="")
 
 
-def light_page(*, contract: Mapping[str, Any], assets: Mapping[str, Asset]) -> tuple[str, dict[str, bytes]]:
-    """Return a page that loads its assets from beside it, and these files by name; it wants a static host."""
-    files = compressed(contract, assets)
+def light_page(contract: Mapping[str, Any], assets: Mapping[str, Asset], files: Mapping[str, bytes]) -> str:
+    """Return a page that loads its files from the folder `assets` beside it; it wants a static host."""
     tags = [_tag(name, assets, f' data-file="assets/{name}.gz"') for name in files]
-    loaded = {f"assets/{name}.gz": file for name, file in files.items()}
-    return _assembled(contract, tags, connect="'self'"), loaded
+    return _assembled(contract, tags, connect="'self'")
 
 
 def compressed(contract: Mapping[str, Any], assets: Mapping[str, Asset]) -> dict[str, bytes]:

@@ -46,6 +46,6 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
     )
     assets = reading.behavior_assets(inputs.behavior, place.volume, place.roots_world)
     labels = {video.id: Path(video.file).stem for video in videos} | place.labels
-    size_mb = writing.write_simulator(out, parts, assets, config, labels, place.remark)
-    qa.write(out, **writing.quality(parts, size_mb, assets.supported))
-    return size_mb
+    sizes_mb = writing.write_simulator(out, parts, assets, config, labels, place.remark)
+    qa.write(out, **writing.quality(parts, sizes_mb, assets.supported))
+    return sum(sizes_mb.values())

@@ -18,6 +18,8 @@ from stages.export_simulator.reading import BehaviorAssets
 
 WARN_PAGE_MB = 25.0
 """Megabytes above which the report warns about the page: some mail programs and hosts refuse more."""
+WARN_MORE_MB = 5.0
+"""Megabytes that each animal but the first may add to the page before the report warns."""
 
 
 def write_simulator(
@@ -27,18 +29,18 @@ def write_simulator(
     config: Config,
     labels: Mapping[str, str],
     remark: str | None,
-) -> float:
-    """Write the page, the animated agent, the scene and the contract; return megabytes that a visitor loads.
+) -> dict[str, float]:
+    """Write page, animated agent, scene and contract; return megabytes that a visitor loads, by part.
 
     ``remark`` is what a visitor should know of the home beside what carries the animal.
     """
     about = contract(parts, behavior, config.name, labels, remark)
     room = glb.static(parts.scene, "scene")
-    size_mb = _write_page(folder, about, _room(parts, room) | _animal(parts, behavior), config.layout)
+    sizes_mb = _write_page(folder, about, _room(parts, room) | _animal(parts, behavior), config.layout)
     (folder / "agent.glb").write_bytes(glb.skinned(parts.agent, parts.skin, parts.actions))
     (folder / "scene.glb").write_bytes(room)
     (folder / "simulator.json").write_text(json.dumps(about, indent=1) + "\n")
-    return size_mb
+    return sizes_mb
 
 
 def write_home(
@@ -46,8 +48,8 @@ def write_home(
     animals: Mapping[str, tuple[SimulatorParts, BehaviorAssets]],
     config: Config,
     labels: Mapping[str, str],
-) -> float:
-    """Write the page of several animals, by name, in the room of the first; return megabytes to load.
+) -> dict[str, float]:
+    """Write the page of several animals, by name, in the room of the first; return megabytes by part.
 
     Assets and contract of each are those of its own page, and when clips begin in their sessions, so that all
     begin at one moment.
@@ -65,9 +67,9 @@ def write_home(
     assets = _room(first, glb.static(first.scene, "scene"))
     for name, (parts, behavior) in animals.items():
         assets |= {f"{name}-{key}": asset for key, asset in _animal(parts, behavior).items()}
-    size_mb = _write_page(folder, whole, assets, config.layout)
+    sizes_mb = _write_page(folder, whole, assets, config.layout)
     (folder / "simulator.json").write_text(json.dumps(whole, indent=1) + "\n")
-    return size_mb
+    return sizes_mb
 
 
 def _room(parts: SimulatorParts, room: bytes) -> dict[str, Asset]:
@@ -78,32 +80,48 @@ def _room(parts: SimulatorParts, room: bytes) -> dict[str, Asset]:
 def _animal(parts: SimulatorParts, behavior: BehaviorAssets) -> dict[str, Asset]:
     """Return the assets that are an animal's own."""
     return {
-        "agent": Asset(glb.skinned(parts.agent, parts.skin, []), 4),
-        "clips": Asset(page.clip_rows(parts.motions), 4),
-        "agent-splats": Asset(parts.agent_splats.rows, 32),
-        "agent-skin": Asset(parts.agent_splats.skin, 8),
-        "volume": Asset(behavior.features, 2),
-        **{name: Asset(values) for name, values in behavior.voxels.items()},
-        **{name: Asset(network, 4) for name, network in behavior.networks.items()},
+        "agent": Asset(glb.skinned(parts.agent, parts.skin, []), 4, "bodies"),
+        "clips": Asset(page.clip_rows(parts.motions), 4, "recorded motion"),
+        "agent-splats": Asset(parts.agent_splats.rows, 32, "bodies"),
+        "agent-skin": Asset(parts.agent_splats.skin, 8, "bodies"),
+        "volume": Asset(behavior.features, 2, "voxels"),
+        **{name: Asset(values, part="voxels") for name, values in behavior.voxels.items()},
+        **{name: Asset(network, 4, "networks") for name, network in behavior.networks.items()},
     }
 
 
-def _write_page(folder: Path, about: dict[str, Any], assets: dict[str, Asset], layout: Layout) -> float:
-    """Write the page and return its megabytes."""
+def _write_page(
+    folder: Path, about: dict[str, Any], assets: dict[str, Asset], layout: Layout
+) -> dict[str, float]:
+    """Write the page and return its megabytes by part."""
+    compressed = page.compressed(about, assets)
     match layout:
         case "file":
-            text, files = page.page(contract=about, assets=assets), {}
+            text, files = page.page(about, assets, compressed), {}
         case "folder":
-            text, files = page.light_page(contract=about, assets=assets)
+            text = page.light_page(about, assets, compressed)
+            files = {f"assets/{name}.gz": file for name, file in compressed.items()}
             (folder / "assets").mkdir()
         case _:
             assert_never(layout)
     for name, content in {"index.html": text.encode(), **files}.items():
         (folder / name).write_bytes(content)
-    return (len(text.encode()) + sum(map(len, files.values()))) / 1e6
+    whole_mb = (len(text.encode()) + sum(map(len, files.values()))) / 1e6
+    mb_per_byte, sizes_mb = whole_mb / sum(map(len, compressed.values())), {}
+    for name, file in compressed.items():
+        part = assets[name].part if name in assets else "program"
+        sizes_mb[part] = sizes_mb.get(part, 0.0) + mb_per_byte * len(file)
+    return sizes_mb
 
 
-def quality(parts: SimulatorParts, size_mb: float, supported: float | None) -> dict[str, Any]:
+def page_checks(sizes_mb: Mapping[str, float], animals: int = 1) -> list[Check]:
+    """Return checks of the megabytes of a page by part, from `write_simulator` or `write_home`."""
+    warn_mb = WARN_PAGE_MB + WARN_MORE_MB * (animals - 1)
+    whole = Check("size of the page", sum(sizes_mb.values()), "MB", warn=warn_mb, fail=2 * warn_mb)
+    return [whole, *(Check(f"of the page: {part}", size, "MB") for part, size in sizes_mb.items())]
+
+
+def quality(parts: SimulatorParts, sizes_mb: Mapping[str, float], supported: float | None) -> dict[str, Any]:
     """Return checks and pictures of the simulator for `qa.write`."""
     residual_mm = parts.residual_m * 1000
     carried = "recorded motion that the scene carries"
@@ -115,7 +133,7 @@ def quality(parts: SimulatorParts, size_mb: float, supported: float | None) -> d
         "good": "the page opens within seconds; the skin of `agent.glb` is within 2 mm of the reconstruction",
         "bad": "limbs of `agent.glb` that thin out at the joints, or a page too big to send",
         "checks": [
-            Check("size of the page", size_mb, "MB", warn=WARN_PAGE_MB, fail=2 * WARN_PAGE_MB),
+            *page_checks(sizes_mb),
             Check("skinning loss, mean", float(residual_mm.mean()), "mm", warn=2.0, fail=10.0),
             Check("skinning loss, 99th percentile", float(np.percentile(residual_mm, 99)), "mm", warn=10.0),
             Check("skinning loss, largest", float(residual_mm.max()), "mm", warn=15.0),

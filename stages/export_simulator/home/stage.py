@@ -11,9 +11,6 @@ from pipeline.data import ply, qa
 from stages.export_simulator import export, pictures, reading, surfaces, surroundings, writing
 from stages.export_simulator.home.config import Config
 
-WARN_MORE_MB = 10.0
-"""Megabytes that each animal but the first may add to the page before the report warns."""
-
 
 @dataclass(frozen=True)
 class Inputs:
@@ -52,17 +49,16 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
     setting = surfaces.extent(room, been)
     animals = {name: (replace(parts, setting=setting), assets) for name, (parts, assets) in animals.items()}
     labels = {video.id: Path(video.file).stem for video in videos}
-    size_mb = writing.write_home(out, animals, config, labels)
-    warn_mb = writing.WARN_PAGE_MB + WARN_MORE_MB * (len(animals) - 1)
+    sizes_mb = writing.write_home(out, animals, config, labels)
     sheets = {name: pictures.visits(room, setting.floor_m, places[name].motions) for name in animals}
     qa.write(
         out,
         good="the page opens within seconds and shows every animal in the same room",
         bad="an animal that floats or stands in a wall, or a page too big to send",
-        checks=[qa.Check("size of the page", size_mb, "MB", warn=warn_mb, fail=2 * warn_mb)],
+        checks=writing.page_checks(sizes_mb, len(animals)),
         pictures=[
             qa.Picture(f"visits_{name}", sheet, f"where {name} (amber) and the person (blue) have been")
             for name, sheet in sheets.items()
         ],
     )
-    return size_mb
+    return sum(sizes_mb.values())

@@ -1,6 +1,6 @@
 """Assembly of the page is robust to special characters in names and addresses."""
 
-from stages.export_simulator import page
+from stages.export_simulator import page, writing
 from tests.stages.export_simulator.test_support_twins import SOURCES, needs_node, run_node
 
 READ = f"""
@@ -26,9 +26,21 @@ console.log(JSON.stringify(keys.map(asked)));
 
 def test_markup_in_names_is_escaped():
     marks = "@@ASSETS@@ @@SCRIPT@@ @@NAME@@"
-    text = page.page(contract={"name": marks}, assets={"room": page.Asset(b"room")})
+    contract, assets = {"name": marks}, {"room": page.Asset(b"room")}
+    text = page.page(contract, assets, page.compressed(contract, assets))
     assert f"<h1>{marks}</h1>" in text
     assert text.count('id="asset-room"') == 1
+
+
+def test_page_of_two_animals_may_be_bigger():
+    sizes_mb = {"program": 6.0, "networks": 20.0}
+    assert [check.status for check in writing.page_checks(sizes_mb)] == ["warn", "ok", "ok"]
+    whole, *parts = writing.page_checks(sizes_mb, animals=2)
+    assert (whole.value, whole.warn, whole.status) == (26.0, 30.0, "ok")
+    assert [(check.name, check.value) for check in parts] == [
+        ("of the page: program", 6.0),
+        ("of the page: networks", 20.0),
+    ]
 
 
 @needs_node

@@ -1,6 +1,7 @@
 """The page of several animals: all are simulated, perceive each other as in Python, and react to input."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,12 @@ def test_contract_has_each_animal_and_one_room(home: Path, animals: Path) -> Non
     text = (home / "index.html").read_text()
     for asset, times in (("room", 1), ("splats", 1), ("cat-perception", 1), ("dog-agent", 1), ("agent", 0)):
         assert text.count(f'id="asset-{asset}"') == times, asset
+    whole, *parts = json.loads((home / "qa.json").read_bytes())["checks"]
+    assert whole["value"] == pytest.approx(len(text.encode()) / 1e6) and whole["warn"] == 30.0
+    assert whole["value"] == pytest.approx(sum(part["value"] for part in parts)) and len(parts) == 6
+    inside = {part["name"]: part["value"] for part in parts}
+    found = re.findall(r'id="asset-(?:cat|dog)-(?:goal|path|body|perception)"[^>]*>([^<]*)<', text)
+    assert inside["of the page: networks"] == pytest.approx(sum(map(len, found)) / 1e6, rel=1e-2)
 
 
 def test_animals_perceive_each_other_as_in_python(home: Path, animals: Path, chromium: Browser) -> None:
