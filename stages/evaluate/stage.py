@@ -9,6 +9,7 @@ from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import BehaviorData
 from pipeline.core import devices, progress
 from pipeline.data import qa
+from pipeline.metrics import bars
 from pipeline.metrics.metrics import Metrics
 from stages.evaluate import behavior, physical, speed
 from stages.evaluate.config import Config
@@ -19,6 +20,7 @@ LIMITS = (
     qa.Check("behavior/ats_minus_constant_velocity/goal_minde_m", None, "m", 0.0),
 )
 """Checks of the quality page, without values."""
+FOOT_SKATE = "behavior/ats/foot_slide_m_s"
 
 
 @dataclass(frozen=True)
@@ -46,8 +48,15 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
     metrics.write(out, "metrics.json")
     qa.write(
         out,
-        good="all simple baselines clearly worse",
+        good="all simple baselines clearly worse, feet that slide no more than in recorded motion",
         bad="a simple baseline as good as ours: the capture is too easy, or the model has learned nothing",
-        checks=metrics.judged(LIMITS),
+        checks=[*metrics.judged(LIMITS), *foot_skate(metrics)],
     )
     return metrics
+
+
+def foot_skate(metrics: Metrics) -> list[qa.Check]:
+    """Return the check of how fast feet slide in plans, by the bar of the report; none where not measured."""
+    row = next(row for row in bars.judge(metrics.values, {}) if row.bar.metric == FOOT_SKATE)
+    check = qa.Check(FOOT_SKATE, row.value, row.bar.unit, row.limit)
+    return [] if row.verdict == "none" else [check]

@@ -68,3 +68,12 @@ def test_plans_are_timed_on_the_cpu(monkeypatch: pytest.MonkeyPatch, tmp_path: P
         monkeypatch.setattr(owner, name, double)
     stage.run(stage.Inputs(*[tmp_path] * 4), Config(), tmp_path, device="cuda")
     assert asked == {"behavior": "cuda", "physical": "cuda", "speed": "cpu"}
+
+
+def test_feet_that_slide_more_than_in_recorded_motion_are_a_warning():
+    def check(planned, recorded):
+        values = {"behavior/ats/foot_slide_m_s": planned, "behavior/recorded/foot_slide_m_s": recorded}
+        return stage.foot_skate(Metrics(values))
+
+    assert [each.status for each in check(0.42, 0.21) + check(0.044, 0.030)] == ["warn", "ok"]
+    assert check(None, None) == [], "no window"
