@@ -5,6 +5,7 @@
 
 import base64
 import json
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -155,13 +156,16 @@ def read_chapter(
     total = sum(file.stat().st_size for file in files)
     shrink = max(1.0, total / _PICTURE_BYTES) ** 0.5
 
+    def named(caption: str) -> str:
+        return re.sub(r"\bv\d+\b", lambda v: labels.get(v[0], RecordingLabel()).name or v[0], caption)
+
     def blurred(file: str) -> bool:
         return safe and not any(fnmatch(Path(file).stem, name) for name in chapter.nobody_in)
 
     notes = []
     for video, qa in raw.items():
         pictures = [
-            _picture(folders[video] / entry["file"], entry["caption"], shrink, blurred(entry["file"]))
+            _picture(folders[video] / entry["file"], named(entry["caption"]), shrink, blurred(entry["file"]))
             for entry in qa["pictures"]
         ]
         label = labels.get(video or "", RecordingLabel())

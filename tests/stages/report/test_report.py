@@ -102,6 +102,15 @@ def test_every_note_is_shown_without_network_requests(tmp_path: Path) -> None:
     assert collect.label(VIDEOS[0], safe=True).name == "v000"
 
 
+def test_captions_name_recordings(tmp_path: Path) -> None:
+    picture = qa.Picture("view", np.zeros((24, 80, 3), np.uint8), "v001: picture, v9 of v0012")
+    qa.write(tmp_path, good="", bad="", pictures=[picture])
+    (chapter,) = [each for each in CHAPTERS if each.artifact == "reconstruction"]
+    labels = {"v001": collect.RecordingLabel("session-1.r3d")}
+    (note,) = collect.read_chapter(chapter, {None: tmp_path}, labels).notes
+    assert note.pictures[0].caption == "session-1.r3d: picture, v9 of v0012"
+
+
 def chapter_report(artifact_name: str, light: str, *stands_on: str) -> collect.ChapterReport:
     chapter = next(chapter for chapter in CHAPTERS if chapter.artifact == artifact_name)
     note = collect.Note(None, collect.RecordingLabel(), light, "", "", [], [])
