@@ -82,7 +82,6 @@ MODEL = TrainingConfig(
 """As in `agents/benchmark.toml`, without bodies and with fewer steps for paths. Of 500, 2000 and 5000 steps of goals,
 2000 have the least energy score in three homes chosen for this (0.796, 0.753 and 0.836 m)."""
 PERCEIVED = ("as it is", "standing still", "not at all")
-ROLLOUT_PERCEPTIONS = ("as it is", "not at all")
 GOALS, GOAL_STRIDE = 16, 20
 """Samples per window, and stride of the evaluated test windows."""
 ROLLOUT_FRAMES, ROLLOUT_STRIDE = 280, 3
@@ -150,9 +149,9 @@ class RecordedTakes:
         context, future = data.windows(selected)
         return cls(context, future.path_world, cat, np.stack(person))
 
-    def rollout(self, ats: Ats, *, aware: bool, seed: int) -> Float[np.ndarray, "take frame 3"]:
-        """Simulate the dog beside the recorded cat and person and return its path; it perceives the cat and keeps clear
-        of it only if ``aware``.
+    def rollout(self, ats: Ats, perception: str, seed: int) -> Float[np.ndarray, "take frame 3"]:
+        """Simulate the dog beside the recorded cat and person and return its path, with one of the perceptions
+        `PERCEIVED` of the cat; without any, it does not keep clear of the cat either.
         """
         scenes, own = ats.scenes, ats.sampler
         sampler = ForwardFacingSampler(own.networks, own.schedule, own.scaling)
@@ -165,15 +164,20 @@ class RecordedTakes:
             chaining=ReplanningConfig(),
         )
         dogs.clearance_m = clearance_of(DOG.size * rest())
-        cat = self.cat[:, None]
-        context = replace(self.context, companions=cat[:, :, :PAST] if aware else None)
+        context = replace(self.context, companions=self.cat_perceived(perception, 0))
         dogs.begin(context, np.random.default_rng(seed), companions=context.companions)
         found = []
         for frame in range(ROLLOUT_FRAMES):
-            past = slice(frame, frame + PAST)
-            now = dogs.step(self.person[:, frame + PAST - 1], cat[:, :, past] if aware else None)
+            now = dogs.step(self.person[:, frame + PAST - 1], self.cat_perceived(perception, frame))
             found.append(now.root[:, 0, :3, 3])
         return np.stack(found, axis=1)
+
+    def cat_perceived(self, perception: str, frame: int) -> Float[np.ndarray, "take 1 past 4"] | None:
+        """Return the past of the cat at a frame of the rollouts; None if it is not perceived at all."""
+        if perception == PERCEIVED[-1]:
+            return None
+        cat = self.cat[:, None, frame : frame + PAST]
+        return with_perception(replace(self.context, companions=cat), perception).companions
 
     def statistics(self, path: Float[np.ndarray, "take frame 3"]) -> dict[str, Float[np.ndarray, "take"]]:
         """Return the mean distance to the cat and the fractions of time in collision and of each activity, per take."""
@@ -292,18 +296,13 @@ def sampled_goals(out: Path, seed: int, scenes: Scenes, context: Context) -> dic
 def rollouts(out: Path, seed: int, scenes: Scenes, takes: RecordedTakes) -> dict[str, np.ndarray]:
     """Return rollouts of a model for each perception; cached."""
     path = out / f"lives-{seed}.npz"
-    if not path.is_file():
+    found = npz.load(path) if path.is_file() else {}
+    if missing := [perception for perception in PERCEIVED if perception not in found]:
         ats = Ats.load(train_model(out, seed), scenes, PlanSamplingConfig())
-        npz.save(
-            path,
-            compress=False,
-            **{
-                perception: takes.rollout(ats, aware=perception == ROLLOUT_PERCEPTIONS[0], seed=seed)
-                for perception in ROLLOUT_PERCEPTIONS
-            },
-        )
+        found |= {perception: takes.rollout(ats, perception, seed) for perception in missing}
+        npz.save(path, compress=False, **found)
         log(f"seed {seed}: rollouts finished")
-    return npz.load(path)
+    return found
 
 
 def over_seeds(values: Sequence[float], form: str = ".3f") -> str:
@@ -354,7 +353,7 @@ def main() -> None:
             over_seeds([goal_minde(each, future).mean() for each in of[perception]]),
             over_seeds(np.mean(energy[perception], 1)),
         )
-        difference = np.mean(energy[perception], 0) - np.mean(energy[ROLLOUT_PERCEPTIONS[0]], 0)
+        difference = np.mean(energy[perception], 0) - np.mean(energy[PERCEIVED[0]], 0)
         interval = bootstrapped(difference, episode, np.random.default_rng(0))
         print(
             f"| {perception} | {' | '.join(means)} | {interval.mean:.3f} [{interval.low:.3f}, {interval.high:.3f}] |"
@@ -362,17 +361,12 @@ def main() -> None:
     runs = [rollouts(arguments.out, seed, scenes, takes) for seed in arguments.life_seeds]
     print(
         "| beside the recorded cat | recorded dog | "
-        + " | ".join(f"perceived {perception}" for perception in ROLLOUT_PERCEPTIONS)
+        + " | ".join(f"perceived {perception}" for perception in PERCEIVED)
         + " |"
     )
-    found = {
-        perception: [takes.statistics(run[perception]) for run in runs] for perception in ROLLOUT_PERCEPTIONS
-    }
+    found = {perception: [takes.statistics(run[perception]) for run in runs] for perception in PERCEIVED}
     for name, value in takes.statistics(takes.path).items():
-        columns = [
-            over_seeds([each[name].mean() for each in found[perception]])
-            for perception in ROLLOUT_PERCEPTIONS
-        ]
+        columns = [over_seeds([each[name].mean() for each in found[perception]]) for perception in PERCEIVED]
         print(f"| {name} | {value.mean():.3f} | {' | '.join(columns)} |")
 
 
