@@ -1,6 +1,6 @@
 """Composite the built-in animal into a real RGB-D sequence, for `semi_real`.
 
-`Sequence` reads a 7-Scenes style folder; `surfaces` finds walkable surfaces; `course` samples a trajectory on which
+`Sequence` reads a recording with depth of any known format; `surfaces` finds walkable surfaces; `course` samples a trajectory on which
 the animal walks, rests, and enters and leaves the scene; `Compositor` renders each frame, with occlusion by the
 sequence's depth and with its measured noise and holes. World: that of the sequence, rotated so that +y is up, meters.
 """
@@ -12,24 +12,32 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numba import njit
 from scipy import ndimage
 
-from pipeline.data import images
+from pipeline.core.progress import log
 from pipeline.geometry import cameras, rigid
 from pipeline.mapping.icp import DepthImage, depth_image
-from pipeline.mapping.odometry import align_gravity
+from pipeline.mapping.odometry import align_gravity, chain_alignments, correct_drift
+from pipeline.recordings import errors, extraction
+from pipeline.recordings.extraction import ExtractionPlan
+from pipeline.recordings.formats import open_recording
+from pipeline.recordings.recording import Recording
 from stages.synthesize_capture import animal, gait, raster, shade
 from stages.synthesize_capture.session import STEP_S, AnimalCourse
 
-COLOR_FOCAL_PX, DEPTH_FOCAL_PX, BASELINE_M = 525.5, 585.0, 0.025
-"""Kinect v1 as measured on 7-Scenes: focal lengths of both cameras at 640 x 480, and the offset of the color camera
-to the right"""
 PROJECTOR_BASELINE_M = 0.075
 """Kinect v1: from infrared projector to infrared camera; surfaces in the projector's shadow have no depth"""
-MILLIMETERS = 1000
+NO_SHADOW = 1e-3
+"""share of pixels without depth beside a nearer surface below which a sensor has no projector shadow"""
 FARTHEST_M = 6.0
+PICTURE_SIDE_PX, VIEW_SIDE_PX = 640, 160
+"""longer sides to which pictures, and points for surfaces, are reduced"""
+EVERY_FRAME_HZ = 1000.0
+"""rate at which no frame of a recording is skipped"""
+MARGIN = 50 / 640
+"""the animal's target is at least this far inside the picture, share of its longer side"""
 CELL_M = 0.04
 ABSENT_M = 100.0
 """depth below the world at which an absent animal is placed"""
@@ -37,59 +45,96 @@ ABSENT_M = 100.0
 
 @dataclass(frozen=True)
 class Sequence:
-    """A raw 7-Scenes folder; its depth is reprojected into the color camera: one pinhole for both."""
+    """Frames of a recording in any format that the pipeline reads: upright, with one pinhole for all of them.
 
-    folder: Path
-    numbers: tuple[int, ...]
+    Its reader decides whether depth must be reprojected into the color camera.
+    """
+
+    recording: Recording
+    plan: ExtractionPlan
+    rows: tuple[int, ...]
+    """frames of the plan, in the order in which they are shown"""
+
+    @classmethod
+    def open(cls, path: Path, *, first: int = 0, last: int = 10**9, step: int = 1) -> "Sequence":
+        """Open the frames from number ``first`` to ``last``, every ``step``-th; a negative step reverses them.
+
+        Raises InputError CAP-001..011 for recordings without usable frames or depth.
+        """
+        recording = open_recording(path)
+        for remark in recording.remarks:
+            log(f"{recording.where}: {remark}")
+        plan = extraction.understand(
+            recording, rate_hz=EVERY_FRAME_HZ, max_depth_m=FARTHEST_M, max_side_px=PICTURE_SIDE_PX
+        )
+        log(extraction.summary(recording, plan))
+        number = recording.index[plan.chosen]
+        rows = np.flatnonzero((number >= first) & (number <= last))[::step]
+        if len(rows) < extraction.MIN_FRAMES:
+            why = f"{len(rows)} of {len(number)} between numbers {first} and {last} at a step of {step}"
+            raise errors.no_frames(recording.where, why)
+        return cls(recording, plan, tuple(rows.tolist()))
+
+    @property
+    def numbers(self) -> Int[np.ndarray, "frame"]:
+        """Return the frame numbers of the recording."""
+        return self.recording.index[self.plan.chosen[list(self.rows)]]
+
+    @property
+    def timestamp_s(self) -> Float[np.ndarray, "frame"]:
+        """Return seconds since the first frame shown, increasing."""
+        stored = self.plan.timestamp_s[list(self.rows)]
+        return np.abs(stored - stored[0])
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Return (height, width) of the pictures."""
+        return self._upright(self.plan.stored_size)
+
+    @property
+    def depth_size(self) -> tuple[int, int]:
+        """Return (height, width) of depth."""
+        return self.depth(0).shape
 
     @property
     def intrinsics(self) -> Float[np.ndarray, "3 3"]:
-        """Return the intrinsics shared by color and depth, pixels."""
-        return np.array([[COLOR_FOCAL_PX, 0, 320.0], [0, COLOR_FOCAL_PX, 240.0], [0, 0, 1]])
+        """Return the intrinsics of the pictures, pixels: the median over the frames."""
+        return np.median(self.plan.intrinsics[list(self.rows)], axis=0)
 
     def color(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
-        """Read a picture, RGB."""
-        return np.ascontiguousarray(images.read_color(self._path(index, "color.jpg")))
+        """Read a picture, RGB. Raises InputError CAP-001 if it is damaged."""
+        row = int(self.plan.chosen[self.rows[index]])
+        stored = extraction.picture(self.recording, row, self.plan.stored_size)
+        if stored is None:
+            raise errors.damaged(self.recording.where, f"frame {self.recording.index[row]} has no picture")
+        return np.ascontiguousarray(cameras.turn_image(stored, self.plan.quarter_turns))
 
-    def depth(self, index: int) -> Float[np.ndarray, "height width"]:
-        """Read depth, meters."""
-        raw = (
-            np.asarray(cv2.imread(str(self._path(index, "depth.png")), cv2.IMREAD_UNCHANGED), np.float32)
-            / MILLIMETERS
-        )
-        raw[raw > FARTHEST_M] = 0
-        return _reproject_depth(raw, DEPTH_FOCAL_PX, COLOR_FOCAL_PX, BASELINE_M)
+    def depth(self, index: int) -> Float[np.ndarray, "depth_height depth_width"]:
+        """Read depth, meters; 0 where it is unknown or of low confidence."""
+        number = int(self.recording.index[self.plan.chosen[self.rows[index]]])
+        depth = extraction.stored_depth(self.recording, number, FARTHEST_M)
+        if self.recording.read_confidence is not None:
+            depth = np.where(extraction.confidence_of(self.recording, number, depth) > 0, depth, 0)
+        return np.ascontiguousarray(cameras.turn_image(depth, self.plan.quarter_turns), np.float32)
 
     def poses(self) -> Float[np.ndarray, "frame 4 4"]:
-        """Read `world_from_camera`, rotated so that +y is up."""
-        given = np.stack([np.loadtxt(self._path(index, "pose.txt")) for index in range(len(self.numbers))])
-        given = given @ rigid.make(np.eye(3), np.array([BASELINE_M, 0, 0]))
-        return align_gravity(self.view, given)
+        """Return `world_from_camera` with +y up: the recording's poses, else odometry by aligned depth."""
+        if self.plan.odometry_from_camera is not None:
+            given = self.plan.odometry_from_camera[list(self.rows)]
+            return given if self.plan.gravity_known else align_gravity(self.view, given)
+        chained = chain_alignments(self.view, lambda _, last: last, len(self.rows))
+        found = correct_drift(self.view, self.timestamp_s, chained)
+        log(f"{self.recording.where}: no poses; depth is aligned, residual {1000 * found.residual_m:.1f} mm")
+        return align_gravity(self.view, found.world_from_camera)
 
     def view(self, index: int) -> DepthImage:
         """Return points and normals of a frame, camera axes."""
         depth = self.depth(index)
-        return depth_image(depth, self.intrinsics, depth > 0, 4)
+        intrinsics = cameras.scale_intrinsics(self.intrinsics, self.size, depth.shape)
+        return depth_image(depth, intrinsics, depth > 0, max(1, max(depth.shape) // VIEW_SIDE_PX))
 
-    def _path(self, index: int, kind: str) -> Path:
-        return self.folder / f"frame-{self.numbers[index]:06d}.{kind}"
-
-
-@njit(cache=True)
-def _reproject_depth(depth, depth_focal, color_focal, baseline_m):
-    """Reproject depth into a camera with another focal length, ``baseline_m`` to the right."""
-    height, width = depth.shape
-    out = np.zeros((height, width), np.float32)
-    for i in range(height):
-        for j in range(width):
-            z = depth[i, j]
-            if z > 0:
-                x = ((j + 0.5 - width / 2) / depth_focal * z - baseline_m) / z * color_focal + width / 2
-                y = (i + 0.5 - height / 2) / depth_focal * color_focal + height / 2
-                u, v = int(np.floor(x)), int(np.floor(y))
-                if 0 <= u < width and 0 <= v < height and (out[v, u] == 0 or z < out[v, u]):
-                    out[v, u] = z
-    return out
+    def _upright(self, size: tuple[int, int]) -> tuple[int, int]:
+        return size if self.plan.quarter_turns % 2 == 0 else (size[1], size[0])
 
 
 @dataclass(frozen=True)
@@ -99,7 +144,7 @@ class Noise:
     coefficients: Float[np.ndarray, "3"]
     """Standard deviation of depth in meters as a polynomial of z in meters, constant last."""
     shadow_side: int
-    """Side of a nearer surface on which depth is missing (projector shadow): -1 left, 1 right."""
+    """Side of a nearer surface on which depth is missing (projector shadow): -1 left, 1 right, 0 neither."""
     color: float
     """Standard deviation of the color noise, 0..255."""
 
@@ -133,7 +178,8 @@ def measure_noise(sequence: Sequence, frames: int = 12) -> Noise:
         if len(middle) > 3
         else np.array([0.0015, 0, 0.001])
     )
-    return Noise(coefficients, -1 if sides[0] > sides[1] else 1, max(float(np.median(grain)), 1.0))
+    side = 0 if sides.max() < NO_SHADOW * frames * depth.size else -1 if sides[0] > sides[1] else 1
+    return Noise(coefficients, side, max(float(np.median(grain)), 1.0))
 
 
 @dataclass(frozen=True)
@@ -158,9 +204,10 @@ class Surface:
         return bool(self.free[at[:, 0], at[:, 1]].all())
 
 
-def surfaces(sequence: Sequence, world_from_camera: np.ndarray, every: int = 8) -> list[Surface]:
+def surfaces(sequence: Sequence, world_from_camera: np.ndarray) -> list[Surface]:
     """Find horizontal surfaces with free space for an animal, largest first."""
     points, up = [], []
+    every = int(np.clip(len(sequence.numbers) // 3, 1, 8))
     for index in range(0, len(sequence.numbers), every):
         view = sequence.view(index)
         seen = view.points[..., 2] > 0
@@ -227,13 +274,16 @@ def course(
 
 def _walk(sequence, world_from_camera, frame, walkable, count, rng):
     """Walk and rest for ``count`` steps within view of a frame, climbing over the edge at the start and the end."""
-    for _ in range(40):
+    height, width = sequence.size
+    middle, margin = np.array([width, height]) / 2, MARGIN * max(width, height)
+    for _ in range(40 if walkable else 0):
         surface = walkable[min(int(rng.exponential(0.8)), len(walkable) - 1)]
         cells = surface.points()
         pixel, z = cameras.project(rigid.apply(rigid.inverse(world_from_camera), cells), sequence.intrinsics)
-        inside = (np.abs(np.asarray(pixel) - [320, 240]) < [270, 190]).all(1) & (z > 0.7) & (z < 3.5)
-        at = np.clip(np.asarray(pixel).astype(int), 0, [639, 479])
-        measured = sequence.depth(frame)[at[:, 1], at[:, 0]]
+        inside = (np.abs(np.asarray(pixel) - middle) < middle - margin).all(1) & (z > 0.7) & (z < 3.5)
+        measured = resampled(sequence.depth(frame), sequence.size)
+        at = np.clip(np.asarray(pixel).astype(int), 0, [width - 1, height - 1])
+        measured = measured[at[:, 1], at[:, 0]]
         seen = cells[inside & (measured > z - 0.08)]
         if len(seen) >= 4:
             break
@@ -280,7 +330,7 @@ _EMPTY = shade.Backdrop(
 
 @dataclass(frozen=True)
 class Composite:
-    """One frame with the animal, and its ground truth."""
+    """One frame with the animal, all of the picture's size, and its ground truth."""
 
     color: UInt8[np.ndarray, "height width 3"]
     depth: Float[np.ndarray, "height width"]
@@ -305,7 +355,8 @@ class Compositor:
         )
         turned = np.concatenate([turned, turned[-1:]])
         for index, visible in enumerate(present):
-            color, depth = self.sequence.color(index), self.sequence.depth(index)
+            color = self.sequence.color(index)
+            depth = resampled(self.sequence.depth(index), color.shape[:2])
             if visible:
                 blur = 0.15 * self.sequence.intrinsics[0, 0] * np.array([-turned[index, 1], turned[index, 0]])
                 yield self._draw(color, depth, world_from_camera[index], motion, index, blur)
@@ -384,6 +435,12 @@ class Compositor:
         lost = (own > 0) & (slant > 0.03) & (bend[..., 0] > 0.8)
         out = np.where(own > 0, np.where(lost, 0, own), np.where(shadow, 0, room))
         return out.astype(np.float32)
+
+
+def resampled(depth: np.ndarray, size: tuple[int, int]) -> Float[np.ndarray, "height width"]:
+    """Resize depth to a (height, width) by nearest neighbor."""
+    same = depth.shape == size
+    return depth if same else cv2.resize(depth, size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
 
 
 @lru_cache(maxsize=1)

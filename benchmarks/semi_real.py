@@ -1,10 +1,11 @@
 """Evaluate masks and registration on semi-synthetic recordings: the built-in animal rendered into a real RGB-D
 sequence, with exact ground truth.
 
-Each recording is a 7-Scenes style folder that `extract_frames` reads, with the ground truth in a separate folder. The
-animal enters and leaves the scene; many frames show none.
+The sequence is a recording with depth in any format that `extract_frames` reads. Poses are those of the recording, else
+its depth is aligned from frame to frame. Each drawn recording is a 7-Scenes style folder at 30 Hz, with the ground truth
+in a separate folder. The animal enters and leaves the scene; many frames show none.
 
-    python -m benchmarks.semi_real draw SEQUENCE OUT --seeds 1 2 [--first 500 --step 3]
+    python -m benchmarks.semi_real draw RECORDING OUT --seeds 1 2 [--first 500 --step 3]
     python -m benchmarks.semi_real score OUT [--masks masks]
 
 For a whole build, the walk-through is another part of the sequence without the animal, and the turnaround is that of
@@ -23,7 +24,6 @@ With `--structure` cameras are also compared with structure from motion on the c
 
 import argparse
 import json
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,7 +32,8 @@ import numpy as np
 from jaxtyping import Float, Integer
 
 from benchmarks import structure
-from benchmarks.composited import Compositor, Sequence, course, measure_noise, surfaces
+from benchmarks.composited import Compositor, Sequence, course, measure_noise, resampled, surfaces
+from pipeline.core.errors import InputError, exit_code
 from pipeline.core.progress import log
 from pipeline.core.videos import Video
 from pipeline.core.videos import read as read_videos
@@ -41,13 +42,12 @@ from pipeline.data.poses import RegisteredPoses
 from pipeline.data.templates import AgentCameras, SceneCameras
 from pipeline.geometry import rigid
 from pipeline.metrics.pose_errors import constant_between, joined, pose_errors
+from pipeline.recordings.seven_scenes import KINECT_DEPTH, RATE_HZ, SAME_LENS_PX
 from stages.evaluate.registration import FLIPPED_DEG
 from stages.synthesize_capture import animal, gait
 
 MIN_VISIBLE = 0.001
 """Fraction of a picture above which the animal counts as visible."""
-RATE_HZ = 30.0
-"""rate of the frame numbers in 7-Scenes folders"""
 
 
 @dataclass(frozen=True)
@@ -66,11 +66,19 @@ def draw(sequence: Sequence, out: Path, name: str, seed: int, render: RenderConf
     """Render one recording and write its ground truth."""
     rng = np.random.default_rng([seed, 41])
     poses = sequence.poses()
-    timestamp_s = np.abs(np.array(sequence.numbers) - sequence.numbers[0]) / RATE_HZ
+    ticks = np.round(sequence.timestamp_s * RATE_HZ).astype(int)
+    if (np.diff(ticks) < 1).any():
+        what = f"frames follow each other faster than the {RATE_HZ:g} Hz of the drawn recording"
+        raise InputError("CAP-007", what, sequence.recording.where, "take every second one, with --step 2")
+    timestamp_s = ticks / RATE_HZ
     noise = measure_noise(sequence)
     walkable = surfaces(sequence, poses)
     log(f"{name}: noise {noise}, surfaces {[(round(s.height_m, 2), int(s.free.sum())) for s in walkable]}")
     trajectory, present = course(sequence, poses, timestamp_s, walkable, rng)
+    if not (render.empty or present.any()):
+        what = "no frame shows level ground with room for the animal 0.7 to 3.5 m away"
+        remedy = "choose other frames with --first, --last and --step, or a recording that shows the floor"
+        raise InputError("CAP-007", what, sequence.recording.where, remedy)
     present = present & (not render.empty)
     motion = gait.poses(trajectory, timestamp_s)
     creature = animal.grow(np.random.default_rng([seed if render.coat is None else render.coat, 2]))
@@ -78,18 +86,22 @@ def draw(sequence: Sequence, out: Path, name: str, seed: int, render: RenderConf
     folder.mkdir(parents=True)
     (out / "truth").mkdir(exist_ok=True)
     np.savetxt(folder / "camera-intrinsics.txt", sequence.intrinsics)
+    given = sequence.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]]
+    if np.abs(given - KINECT_DEPTH).max() < SAME_LENS_PX:
+        np.savetxt(folder / "depth_from_color.txt", np.eye(4))  # else its reader may take depth for raw
+    depth_size = sequence.depth_size if max(sequence.depth_size) < max(sequence.size) else sequence.size
     masks = []
     for index, frame in enumerate(Compositor(sequence, creature, noise, rng).frames(poses, motion, present)):
-        base = folder / f"frame-{round(timestamp_s[index] * RATE_HZ):06d}"
+        base = folder / f"frame-{ticks[index]:06d}"
         cv2.imwrite(f"{base}.color.jpg", frame.color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
-        cv2.imwrite(f"{base}.depth.png", np.round(frame.depth * 1000).astype(np.uint16))
+        cv2.imwrite(f"{base}.depth.png", np.round(resampled(frame.depth, depth_size) * 1000).astype(np.uint16))
         if render.poses:
             np.savetxt(f"{base}.pose.txt", poses[index])
         masks.append(frame.mask)
     packed = np.packbits(np.stack(masks), axis=-1)
     npz.save(
         out / "truth" / f"{name}.npz", compress=True, timestamp_s=timestamp_s, packed=packed,
-        source_index=np.round(timestamp_s * RATE_HZ).astype(int),
+        source_index=ticks,
         shape=np.array([len(masks), *masks[0].shape]), world_from_camera=poses, number=sequence.numbers,
         world_from_agent=motion.world_from_agent, there=present,
     )  # fmt: skip
@@ -218,18 +230,18 @@ def _p95(values: np.ndarray) -> float:
     return float(np.percentile(np.nan_to_num(values, nan=np.inf), 95))
 
 
-def main() -> None:
-    """Parse the command line."""
+def main() -> int:
+    """Parse the command line and run; return the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True)
     draw_parser = commands.add_parser("draw")
-    draw_parser.add_argument("sequence", type=Path)
+    draw_parser.add_argument("sequence", type=Path, help="a recording with depth")
     draw_parser.add_argument("out", type=Path)
     draw_parser.add_argument("--seeds", type=int, nargs="+", default=[1])
-    draw_parser.add_argument("--first", type=int, default=0)
-    draw_parser.add_argument("--last", type=int, default=10**6)
+    draw_parser.add_argument("--first", type=int, default=0, help="frame number")
+    draw_parser.add_argument("--last", type=int, default=10**9, help="frame number")
     draw_parser.add_argument(
         "--step", type=int, default=3, help="stride of frames; negative: in reverse order"
     )
@@ -253,12 +265,10 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     if arguments.command == "draw":
-        known = sorted(
-            int(re.findall(r"\d+", p.name)[0]) for p in arguments.sequence.glob("frame-*.depth.png")
-        )
-        numbers = [n for n in known if arguments.first <= n <= arguments.last][:: arguments.step]
         render = RenderConfig(arguments.coat, arguments.empty, not arguments.no_poses)
-        sequence = Sequence(arguments.sequence, tuple(numbers))
+        sequence = Sequence.open(
+            arguments.sequence, first=arguments.first, last=arguments.last, step=arguments.step
+        )
         for seed in arguments.seeds:
             draw(
                 sequence, arguments.out, "walkthrough" if arguments.empty else f"session-{seed}", seed, render
@@ -274,7 +284,8 @@ def main() -> None:
             truth = read_truth(arguments.out / "truth" / f"{folder.name}.npz", index)
             labels = np.stack([images.read_gray(p) for p in sorted(folder.glob("*.png"))])
             print(folder.name, json.dumps({k: round(v, 4) for k, v in mask_metrics(labels, truth).items()}))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(exit_code(main))

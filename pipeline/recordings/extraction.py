@@ -240,7 +240,7 @@ def frames(
             continue
         color = _decoded(stored, recording.color_size, f"{recording.where}, frame {number}")
         depth = stored_depth(recording, int(number), max_depth_m)
-        confidence = _confidence(recording, int(number), depth)
+        confidence = confidence_of(recording, int(number), depth)
         if color.shape[:2] != plan.stored_size:
             color = cv2.resize(color, plan.stored_size[::-1], interpolation=cv2.INTER_AREA)
         if plan.quarter_turns:
@@ -316,8 +316,10 @@ def _decoded(stored: Picture, size: tuple[int, int], where: str) -> UInt8[np.nda
     return color
 
 
-def _confidence(recording: Recording, number: int, depth: np.ndarray) -> UInt8[np.ndarray, "height width"]:
-    """Return the confidence of depth: 2 if the recording has none, 0 if only this frame lacks it."""
+def confidence_of(
+    recording: Recording, number: int, depth: Float[np.ndarray, "height width"]
+) -> UInt8[np.ndarray, "height width"]:
+    """Return the confidence of a frame's `stored_depth`, 0 to 2: 2 if the recording has none, 0 if only this frame lacks it."""
     if recording.read_confidence is None:
         return np.where(depth > 0, 2, 0).astype(np.uint8)
     confidence = recording.read_confidence(number)

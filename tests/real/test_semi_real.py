@@ -15,7 +15,7 @@ def drawn(tmp_path_factory):
     if not SCENE.exists():
         pytest.skip(f"no real kitchen at {SCENE} (set ATS_REALDATA)")
     out = tmp_path_factory.mktemp("semi_real")
-    sequence = Sequence(SCENE, tuple(range(500, 1000, 10))[1::2])
+    sequence = Sequence.open(SCENE, first=500)
     semi_real.draw(sequence, out, "session-1", seed=1)
     return sequence, out
 
