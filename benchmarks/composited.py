@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numba import njit
 from scipy import ndimage
 
+from pipeline.core.errors import InputError
 from pipeline.core.progress import log
 from pipeline.geometry import cameras, rigid
 from pipeline.mapping.icp import DepthImage, depth_image
@@ -71,8 +72,8 @@ class Sequence:
         number = recording.index[plan.chosen]
         rows = np.flatnonzero((number >= first) & (number <= last))[::step]
         if len(rows) < extraction.MIN_FRAMES:
-            why = f"{len(rows)} of {len(number)} between numbers {first} and {last} at a step of {step}"
-            raise errors.no_frames(recording.where, why)
+            what = f"{len(rows)} of {len(number)} frames are left, at least {extraction.MIN_FRAMES} are needed"
+            raise InputError("CAP-007", what, recording.where, "choose other --first, --last and --step")
         return cls(recording, plan, tuple(rows.tolist()))
 
     @property

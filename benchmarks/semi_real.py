@@ -19,7 +19,8 @@ the built-in capture with the same coat; sessions have no poses, so that registr
         --structure SEQUENCE
 
 With `--structure` cameras are also compared with structure from motion on the color pictures of the sequence
-(`benchmarks.structure`), aligned to the world of the build by a similarity on the cameras of the walk-through.
+(`benchmarks.structure`), aligned to the world of the build by a similarity on the cameras of the walk-through; the
+calibration of their confidence is then measured against that, else against the poses of the sequence.
 """
 
 import argparse
@@ -29,7 +30,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Integer
+from jaxtyping import Bool, Float, Integer
 
 from benchmarks import structure
 from benchmarks.composited import Compositor, Sequence, course, measure_noise, resampled, surfaces
@@ -43,11 +44,14 @@ from pipeline.data.templates import AgentCameras, SceneCameras
 from pipeline.geometry import rigid
 from pipeline.metrics.pose_errors import constant_between, joined, pose_errors
 from pipeline.recordings.seven_scenes import KINECT_DEPTH, RATE_HZ, SAME_LENS_PX
-from stages.evaluate.registration import FLIPPED_DEG
+from stages.evaluate.registration import FLIPPED_DEG, is_right
+from stages.evaluate.reliability import BINS, reliability_curve, reliability_metrics
 from stages.synthesize_capture import animal, gait
 
 MIN_VISIBLE = 0.001
 """Fraction of a picture above which the animal counts as visible."""
+RIGHT_CAMERA, RIGHT_ROOT = (5.0, 0.05), (20.0, 0.1)
+"""degrees and meters within which a pose is right, when the calibration of its confidence is measured"""
 
 
 @dataclass(frozen=True)
@@ -76,8 +80,8 @@ def draw(sequence: Sequence, out: Path, name: str, seed: int, render: RenderConf
     log(f"{name}: noise {noise}, surfaces {[(round(s.height_m, 2), int(s.free.sum())) for s in walkable]}")
     trajectory, present = course(sequence, poses, timestamp_s, walkable, rng)
     if not (render.empty or present.any()):
-        what = "no frame shows level ground with room for the animal 0.7 to 3.5 m away"
-        remedy = "choose other frames with --first, --last and --step, or a recording that shows the floor"
+        what = "the animal is in no frame: it needs level ground in view, 0.7 to 3.5 m away, for some seconds"
+        remedy = "choose other --seeds or frames (--first, --last), or a recording that shows the floor"
         raise InputError("CAP-007", what, sequence.recording.where, remedy)
     present = present & (not render.empty)
     motion = gait.poses(trajectory, timestamp_s)
@@ -143,7 +147,8 @@ def registration_metrics(
     poses of the sequence, with which it was rendered, are no ground truth of the room (the scale of KinectFusion may
     differ from that of the sensor by several percent), but its pose relative to the camera is exact. `root_placed`
     is the fraction of these frames with a root, `root_where_empty` that of frames without the animal. With
-    ``sequence`` cameras are also compared with structure from motion on its pictures. Meters and degrees.
+    ``sequence`` cameras are also compared with structure from motion on its pictures. Meters and degrees. `calibration`
+    of cameras is measured against structure from motion if given, of roots where there are any.
     """
     videos = {Path(v.file).stem: v for v in read_videos(build / "plan" / "videos.json")}
     walk = _rows(build, videos["walkthrough"], npz.load(truth / "walkthrough.npz"))
@@ -157,6 +162,7 @@ def registration_metrics(
         AgentCameras.open(build / "agent_template").agent_from_registered, true_agent_from_camera
     )
     cameras, roots, empty, cameras_by_session = [], [], [], {}
+    camera_sure, root_sure = [], []
     for name, video in videos.items():
         if video.role != "session":
             continue
@@ -171,15 +177,17 @@ def registration_metrics(
         own_roots = rigid.inverse(poses.world_from_camera) @ poses.world_from_agent
         share = np.unpackbits(table["packed"], axis=-1, count=int(table["shape"][2])).mean((1, 2))
         roots.append(pose_errors(own_roots, true_roots)[share > MIN_VISIBLE])
+        camera_sure.append(poses.confidence), root_sure.append(poses.agent_confidence[share > MIN_VISIBLE])
         empty.append(np.isfinite(poses.world_from_agent[share == 0, 0, 3]))
     camera, root = joined(cameras), joined(roots)
     placed = np.isfinite(root.meters)
-    structure_metrics = (
-        {}
-        if sequence is None
-        else _structure_metrics(NumberedCameras(ours, walk["number"]), cameras_by_session, sequence, truth)
-    )
-    return structure_metrics | {
+    found = calibration("root", np.concatenate(root_sure)[placed], is_right(root[placed], RIGHT_ROOT))
+    if sequence is not None:
+        walked = NumberedCameras(ours, walk["number"])
+        found |= _structure_metrics(walked, cameras_by_session, sequence, truth, camera_sure)
+    else:
+        found |= calibration("camera", np.concatenate(camera_sure), is_right(camera, RIGHT_CAMERA))
+    return found | {
         "frames": len(camera.meters), "camera_deg_median": float(np.median(camera.degrees)),
         "camera_m_median": float(np.median(camera.meters)), "camera_deg_p95": _p95(camera.degrees),
         "camera_m_p95": _p95(camera.meters), "root_frames": len(placed), "root_placed": float(placed.mean()),
@@ -197,23 +205,49 @@ class NumberedCameras:
     world_from_camera: Float[np.ndarray, "frame 4 4"]
     number: Integer[np.ndarray, "frame"]
 
+    def rows(self, known: dict[int, np.ndarray]) -> list[int]:
+        """Return the frames that the reference contains."""
+        return [row for row, number in enumerate(self.number.tolist()) if number in known]
+
     def matched(self, known: dict[int, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return the cameras that the reference contains, and those of the reference."""
-        rows = [row for row, number in enumerate(self.number.tolist()) if number in known]
+        rows = self.rows(known)
         return self.world_from_camera[rows], np.stack([known[int(self.number[row])] for row in rows])
 
 
-def _structure_metrics(
-    walk: NumberedCameras, sessions: dict[str, NumberedCameras], sequence: Path, out: Path
+def calibration(
+    name: str, confidence: Float[np.ndarray, "frame"], right: Bool[np.ndarray, "frame"]
 ) -> dict[str, float]:
-    """Compare cameras with structure from motion, which is cached in ``out``."""
+    """Return the share that was right, mean confidence, expected calibration error, and the reliability curve: frames,
+    mean confidence and share right of every bin of confidence that has frames (0..1).
+    """
+    values = reliability_metrics(name, confidence, right).values
+    found = {key.replace("/", "_"): np.nan if value is None else value for key, value in values.items()}
+    found[f"{name}_right"] = float(right.mean()) if len(right) else np.nan
+    curve = np.stack(reliability_curve(confidence, right), axis=1)
+    for row, (sure, share, count) in enumerate(curve.tolist()):
+        key = f"{name}_confidence_from_{row / BINS:.1f}"
+        found |= {f"{key}_frames": count, f"{key}_mean": sure, f"{key}_right": share} if count else {}
+    return found
+
+
+def _structure_metrics(
+    walk: NumberedCameras,
+    sessions: dict[str, NumberedCameras],
+    sequence: Path,
+    out: Path,
+    confidence: list[Float[np.ndarray, "frame"]],
+) -> dict[str, float]:
+    """Compare cameras and their ``confidence`` by session with structure from motion, which is cached in ``out``."""
     frames = np.unique(np.concatenate([walk.number, *(each.number for each in sessions.values())])).tolist()
     known = structure.cameras(sequence, frames, out / "structure")
     pairs = {name: each.matched(known) for name, each in {"walk": walk, **sessions}.items()}
     errors = {name: pose_errors(ours, structure.in_world(*pairs["walk"], other))
               for name, (ours, other) in pairs.items()}  # fmt: skip
     found = {"walk": errors.pop("walk"), "camera": joined(list(errors.values()))}
-    return {f"structure_{name}_{key}": value for name, each in found.items()
+    sure = np.concatenate([c[each.rows(known)] for c, each in zip(confidence, sessions.values(), strict=True)])
+    calibrated = calibration("camera", sure, is_right(found["camera"], RIGHT_CAMERA))
+    return calibrated | {f"structure_{name}_{key}": value for name, each in found.items()
             for key, value in (("frames", len(each.meters)), ("deg_median", float(np.median(each.degrees))),
                                ("m_median", float(np.median(each.meters))), ("deg_p95", _p95(each.degrees)),
                                ("m_p95", _p95(each.meters)))}  # fmt: skip

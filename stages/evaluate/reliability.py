@@ -18,14 +18,9 @@ def reliability_metrics(
 
     Frames without a probability are ignored.
     """
-    metrics, known = Metrics(), np.isfinite(probability)
-    probability, right = probability[known], right[known]
-    index = np.clip((probability * BINS).astype(int), 0, BINS - 1)
-    count = np.bincount(index, minlength=BINS)
-    confidence, accuracy = (
-        np.bincount(index, each, BINS) / np.maximum(count, 1) for each in (probability, right)
-    )
-    metrics.put(f"{name}/confidence_mean", mean(probability))
+    metrics = Metrics()
+    confidence, accuracy, count = reliability_curve(probability, right)
+    metrics.put(f"{name}/confidence_mean", mean(probability[np.isfinite(probability)]))
     error = float((count * np.abs(confidence - accuracy)).sum() / count.sum()) if count.sum() else np.nan
     metrics.put(f"{name}/calibration_error", error)
     if count.sum():
@@ -34,6 +29,23 @@ def reliability_metrics(
         )
         metrics.charts[caption] = _chart(confidence, accuracy, count)
     return metrics
+
+
+def reliability_curve(
+    probability: Float[np.ndarray, "frame"], right: Bool[np.ndarray, "frame"]
+) -> tuple[Float[np.ndarray, "bin"], Float[np.ndarray, "bin"], Int[np.ndarray, "bin"]]:
+    """Return mean confidence, share that was right (both 0..1, 0 without frames) and frames of ten bins.
+
+    Frames without a probability are ignored.
+    """
+    known = np.isfinite(probability)
+    probability, right = probability[known], right[known]
+    index = np.clip((probability * BINS).astype(int), 0, BINS - 1)
+    count = np.bincount(index, minlength=BINS)
+    confidence, accuracy = (
+        np.bincount(index, each, BINS) / np.maximum(count, 1) for each in (probability, right)
+    )
+    return confidence, accuracy, count
 
 
 def _chart(
