@@ -72,7 +72,9 @@ class Sequence:
         number = recording.index[plan.chosen]
         rows = np.flatnonzero((number >= first) & (number <= last))[::step]
         if len(rows) < extraction.MIN_FRAMES:
-            what = f"{len(rows)} of {len(number)} frames are left, at least {extraction.MIN_FRAMES} are needed"
+            what = (
+                f"{len(rows)} of {len(number)} frames are left, at least {extraction.MIN_FRAMES} are needed"
+            )
             raise InputError("CAP-007", what, recording.where, "choose other --first, --last and --step")
         return cls(recording, plan, tuple(rows.tolist()))
 

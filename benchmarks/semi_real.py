@@ -98,7 +98,9 @@ def draw(sequence: Sequence, out: Path, name: str, seed: int, render: RenderConf
     for index, frame in enumerate(Compositor(sequence, creature, noise, rng).frames(poses, motion, present)):
         base = folder / f"frame-{ticks[index]:06d}"
         cv2.imwrite(f"{base}.color.jpg", frame.color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
-        cv2.imwrite(f"{base}.depth.png", np.round(resampled(frame.depth, depth_size) * 1000).astype(np.uint16))
+        cv2.imwrite(
+            f"{base}.depth.png", np.round(resampled(frame.depth, depth_size) * 1000).astype(np.uint16)
+        )
         if render.poses:
             np.savetxt(f"{base}.pose.txt", poses[index])
         masks.append(frame.mask)
@@ -245,7 +247,9 @@ def _structure_metrics(
     errors = {name: pose_errors(ours, structure.in_world(*pairs["walk"], other))
               for name, (ours, other) in pairs.items()}  # fmt: skip
     found = {"walk": errors.pop("walk"), "camera": joined(list(errors.values()))}
-    sure = np.concatenate([c[each.rows(known)] for c, each in zip(confidence, sessions.values(), strict=True)])
+    sure = np.concatenate(
+        [c[each.rows(known)] for c, each in zip(confidence, sessions.values(), strict=True)]
+    )
     calibrated = calibration("camera", sure, is_right(found["camera"], RIGHT_CAMERA))
     return calibrated | {f"structure_{name}_{key}": value for name, each in found.items()
             for key, value in (("frames", len(each.meters)), ("deg_median", float(np.median(each.degrees))),

@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks.real import davis, flow, masks
 from pipeline.data.clips import Clip
+from pipeline.data.flow import STRIDE_PX, writer
 
 SIZE = (60, 107)
 SHIFT_PX = 3
@@ -87,3 +88,22 @@ def test_iou():
     assert masks.iou(half, np.ones((4, 4), bool)) == 0.5
     assert masks.iou(half, ~half) == 0.0
     assert masks.iou(half & ~half, half & ~half) == 1.0
+
+
+def test_grabcut_follows_a_box_along_the_flow(sequence, tmp_path):
+    pictures = sequence / "JPEGImages/480p/cows"
+    for path in sorted(pictures.glob("*.jpg")):
+        color = np.full((*SIZE, 3), 200, np.uint8)
+        color[cv2.imread(str(sequence / "Annotations/480p/cows" / f"{path.stem}.png"), 0) > 0] = 40
+        cv2.imwrite(str(path), color, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    (davis_sequence,) = davis.animals(sequence).values()
+    clip = Clip.open(davis.frames(davis_sequence, tmp_path / "frames"))
+    cells = (-(-SIZE[0] // STRIDE_PX), -(-SIZE[1] // STRIDE_PX))
+    (tmp_path / "flow").mkdir()
+    with writer(tmp_path / "flow", 1, len(clip) - 1, cells) as table:
+        for _ in range(len(clip) - 1):
+            moved = np.tile(np.array([SHIFT_PX, 0], np.float16), (*cells, 1))
+            table.append(flow=moved, confidence=np.full(cells, 255, np.uint8))
+    found = masks.grabcut_masks(clip, tmp_path / "flow", masks.box_of(davis_sequence.mask(0)))
+    assert len(found) == len(clip)
+    assert min(masks.iou(each, davis_sequence.mask(frame)) for frame, each in enumerate(found)) > 0.8

@@ -5,9 +5,21 @@ import pytest
 
 from benchmarks import semi_real
 from benchmarks.composited import Sequence
+from pipeline.core.errors import InputError
 from pipeline.data import npz
+from pipeline.data.clips import Masks, read_source_index
 from pipeline.recordings.formats import open_recording
+from stages.estimate_flow import stage as flowing
+from stages.estimate_flow.config import Config as FlowConfig
+from stages.extract_frames import stage as extracting
+from stages.extract_frames.config import Config as FramesConfig
+from stages.segment_agent import stage as segmenting
+from stages.segment_agent.config import Config, LearningConfig
+from tests.pipeline.recordings import made_formats
 from tests.real.seven_scenes import SCENE
+from tests.stages.extract_frames.made_recordings import walk
+
+LEARNED_FAST = Config(learning=LearningConfig(batch=3))
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +56,24 @@ def test_animal_changes_color_and_depth_only_in_its_mask(drawn):
         )
 
 
+def test_masks_find_the_animal_and_only_it(drawn, tmp_path):
+    sequence, out = drawn
+    frames, flow, masks = (tmp_path / name for name in ("frames", "flow", "masks"))
+    for folder in (frames, flow, masks):
+        folder.mkdir()
+    extracting.run(extracting.Inputs(out / "recordings" / "session-1"), FramesConfig(), frames)
+    flowing.run(flowing.Inputs(frames), FlowConfig(), flow)
+    segmenting.run(segmenting.Inputs(frames, flow), LEARNED_FAST, masks)
+    found = Masks.open(masks)
+    labels = np.stack([found[frame] for frame in range(len(sequence.numbers))])
+    truth = semi_real.read_truth(out / "truth" / "session-1.npz", read_source_index(frames))
+    metrics = semi_real.mask_metrics(labels, truth)
+    assert metrics["frames_without"] >= 10 and metrics["frames_with"] >= 10
+    assert metrics["false_frames"] == 0
+    assert metrics["iou_mean"] > 0.5, "frames in which it is missed count as 0"
+    assert metrics["precision"] > 0.85
+
+
 def test_mask_metrics_have_known_values():
     truth = np.zeros((4, 10, 10), bool)
     truth[:2, 2:6, 2:6] = True
@@ -68,3 +98,33 @@ def test_truth_is_found_by_frame_number(tmp_path):
         source_index=np.array([0, 3, 6]),
     )
     assert semi_real.read_truth(tmp_path / "t.npz", np.array([3, 6])).any((1, 2)).tolist() == [True, False]
+
+
+def test_phone_recordings_are_upright_with_the_pinhole_of_their_pictures(tmp_path):
+    made = walk(12, quarter_turns=1)
+    sequence = Sequence.open(made_formats.stray(tmp_path / "stray", made), first=2, step=2)
+    assert sequence.numbers.tolist() == [2, 4, 6, 8, 10]
+    assert sequence.size == sequence.color(0).shape[:2] == (64, 48)
+    assert sequence.depth_size == (32, 24)
+    np.testing.assert_allclose(sequence.intrinsics, walk(12).intrinsics, atol=1e-6)
+    np.testing.assert_allclose(sequence.poses()[1], made.world_from_camera[4], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "frames", "code"), [("empty", {}, "CAP-003"), ("few", {"first": 20}, "CAP-007")]
+)
+def test_folders_without_frames_end_with_a_code(tmp_path, name, frames, code):
+    folder = tmp_path / name
+    folder.mkdir()
+    if name == "few":
+        made_formats.stray(folder, walk())
+    with pytest.raises(InputError, match=code):
+        Sequence.open(folder, **frames)
+
+
+def test_depth_is_required(tmp_path):
+    folder = made_formats.seven_scenes(tmp_path / "scene", walk(6))
+    for path in folder.glob("*.depth.png"):
+        path.unlink()
+    with pytest.raises(InputError, match="CAP-006"):
+        Sequence.open(folder)
