@@ -19,7 +19,8 @@ from stages.segment_agent import stage
 from stages.segment_agent.config import Config
 
 AGENT = 255
-GRABCUT_ITERATIONS = 5
+GRABCUT_ITERATIONS, GRABCUT_REDUCED = 3, 2
+"""iterations, and the factor by which pictures are reduced"""
 BOX_MARGIN = 0.1
 """by which the box of a mask is enlarged for the next frame, share of its sides"""
 PEER = "GrabCut in a box moved by our flow"
@@ -97,17 +98,17 @@ def grabcut_masks(clip: Clip, flows: Path, box: list[int]) -> list[Bool[np.ndarr
 
 def grabcut(color: np.ndarray, box: list[int]) -> Bool[np.ndarray, "height width"]:
     """Return the foreground of an RGB picture in a box (x0, y0, x1, y1, pixels) by GrabCut; else it is background."""
-    x0, y0, x1, y1 = box
-    inside = np.zeros(color.shape[:2], bool)
-    inside[y0:y1, x0:x1] = True
-    if inside.sum() < 2 or inside.all():
-        return inside
-    labels = np.where(inside, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
-    cv2.grabCut(
-        np.ascontiguousarray(color[..., ::-1]), labels, None, np.zeros((1, 65)), np.zeros((1, 65)),
-        GRABCUT_ITERATIONS, cv2.GC_INIT_WITH_MASK,
-    )  # fmt: skip
-    return (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
+    height, width = color.shape[:2]
+    size = (width // GRABCUT_REDUCED, height // GRABCUT_REDUCED)
+    small = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
+    x0, y0, x1, y1 = np.array(box) // GRABCUT_REDUCED
+    labels = np.full(small.shape[:2], cv2.GC_BGD, np.uint8)
+    labels[y0:y1, x0:x1] = cv2.GC_PR_FGD
+    if len(np.unique(labels)) == 2:
+        models = np.zeros((2, 1, 65))
+        cv2.grabCut(small, labels, None, models[0], models[1], GRABCUT_ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    found = cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST)
+    return (found == cv2.GC_FGD) | (found == cv2.GC_PR_FGD)
 
 
 def iou(found: np.ndarray, true: np.ndarray) -> float:

@@ -319,7 +319,10 @@ def _decoded(stored: Picture, size: tuple[int, int], where: str) -> UInt8[np.nda
 def confidence_of(
     recording: Recording, number: int, depth: Float[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width"]:
-    """Return the confidence of a frame's `stored_depth`, 0 to 2: 2 if the recording has none, 0 if only this frame lacks it."""
+    """Return the confidence of a frame's `stored_depth`, 0 to 2.
+
+    It is 2 if the recording has none, 0 if only this frame lacks it.
+    """
     if recording.read_confidence is None:
         return np.where(depth > 0, 2, 0).astype(np.uint8)
     confidence = recording.read_confidence(number)

@@ -14,12 +14,10 @@ from stages.estimate_flow.config import Config as FlowConfig
 from stages.extract_frames import stage as extracting
 from stages.extract_frames.config import Config as FramesConfig
 from stages.segment_agent import stage as segmenting
-from stages.segment_agent.config import Config, LearningConfig
+from stages.segment_agent.config import Config
 from tests.pipeline.recordings import made_formats
 from tests.real.seven_scenes import SCENE
 from tests.stages.extract_frames.made_recordings import walk
-
-LEARNED_FAST = Config(learning=LearningConfig(batch=3))
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +54,7 @@ def test_animal_changes_color_and_depth_only_in_its_mask(drawn):
         )
 
 
+@pytest.mark.slow
 def test_masks_find_the_animal_and_only_it(drawn, tmp_path):
     sequence, out = drawn
     frames, flow, masks = (tmp_path / name for name in ("frames", "flow", "masks"))
@@ -63,7 +62,7 @@ def test_masks_find_the_animal_and_only_it(drawn, tmp_path):
         folder.mkdir()
     extracting.run(extracting.Inputs(out / "recordings" / "session-1"), FramesConfig(), frames)
     flowing.run(flowing.Inputs(frames), FlowConfig(), flow)
-    segmenting.run(segmenting.Inputs(frames, flow), LEARNED_FAST, masks)
+    segmenting.run(segmenting.Inputs(frames, flow), Config(), masks)
     found = Masks.open(masks)
     labels = np.stack([found[frame] for frame in range(len(sequence.numbers))])
     truth = semi_real.read_truth(out / "truth" / "session-1.npz", read_source_index(frames))
