@@ -179,7 +179,8 @@ def registration_metrics(
         own_roots = rigid.inverse(poses.world_from_camera) @ poses.world_from_agent
         share = np.unpackbits(table["packed"], axis=-1, count=int(table["shape"][2])).mean((1, 2))
         roots.append(pose_errors(own_roots, true_roots)[share > MIN_VISIBLE])
-        camera_sure.append(poses.confidence), root_sure.append(poses.agent_confidence[share > MIN_VISIBLE])
+        camera_sure.append(poses.confidence)
+        root_sure.append(poses.agent_confidence[share > MIN_VISIBLE])
         empty.append(np.isfinite(poses.world_from_agent[share == 0, 0, 3]))
     camera, root = joined(cameras), joined(roots)
     placed = np.isfinite(root.meters)

@@ -106,7 +106,9 @@ def grabcut(color: np.ndarray, box: list[int]) -> Bool[np.ndarray, "height width
     labels[y0:y1, x0:x1] = cv2.GC_PR_FGD
     if len(np.unique(labels)) == 2:
         models = np.zeros((2, 1, 65))
-        cv2.grabCut(small, labels, None, models[0], models[1], GRABCUT_ITERATIONS, cv2.GC_INIT_WITH_MASK)
+        cv2.grabCut(
+            small, labels, (0, 0, 0, 0), models[0], models[1], GRABCUT_ITERATIONS, cv2.GC_INIT_WITH_MASK
+        )
     found = cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST)
     return (found == cv2.GC_FGD) | (found == cv2.GC_PR_FGD)
 
