@@ -14,7 +14,7 @@ from pipeline.behavior.simulator import Simulator
 from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.core.errors import InputError
 from pipeline.environments.config import EnvironmentConfig
-from pipeline.environments.world import AnimalWorld
+from pipeline.environments.residents import Resident
 from pipeline.geometry import rigid
 
 ZUP_FROM_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -42,12 +42,11 @@ class LiveAnimal:
     def open(
         cls, build: Path, *, home: Path | None = None, seed: int = 0, device: str = "cpu"
     ) -> "LiveAnimal":
-        """Open `build/<agent>`, in the home of another build if given; raises as `AnimalWorld.load`."""
-        homes = () if home is None else (home,)
-        world = AnimalWorld.load(build, EnvironmentConfig(), homes=homes, device=device)
-        animals, where = world.animals, (world.data, world.scenes)
-        settings = {"sampling": animals.sampling, "chaining": animals.chaining}
-        return cls(Simulator(animals.sampler, *where, animals.ego, **settings), seed)
+        """Open `build/<agent>`, in the home of another build if given; raises as `Resident.load`."""
+        resident = Resident.load(build, homes=() if home is None else (home,), device=device)
+        where, how = (resident.habitat.data, resident.habitat.scenes), EnvironmentConfig()
+        settings = {"sampling": how.sampling, "chaining": how.chaining}
+        return cls(Simulator(resident.sampler, *where, resident.ego, **settings), seed)
 
     def reset(self, seed: int) -> None:
         """Begin again at time 0."""

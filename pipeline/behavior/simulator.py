@@ -102,9 +102,16 @@ class AnimalBatch:
         self.played, self.planned_others = np.zeros(len(root), int), self._others_now()
         self.intent_end = np.full(len(root), self.plan_frames)
 
-    def restart(self, some: Int[np.ndarray, "some"], context: Context) -> None:
-        """Restart some of the animals, each from a window of its own."""
+    def restart(
+        self,
+        some: Int[np.ndarray, "some"],
+        context: Context,
+        companions: Float[np.ndarray, "some companion past_frame 4"] | None = None,
+    ) -> None:
+        """Restart some of the animals, each from a window of its own; ``companions`` as in `begin`."""
         bones = channels_from_bones(context.agent_from_bone, self.rest)
+        if self.companions is not None and companions is not None:
+            self.companions[some] = companions
         if self.video is not None and context.video is not None:
             self.video[some] = context.video
         for frame in range(len(self.past)):
@@ -143,6 +150,11 @@ class AnimalBatch:
         return self.past[-1]
 
     @property
+    def past_world(self) -> Float[np.ndarray, "animal past_frame 3"]:
+        """Past positions of the animals, the current ones last; meters."""
+        return np.concatenate([frame.root[..., :3, 3] for frame in self.past], axis=1)
+
+    @property
     def plan_frames(self) -> int:
         """Number of frames of a plan."""
         return self.plan.root.shape[1]
@@ -164,8 +176,8 @@ class AnimalBatch:
         found = [] if self.companions is None else [self.companions[some]]
         together = self._together(some)
         if together is not None:
-            root = np.concatenate([frame.root[..., :3, 3] for frame in self.past], axis=1)
-            found.append(np.where(together[..., None, None], as_companions(root), np.nan))
+            mine = as_companions(self.past_world)
+            found.append(np.where(together[..., None, None], mine, np.nan))
         return np.concatenate(found, axis=1) if found else None
 
     def _others_now(self) -> Float[np.ndarray, "animal other 3"]:
@@ -360,7 +372,7 @@ class Simulator:
     @property
     def past_world(self) -> Float[np.ndarray, "past_frame 3"]:
         """Past positions of the animal, the current one last; meters."""
-        return np.stack([frame.root[0, 0, :3, 3] for frame in self.animals.past])
+        return self.animals.past_world[0]
 
     def step(
         self,

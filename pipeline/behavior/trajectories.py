@@ -249,10 +249,11 @@ class BehaviorData:
 
 
 def as_companions(
-    positions_world: Float[np.ndarray, "animal past_frame 3"],
-) -> Float[np.ndarray, "animal past_frame 4"]:
+    positions_world: Float[np.ndarray, "*animal past_frame 3"],
+) -> Float[np.ndarray, "*animal past_frame 4"]:
     """Return the tracks of animals as companions: positions and kind."""
-    return np.pad(positions_world, ((0, 0), (0, 0), (0, 1)), constant_values=KINDS.index("animal"))
+    kind = np.full_like(positions_world[..., :1], KINDS.index("animal"))
+    return np.concatenate([positions_world, kind], axis=-1)
 
 
 def nearest(

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
 
 Embodiment = Literal["person", "robot"]
 """A person steps forward, sideways and turns; a robot on wheels drives forward and turns."""
@@ -17,6 +17,8 @@ Seen = Literal["animal", "velocity", "occupancy", "rgbd"]
 class EnvironmentConfig:
     """What acts, what it is rewarded for, and how the animal plans."""
 
+    animal: str | None = None
+    """Of a home of several, the animal that observation, reward and end refer to; by default the first."""
     embodiment: Embodiment = "person"
     """What acts."""
     reward: RewardName = "approach"
@@ -39,3 +41,14 @@ class EnvironmentConfig:
     """Scale of classifier-free guidance: the interactivity."""
     candidates: int = 2
     """Plans drawn at most where the first one is blocked."""
+
+    @property
+    def sampling(self) -> PlanSamplingConfig:
+        """How plans are sampled: of samplers in few steps, by the one that keeps the spread of goals."""
+        few = "ddpm_large", self.goal_steps, self.sequence_steps, self.guidance
+        return PlanSamplingConfig(*few, max_path_draws=1)
+
+    @property
+    def chaining(self) -> ReplanningConfig:
+        """When animals plan anew, and of how many candidates."""
+        return ReplanningConfig(candidates=self.candidates)

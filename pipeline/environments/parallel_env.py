@@ -1,5 +1,6 @@
-"""Person and animal both act, for PettingZoo: the animal's action is a goal that it plans its way to."""
+"""Person and animals all act, for PettingZoo: an animal's action is a goal that it plans its way to."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ import gymnasium
 import numpy as np
 from pettingzoo import ParallelEnv
 
+from pipeline.behavior.simulator import AnimalBatch
 from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.environments.floor import to_local, to_world
 from pipeline.environments.rendering import bird_view, known_mode
@@ -16,19 +18,21 @@ from pipeline.environments.spaces import (
     person_observation,
     person_observation_space,
 )
-from pipeline.environments.world import AnimalWorld, checked
+from pipeline.environments.world import ANIMAL_NUMBERS, AnimalWorld, checked, others_seen
 
-PERSON, ANIMAL = "person", "animal"
+PERSON = "person"
 GOAL_M = 3.0
 """Distance of the goal along each axis that an action of 1 stands for, meters."""
 
 
 class PersonAnimalEnv(ParallelEnv):
-    """The person walks, the animal is steered: its action is a goal in its own frame, left and
+    """The person walks, the animals are steered: an action is a goal in an animal's own frame, left and
     ahead.
 
-    The behavior model plans path and body to that goal, as it does to its own. The animal's reward is the
-    person's with the opposite sign.
+    Agents are the person and each animal by its name, `animal` in builds of one. The behavior model plans
+    path and body to a goal, as it does to its own; None lets an animal choose its own again, and one that is
+    left out of the actions keeps what it was last given. The reward of the animal that the person meets is
+    the person's with the opposite sign, that of other animals is 0.
     """
 
     metadata = {  # noqa: RUF012
@@ -41,16 +45,14 @@ class PersonAnimalEnv(ParallelEnv):
         """Open a build (`build/<agent>`); ``opening`` is what `AnimalWorld.opened` takes."""
         self.world = AnimalWorld.opened(build, **opening)
         self.config, self.render_mode = self.world.config, known_mode(render_mode, self.metadata)
-        self.possible_agents = [PERSON, ANIMAL]
+        self.possible_agents = [PERSON, *self.world.batches]
         self.agents: list[str] = []
-        self.observation_spaces = {
-            PERSON: person_observation_space(self.config.observations),
-            ANIMAL: gymnasium.spaces.Box(-FAR, FAR, (4,), np.float32),
-        }
-        self.action_spaces = {
-            PERSON: person_action_space(self.world),
-            ANIMAL: gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32),
-        }
+        numbers = 4 + (len(self.world.names) - 1) * (1 + ANIMAL_NUMBERS)
+        self.observation_spaces: dict[str, gymnasium.Space] = {PERSON: person_observation_space(self.world)}
+        self.action_spaces: dict[str, gymnasium.Space] = {PERSON: person_action_space(self.world)}
+        for name in self.world.batches:
+            self.observation_spaces[name] = gymnasium.spaces.Box(-FAR, FAR, (numbers,), np.float32)
+            self.action_spaces[name] = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
 
     def observation_space(self, agent: str) -> gymnasium.Space:
         """Return what an agent observes."""
@@ -68,25 +70,29 @@ class PersonAnimalEnv(ParallelEnv):
         self.world.begin(1, self.rng, (options or {}).get("split", "train"))
         return self._observations(), {agent: {} for agent in self.agents}
 
-    def step(self, actions: dict[str, Any]):
+    def step(self, actions: Mapping[str, Any]):
         """Let 0.1 s pass; actions (2 or 3 in -1..1) are parts of highest speeds, or of the farthest goal."""
-        root = self.world.animals.past[-1].root[0, 0]
-        if ANIMAL in actions:
-            wish = checked([actions[ANIMAL]], (1, 2)).clip(-1, 1)
-            goal = to_world(GOAL_M * wish, self._animal_heading())[0]
-            self.world.animals.command((root[:3, 3] + [goal[0], 0.0, goal[1]])[None])
+        for name, batch in self.world.batches.items():
+            if name in actions:
+                batch.command(self._goal_world(batch, actions[name]))
         outcome = self.world.step([actions.get(PERSON, ())])
         self.frame += 1
         rewards, ended, out_of_time = self.world.judge(outcome, self.frame)
         reward, over, late, agents = float(rewards[0]), bool(ended[0]), bool(out_of_time), self.agents
         if over or late:
             self.agents = []
+        target = self.world.target
         return (
             self._observations(),
-            {PERSON: reward, ANIMAL: -reward},
+            dict.fromkeys(agents, 0.0) | {PERSON: reward, target: -reward},
             dict.fromkeys(agents, over),
             dict.fromkeys(agents, late),
-            {agent: {"distance_m": float(outcome.distance_m[0])} for agent in agents},
+            {
+                agent: {
+                    "distance_m": float(self.world.distance_of_m(target if agent == PERSON else agent)[0])
+                }
+                for agent in agents
+            },
         )
 
     def render(self):
@@ -96,14 +102,28 @@ class PersonAnimalEnv(ParallelEnv):
     def close(self) -> None:
         """Nothing to close."""
 
-    def _animal_heading(self) -> np.ndarray:
-        ahead = self.world.animals.past[-1].root[:, 0, :3, 2]
-        return np.arctan2(ahead[:, 0], ahead[:, 2])
+    @staticmethod
+    def _goal_world(batch: AnimalBatch, action: Any) -> Float[np.ndarray, "1 3"]:
+        """Return the goal that an action (left, ahead) stands for, meters; NaN for none."""
+        if action is None:
+            return np.full((1, 3), np.nan)
+        wish = checked([action], (1, 2)).clip(-1, 1)
+        goal = to_world(GOAL_M * wish, heading_of(batch))[0]
+        return batch.past[-1].root[:, 0, :3, 3] + [goal[0], 0.0, goal[1]]
 
     def _observations(self) -> dict[str, Any]:
-        world, heading = self.world, self._animal_heading()
-        place = to_local(world.persons.position - world.animal_position[:, [0, 2]], heading)
-        velocity = to_local(world.persons.velocity, heading)
-        seen = np.concatenate([place, velocity], axis=-1).astype(np.float32).clip(-FAR, FAR)
-        person = {name: value[0] for name, value in person_observation(world).items()}
-        return {PERSON: person, ANIMAL: seen[0]}
+        world, seen = self.world, {}
+        for name, batch in world.batches.items():
+            place, heading = batch.past[-1].root[:, 0, [0, 2], 3], heading_of(batch)
+            offset = to_local(world.persons.position - place, heading)
+            velocity = to_local(world.persons.velocity, heading)
+            others = others_seen(world, name, place, heading).reshape(1, -1)
+            numbers = np.concatenate([offset, velocity, others], axis=-1)
+            seen[name] = numbers.astype(np.float32).clip(-FAR, FAR)[0]
+        return {PERSON: {name: value[0] for name, value in person_observation(world).items()}} | seen
+
+
+def heading_of(batch: AnimalBatch) -> Float[np.ndarray, "animal"]:
+    """Return where animals look, radians about world +y, 0 along +z."""
+    ahead = batch.past[-1].root[:, 0, :3, 2]
+    return np.arctan2(ahead[:, 0], ahead[:, 2])

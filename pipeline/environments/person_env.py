@@ -25,7 +25,7 @@ class PersonEnv(gymnasium.Env):
         """Open a build (`build/<agent>`); ``opening`` is what `AnimalWorld.opened` takes."""
         self.world = AnimalWorld.opened(build, **opening)
         self.config, self.render_mode = self.world.config, known_mode(render_mode, self.metadata)
-        self.observation_space = person_observation_space(self.config.observations)
+        self.observation_space = person_observation_space(self.world)
         self.action_space = person_action_space(self.world)
         self.window: PictureWindow | None = None
 

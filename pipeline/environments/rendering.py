@@ -1,4 +1,6 @@
-"""Top-down view of a pair: blocked cells gray, person green, animal blue, its plan and goal orange."""
+"""Top-down view of a life: blocked cells gray, person green, animal blue, others violet, plans and goals
+orange.
+"""
 
 from typing import Any
 
@@ -12,14 +14,14 @@ from pipeline.environments.world import AnimalWorld
 SIDE_PX, SIDE_M = 400, 8.0
 """Side of a picture in pixels, and of what it shows in meters."""
 NOSE_M = 0.3
-"""Length of the line that points ahead of the animal."""
+"""Length of the line that points ahead of an animal."""
 GROUND, SOLID = (250, 250, 250), (150, 150, 150)
-PERSON, ANIMAL, PLAN = (85, 168, 104), (59, 110, 165), (221, 132, 82)
+PERSON, ANIMAL, PLAN, OTHER = (85, 168, 104), (59, 110, 165), (221, 132, 82), (139, 98, 183)
 """Colors, RGB."""
 
 
 def bird_view(world: AnimalWorld, row: int) -> UInt8[np.ndarray, "400 400 3"]:
-    """Draw one pair, the person in the middle of the picture; world +x is right, +z down."""
+    """Draw one life, the person in the middle of the picture; world +x is right, +z down."""
     center, scale = world.persons.position[row], SIDE_PX / SIDE_M
     axis = (np.arange(SIDE_PX) + 0.5) / scale - SIDE_M / 2
     x, z = np.meshgrid(axis + center[0], axis + center[1])
@@ -30,15 +32,16 @@ def bird_view(world: AnimalWorld, row: int) -> UInt8[np.ndarray, "400 400 3"]:
         u, v = np.round((point - center) * scale + SIDE_PX / 2).astype(int)
         return int(u), int(v)
 
-    animals = world.animals
-    path = animals.plan.root[row, animals.played[row] :, :3, 3][:, [0, 2]]
-    root = animals.past[-1].root[row, 0]
-    line = np.array([pixel(point) for point in path], np.int32).reshape(-1, 1, 2)
-    cv2.polylines(picture, [line], False, PLAN, 1)
-    cv2.circle(picture, pixel(animals.goal[row][[0, 2]]), 4, PLAN, -1)
-    nose = root[[0, 2], 3] + NOSE_M * root[[0, 2], 2]
-    cv2.line(picture, pixel(root[[0, 2], 3]), pixel(nose), ANIMAL, 3)
-    cv2.circle(picture, pixel(root[[0, 2], 3]), 6, ANIMAL, -1)
+    for name, animals in world.batches.items():
+        color = ANIMAL if name == world.target else OTHER
+        path = animals.plan.root[row, animals.played[row] :, :3, 3][:, [0, 2]]
+        root = animals.past[-1].root[row, 0]
+        line = np.array([pixel(point) for point in path], np.int32).reshape(-1, 1, 2)
+        cv2.polylines(picture, [line], False, PLAN, 1)
+        cv2.circle(picture, pixel(animals.goal[row][[0, 2]]), 4, PLAN, -1)
+        nose = root[[0, 2], 3] + NOSE_M * root[[0, 2], 2]
+        cv2.line(picture, pixel(root[[0, 2], 3]), pixel(nose), color, 3)
+        cv2.circle(picture, pixel(root[[0, 2], 3]), 6, color, -1)
     heading = world.persons.heading[row]
     ahead = np.array([np.sin(heading), np.cos(heading)])
     cv2.line(picture, pixel(center), pixel(center + 0.5 * ahead), PERSON, 2)

@@ -1,29 +1,29 @@
 """Observation and action spaces for Gymnasium."""
 
-from collections.abc import Sequence
 from typing import assert_never
 
 import gymnasium
 import numpy as np
 from jaxtyping import Shaped
 
-from pipeline.environments.config import Seen
 from pipeline.environments.floor import CELLS, to_local
 from pipeline.environments.rgbd import FAR_M, HEIGHT_PX, WIDTH_PX
-from pipeline.environments.world import ANIMAL_NUMBERS, AnimalWorld, animal_seen, occupancy_seen
+from pipeline.environments.world import ANIMAL_NUMBERS, AnimalWorld, animal_seen, occupancy_seen, others_seen
 
 FAR = 20.0
 """Bound of all observed numbers: meters or m/s; homes are smaller, animals slower."""
 
 
-def person_observation_space(observations: Sequence[Seen]) -> gymnasium.spaces.Dict:
+def person_observation_space(world: AnimalWorld) -> gymnasium.spaces.Dict:
     """Return the space of `person_observation`."""
     box = gymnasium.spaces.Box
     parts: dict[str, gymnasium.Space] = {}
-    for seen in observations:
+    for seen in world.config.observations:
         match seen:
             case "animal":
                 parts["animal"] = box(-FAR, FAR, (ANIMAL_NUMBERS,), np.float32)
+                if others := len(world.names) - 1:
+                    parts["others"] = box(-FAR, FAR, (others, 1 + ANIMAL_NUMBERS), np.float32)
             case "velocity":
                 parts["velocity"] = box(-FAR, FAR, (2,), np.float32)
             case "occupancy":
@@ -37,14 +37,17 @@ def person_observation_space(observations: Sequence[Seen]) -> gymnasium.spaces.D
 
 
 def person_observation(world: AnimalWorld) -> dict[str, Shaped[np.ndarray, "person ..."]]:
-    """Return all persons' observations, first axis person: the animal, their velocity and occupancy in their
-    own frames, and pictures with depth (meters, 0: no surface).
+    """Return all persons' observations, first axis person: the animal, in homes of several also the others,
+    their velocity and occupancy in their own frames, and pictures with depth (meters, 0: no surface).
     """
     parts: dict[str, np.ndarray] = {}
+    here = world.persons.position, world.persons.heading
     for seen in world.config.observations:
         match seen:
             case "animal":
                 parts["animal"] = animal_seen(world).clip(-FAR, FAR)
+                if len(world.names) > 1:
+                    parts["others"] = others_seen(world, world.target, *here).clip(-FAR, FAR)
             case "velocity":
                 velocity = to_local(world.persons.velocity, world.persons.heading)
                 parts["velocity"] = velocity.astype(np.float32).clip(-FAR, FAR)

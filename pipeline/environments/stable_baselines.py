@@ -29,9 +29,7 @@ class PersonStableVecEnv(VecEnv):
         """
         self.world = AnimalWorld.opened(build, **opening)
         self.config, self.split, self.render_mode = self.world.config, split, None
-        super().__init__(
-            num_envs, person_observation_space(self.config.observations), person_action_space(self.world)
-        )
+        super().__init__(num_envs, person_observation_space(self.world), person_action_space(self.world))
         self.rng = np.random.default_rng()
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:

@@ -25,7 +25,7 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
         """Open a build (`build/<agent>`); ``opening`` is what `AnimalWorld.opened` takes."""
         self.world = AnimalWorld.opened(build, **opening)
         self.config, self.num_envs, self.render_mode = self.world.config, num_envs, None
-        self.single_observation_space = person_observation_space(self.config.observations)
+        self.single_observation_space = person_observation_space(self.world)
         self.single_action_space = person_action_space(self.world)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)

@@ -1,11 +1,13 @@
-"""A batch of person-animal pairs that plan together and restart independently.
+"""A batch of lives, each of a person and all animals of a home, that plan together and restart independently.
 
-`AnimalWorld.load` opens a build, `begin` starts pairs, `restart` some, `step` advances all by 0.1 s. Actions
-move persons; the behavior model moves animals through `AnimalBatch`, which replans only when a plan ends or
-the person has moved noticeably, at the rate `plans_per_step`.
+`AnimalWorld.load` opens a build, `begin` starts lives, `restart` some, `step` advances all by 0.1 s. Actions
+move persons; behavior models move animals, each through an `AnimalBatch` of its own, which replans only when
+a plan ends or someone perceived has moved noticeably, at the rate `plans_per_step`. The animals of a life
+perceive each other. What a person meets is one of them, the ``target``: `animals`, `data` and `scenes` are
+its.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from pipeline.baselines.samplers import sampler_of
-from pipeline.behavior import model as behavior
-from pipeline.behavior.config import Ego, PlanSamplingConfig, ReplanningConfig
 from pipeline.behavior.model import bones_from_channels
-from pipeline.behavior.planning import Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import AnimalBatch
 from pipeline.behavior.trajectories import RATE_HZ, TEST, TRAIN, BehaviorData, Context
@@ -25,11 +23,11 @@ from pipeline.core.config import from_table
 from pipeline.core.errors import InputError
 from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.floor import PersonFloor, to_local, to_world
-from pipeline.environments.homes import Habitat, open_homes
+from pipeline.environments.homes import Habitat
+from pipeline.environments.residents import Resident, companions_of, folders_of, moments_together
 from pipeline.environments.rewards import ENDING, REWARDS, StepOutcome
 from pipeline.environments.rgbd import RgbdCamera
 from pipeline.metrics.flight import WITHIN_S, flees
-from pipeline.workflow import artifact
 
 EYE_M = 1.4
 """Height of a person's phone above the floor, meters."""
@@ -53,25 +51,16 @@ class Persons:
 
 
 class AnimalWorld:
-    """Pairs of a person and an animal, each pair in the scene of the animal's recording."""
+    """Lives of a person and the animals of a home, each in the scene of a recording of the target."""
 
-    def __init__(
-        self,
-        sampler: Sampler,
-        habitat: Habitat,
-        ego: Ego,
-        config: EnvironmentConfig,
-        *,
-        camera: RgbdCamera | None = None,
-    ):
-        """``habitat`` is where they live; ``camera`` is what `rgbd` is seen with."""
-        self.habitat, self.config, self.camera = habitat, config, camera
-        data, scenes = habitat.data, habitat.scenes
-        # of samplers in few steps, the one that keeps the spread of goals
-        few = "ddpm_large", config.goal_steps, config.sequence_steps, config.guidance
-        sampling = PlanSamplingConfig(*few, max_path_draws=1)
-        rest, chaining = data.agent_from_bone_rest, ReplanningConfig(candidates=config.candidates)
-        self.animals = AnimalBatch(sampler, scenes, rest, ego, sampling=sampling, chaining=chaining)
+    def __init__(self, residents: Mapping[str, Resident | None], config: EnvironmentConfig):
+        """``residents`` are the animals of the home by name, None if absent."""
+        self.config, self.names = config, tuple(residents)
+        self.residents = {name: each for name, each in residents.items() if each is not None}
+        self.target = config.animal or next(iter(self.residents))
+        self.batches = {name: each.batch(config) for name, each in self.residents.items()}
+        self.camera: RgbdCamera | None = None
+        data, scenes = self.data, self.scenes
         tracks = [data.trajectories[name] for name in data.videos]
         roots = [track.world_from_agent[track.valid, :3, 3] for track in tracks]
         self.floors, scene_of = [], self._scene_of_videos()
@@ -106,34 +95,38 @@ class AnimalWorld:
     def load(
         cls, build: Path, config: EnvironmentConfig, *, homes: Sequence[Path] = (), device: str = "cpu"
     ) -> "AnimalWorld":
-        """Open a finished build, its animal in ``homes`` where there are any: builds, of which one may be its
-        own.
+        """Open a finished build: its animal, in ``homes`` where there are any, or all animals of its home.
 
-        Raises ART-003 where it lacks the model, or the surfaces that `rgbd` shows, ART-007 where another
-        version wrote it, SIM-006 for models without goals, and what `pipeline.environments.other_home` raises
-        for homes that cannot be used.
+        Raises what `Resident.load` and `folders_of` raise, ART-003 where it lacks the surfaces that `rgbd`
+        shows, and SIM-011 for several animals in ``homes``.
         """
-        artifact.require(build, "behavior", "behavior_data", remedy="make it: make <agent>.behavior")
-        architecture, nets, scaling, schedule, _ = behavior.load(build / "behavior")
-        behavior.refuse_unplayable(architecture, str(build))
-        data = BehaviorData.load(build / "behavior_data")
-        sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
-        habitat = open_homes(build, data, homes)
-        camera = RgbdCamera.load(build, homes or (build,)) if "rgbd" in config.observations else None
-        return cls(sampler, habitat, architecture.ego, config, camera=camera)
+        folders = folders_of(build, config.animal)
+        if homes and build not in folders.values():
+            what, remedy = "animals of a home of several live in their own", "leave `home` and `homes` out"
+            raise InputError("SIM-011", what, str(build), remedy)
+        residents = {
+            name: None if folder is None else Resident.load(folder, homes=homes, device=device)
+            for name, folder in folders.items()
+        }
+        world = cls(residents, config)
+        if "rgbd" in config.observations:
+            bodies = {name: folder for name, folder in folders.items() if folder is not None}
+            world.camera = RgbdCamera.load(list(bodies.values()), homes or (bodies[world.target],))
+        return world
 
     def begin(self, count: int, rng: np.random.Generator, split: str = "train") -> None:
-        """Begin ``count`` pairs; ``rng`` draws windows, starts and all plans from here on."""
+        """Begin ``count`` lives; ``rng`` draws windows, starts and all plans from here on."""
         self.rng, self.steps = rng, 0
         zeros = np.zeros((count, 2))
         self.persons = Persons(zeros.copy(), np.zeros(count), zeros.copy())
         self.video = np.zeros(count, int)
-        context = self._drawn(np.arange(count), split)
-        self.animals.begin(context, rng)
+        for name, (context, companions) in self._drawn(np.arange(count), split).items():
+            self.batches[name].begin(context, rng, companions=companions)
 
     def restart(self, some: Int[np.ndarray, "some"], split: str = "train") -> None:
-        """Begin some pairs of person and animal anew, by their indices."""
-        self.animals.restart(some, self._drawn(some, split))
+        """Begin some lives anew, by their indices."""
+        for name, (context, companions) in self._drawn(some, split).items():
+            self.batches[name].restart(some, context, companions)
 
     def step(self, action: Any) -> StepOutcome:
         """Move the persons by their actions (person x command, -1..1 of the highest speeds) and let the
@@ -144,8 +137,10 @@ class AnimalWorld:
         before = self.distance_m
         self._walk(np.clip(checked(action, (len(before), self.action_size)), -1, 1))
         last = self.animal_position.copy()
-        self.animals.step(self.eyes)
-        self.steps += len(before)
+        past = {name: batch.past_world for name, batch in self.batches.items()}
+        for name, batch in self.batches.items():
+            batch.step(self.eyes, companions_of(name, past))
+        self.steps += len(before) * len(self.batches)
         moved = np.linalg.norm((self.animal_position - last)[:, [0, 2]], axis=-1)
         return StepOutcome(before, self.distance_m, moved * RATE_HZ, self.fleeing)
 
@@ -156,6 +151,16 @@ class AnimalWorld:
         over = (outcome.reached | outcome.flees) & (self.config.reward in ENDING)
         late = np.asarray(frame) >= round(self.config.episode_s * RATE_HZ)
         return REWARDS[self.config.reward](outcome), over, late
+
+    @property
+    def animals(self) -> AnimalBatch:
+        """The animals that persons meet, one per life."""
+        return self.batches[self.target]
+
+    @property
+    def habitat(self) -> Habitat:
+        """Where these live."""
+        return self.residents[self.target].habitat
 
     @property
     def data(self) -> BehaviorData:
@@ -175,7 +180,7 @@ class AnimalWorld:
     @property
     def plans_per_step(self) -> float:
         """Plans drawn per animal and step since `begin`."""
-        return self.animals.plans_drawn / max(self.steps, 1)
+        return sum(batch.plans_drawn for batch in self.batches.values()) / max(self.steps, 1)
 
     @property
     def animal_position(self) -> Float[np.ndarray, "animal 3"]:
@@ -185,7 +190,12 @@ class AnimalWorld:
     @property
     def distance_m(self) -> Float[np.ndarray, "person"]:
         """Horizontal distance of person and animal, meters."""
-        return np.linalg.norm(self.animal_position[:, [0, 2]] - self.persons.position, axis=-1)
+        return self.distance_of_m(self.target)
+
+    def distance_of_m(self, name: str) -> Float[np.ndarray, "person"]:
+        """Return the persons' horizontal distances from any of the animals, meters."""
+        root = self.batches[name].past[-1].root[:, 0]
+        return np.linalg.norm(root[:, [0, 2], 3] - self.persons.position, axis=-1)
 
     @property
     def eyes(self) -> Float[np.ndarray, "person 3"]:
@@ -196,26 +206,29 @@ class AnimalWorld:
 
     @property
     def scene(self) -> Int[np.ndarray, "person"]:
-        """Number of each pair's scene."""
+        """Number of each life's scene."""
         return self.scenes.number(self.video, len(self.video))
 
     @property
     def home(self) -> Int[np.ndarray, "person"]:
-        """Number of each pair's home, in the order of `homes`."""
+        """Number of each life's home, in the order of `homes`."""
         return self.habitat.home_of_video[self.video]
 
     @property
     def share_known(self) -> Float[np.ndarray, "person"]:
-        """How much (0..1) of each pair's home looks like the one that the animal knows."""
+        """How much (0..1) of each life's home looks like the one that the animal knows."""
         return np.array(self.habitat.share_known)[self.home]
 
     def pictures(self) -> list[tuple[UInt8[np.ndarray, "48 64 3"], Float[np.ndarray, "48 64"]]]:
         """Return what the persons' cameras see: color, and z-depth in meters (0 where nothing is)."""
         assert self.camera is not None, "a world that is seen is opened with `rgbd` among its observations"
-        now = self.animals.past[-1]
-        bones = bones_from_channels(now.bones[:, 0], self.data.agent_from_bone_rest)
-        rows = zip(self.home, self.eyes, self.persons.heading, now.root[:, 0], bones, strict=True)
-        return [self.camera.picture(int(home), *row) for home, *row in rows]
+        each = [(batch.past[-1], batch.rest) for batch in self.batches.values()]
+        poses = [(now.root[:, 0], bones_from_channels(now.bones[:, 0], rest)) for now, rest in each]
+        rows = enumerate(zip(self.home, self.eyes, self.persons.heading, strict=True))
+        return [
+            self.camera.picture(int(home), eye, heading, [(root[row], bones[row]) for root, bones in poses])
+            for row, (home, eye, heading) in rows
+        ]
 
     @property
     def fleeing(self) -> Bool[np.ndarray, "animal"]:
@@ -249,19 +262,33 @@ class AnimalWorld:
             blocked[mine] = self.floors[number].blocks(points[mine])
         return blocked
 
-    def _drawn(self, some: Int[np.ndarray, "some"], split: str) -> Context:
-        """Draw windows and starts for some pairs; the person has stood there, facing the animal."""
-        context, _ = self.data.windows(self._moments(len(some), split))
-        assert context.video is not None, "windows of data always name their recording"
-        self.video[some] = context.video
-        for row, video, root in zip(some, context.video, context.world_from_agent[:, -1, :3, 3], strict=True):
-            animal = root[[0, 2]]
-            self.persons.position[row] = self._start(animal, self.floors[self._scene_of_videos()[video]])
-            ahead = animal - self.persons.position[row]
+    def _drawn(
+        self, some: Int[np.ndarray, "some"], split: str
+    ) -> dict[str, tuple[Context, Float[np.ndarray, "some companion past_frame 4"] | None]]:
+        """Draw each animal's windows and companions for some lives, and where the persons have stood, facing
+        the target.
+        """
+        data = {name: each.habitat.data for name, each in self.residents.items()}
+        led = self._moments(len(some), split)
+        begun = [moments_together(data, self.target, int(window), SPLITS[split]) for window in led]
+        contexts = {
+            name: mine.windows(np.array([row[name] for row in begun]))[0] for name, mine in data.items()
+        }
+        video = contexts[self.target].video
+        assert video is not None, "windows of data always name their recording"
+        self.video[some] = video
+        past = {name: context.world_from_agent[..., :3, 3] for name, context in contexts.items()}
+        for number, row in enumerate(some):
+            here = {name: track[number, -1, [0, 2]] for name, track in past.items()}
+            self.persons.position[row] = self._start(here, self.floors[self.scene[row]])
+            ahead = here[self.target] - self.persons.position[row]
             self.persons.heading[row] = np.arctan2(ahead[0], ahead[1])
             self.persons.velocity[row] = 0.0
-        observer = np.repeat(self.eyes[some][:, None], self.data.past, axis=1)
-        return replace(context, observer_world=observer, observer_rotation=None)
+        seen = {"observer_world": np.repeat(self.eyes[some][:, None], self.data.past, axis=1)}
+        return {
+            name: (replace(context, observer_rotation=None, **seen), companions_of(name, past))
+            for name, context in contexts.items()
+        }
 
     def _moments(self, count: int, split: str) -> Int[np.ndarray, "some"]:
         """Draw windows; where there are several homes, each is as likely as another."""
@@ -275,14 +302,23 @@ class AnimalWorld:
         drawn = self.rng.choice(homes, count)
         return np.array([self.rng.choice(windows[home == each]) for each in drawn])
 
-    def _start(self, animal: Float[np.ndarray, "2"], floor: PersonFloor) -> Float[np.ndarray, "2"]:
-        """Draw a free place around the animal, the last one drawn where none is free."""
+    def _start(
+        self, here: Mapping[str, Float[np.ndarray, "2"]], floor: PersonFloor
+    ) -> Float[np.ndarray, "2"]:
+        """Draw a free place around the target that is on no other animal, the last one drawn where none is
+        free.
+        """
         near, far = self.config.start_m
-        place = animal
+        animal = place = here[self.target]
         for _ in range(START_DRAWS):
             angle, distance = self.rng.uniform(0, 2 * np.pi), self.rng.uniform(near, far)
             place = animal + distance * np.array([np.sin(angle), np.cos(angle)])
-            if not floor.blocks(place[None])[0]:
+            apart = (
+                np.linalg.norm(place - root) >= self.batches[name].clearance_m
+                for name, root in here.items()
+                if name != self.target
+            )
+            if not floor.blocks(place[None])[0] and all(apart):
                 break
         return place
 
@@ -311,13 +347,35 @@ ANIMAL_NUMBERS = 7
 
 def animal_seen(world: AnimalWorld) -> Float[np.ndarray, "person 7"]:
     """Return the animal in the person's frame: place (left, ahead), height (m), heading, velocity (m/s)."""
-    root, persons = world.animals.past[-1].root[:, 0], world.persons
-    before = world.animals.past[-2].root[:, 0, :3, 3]
-    place = to_local(root[:, [0, 2], 3] - persons.position, persons.heading)
+    return seen_from(world, world.target, world.persons.position, world.persons.heading)
+
+
+def others_seen(
+    world: AnimalWorld, name: str, place: Float[np.ndarray, "life 2"], heading: Float[np.ndarray, "life"]
+) -> Float[np.ndarray, "life other 8"]:
+    """Return all animals but one, by their names, as seen from places (world x and z, meters) and headings
+    (radians): 1 and `seen_from`, or zeros for an animal that is absent.
+    """
+    others = np.zeros((len(place), len(world.names) - 1, 1 + ANIMAL_NUMBERS), np.float32)
+    for column, other in enumerate(each for each in world.names if each != name):
+        if other in world.batches:
+            others[:, column, 0], others[:, column, 1:] = 1.0, seen_from(world, other, place, heading)
+    return others
+
+
+def seen_from(
+    world: AnimalWorld, name: str, place: Float[np.ndarray, "life 2"], heading: Float[np.ndarray, "life"]
+) -> Float[np.ndarray, "life 7"]:
+    """Return an animal in the frames of places (world x and z, meters) and headings (radians), as
+    `animal_seen` does; heights are above the floor.
+    """
+    past = world.batches[name].past
+    root, before = past[-1].root[:, 0], past[-2].root[:, 0, :3, 3]
+    offset = to_local(root[:, [0, 2], 3] - place, heading)
     height = root[:, 1, 3] - np.array([world.floors[scene].floor_m for scene in world.scene])
-    ahead = to_local(root[:, [0, 2], 2], persons.heading)
-    velocity = to_local((root[:, :3, 3] - before)[:, [0, 2]] * RATE_HZ, persons.heading)
-    return np.concatenate([place, height[:, None], ahead, velocity], axis=-1).astype(np.float32)
+    ahead = to_local(root[:, [0, 2], 2], heading)
+    velocity = to_local((root[:, :3, 3] - before)[:, [0, 2]] * RATE_HZ, heading)
+    return np.concatenate([offset, height[:, None], ahead, velocity], axis=-1).astype(np.float32)
 
 
 def occupancy_seen(world: AnimalWorld) -> Float[np.ndarray, "person 16 16"]:

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.behavior.avoidance import clearance_of
 from pipeline.behavior.simulator import Simulator, SimulatorState
-from pipeline.behavior.trajectories import RATE_HZ, TRAIN, BehaviorData, Trajectory, as_companions
+from pipeline.behavior.trajectories import RATE_HZ, TRAIN, BehaviorData
 from pipeline.data import images
+from pipeline.environments.residents import companions_of, moments_together, recorded_at
 from pipeline.geometry import views
 from pipeline.geometry.meshes import Mesh
 from stages.simulate.observers import Observer
@@ -41,7 +41,7 @@ class ReplayedAnimal:
         self, window: Int[np.ndarray, "1"], rng: np.random.Generator, *, companions: Companions = None
     ) -> SimulatorState:
         """Begin at a window; companions have no effect."""
-        self.track, start = recorded_at(self.data, window)
+        self.track, start = recorded_at(self.data, int(window[0]))
         broken = np.flatnonzero(~self.track.valid)
         first = int(broken[broken < start].max(initial=-1)) + 1
         last = int(broken[broken > start].min(initial=len(self.track.valid)))
@@ -77,64 +77,23 @@ class SharedHome:
         without overlap of bodies.
         """
         rng = np.random.default_rng(seed)
-        first, *others = self.animals.values()
-        windows = [rng.choice(first.data.indices(TRAIN), 1)]
-        self.recording, _ = recorded_at(first.data, windows[0])
-        for other in others:
-            before = zip(self.animals.values(), windows, strict=False)
-            placed = np.stack([_past_world(animal.data, window)[-1] for animal, window in before])
-            windows.append(_nearest_window(other.data, first.data, windows[0], placed))
-        begun = list(zip(self.animals.items(), windows, strict=True))
-        past = {name: _past_world(animal.data, window) for (name, animal), window in begun}
+        data = {name: animal.data for name, animal in self.animals.items()}
+        first = next(iter(data))
+        window = int(rng.choice(data[first].indices(TRAIN), 1)[0])
+        self.recording, _ = recorded_at(data[first], window)
+        begun = {name: np.array([each]) for name, each in moments_together(data, first, window).items()}
+        past = {
+            name: data[name].windows(each)[0].world_from_agent[0, :, :3, 3] for name, each in begun.items()
+        }
         return {
-            name: animal.begin(window, each, companions=_companions_of(name, past))
-            for ((name, animal), window), each in zip(begun, rng.spawn(len(begun)), strict=True)
+            name: self.animals[name].begin(begun[name], each, companions=companions_of(name, past))
+            for name, each in zip(begun, rng.spawn(len(begun)), strict=True)
         }
 
     def step(self, observer: Float[np.ndarray, "3"]) -> dict[str, SimulatorState]:
         """Let 0.1 s pass for all with the person at this position (meters, world)."""
         past = {name: animal.past_world for name, animal in self.animals.items()}
-        return {name: each.step(observer, _companions_of(name, past)) for name, each in self.animals.items()}
-
-
-def recorded_at(data: BehaviorData, window: Int[np.ndarray, "1"]) -> tuple[Trajectory, int]:
-    """Return the recording of a window and the window's first frame in it."""
-    return data.trajectories[data.videos[int(data.video[window[0]])]], int(data.start[window[0]])
-
-
-def _past_world(data: BehaviorData, window: Int[np.ndarray, "1"]) -> Float[np.ndarray, "past_frame 3"]:
-    track, start = recorded_at(data, window)
-    return track.world_from_agent[start : start + data.past, :3, 3]
-
-
-def _companions_of(name: str, past: Mapping[str, Float[np.ndarray, "past_frame 3"]]) -> Companions:
-    others = [past[other] for other in past if other != name]
-    return as_companions(np.stack(others)) if others else None
-
-
-def _nearest_window(
-    data: BehaviorData,
-    leading: BehaviorData,
-    window: Int[np.ndarray, "1"],
-    placed: Float[np.ndarray, "animal 3"],
-) -> Int[np.ndarray, "1"]:
-    """Return the training window nearest in time to another animal's, preferably of the same recording, in
-    which the animal does not overlap those ``placed`` (meters, world).
-    """
-    (track, start), known = recorded_at(leading, window), data.indices(TRAIN)
-    same, time_s = leading.videos[int(leading.video[window[0]])], track.timestamp_s[start]
-    names = [data.videos[video] for video in data.video[known]]
-    begins = [
-        data.trajectories[name].timestamp_s[begin] - time_s
-        for name, begin in zip(names, data.start[known], strict=True)
-    ]
-    clearance_m = clearance_of(data.agent_from_bone_rest)
-    order = np.lexsort((np.abs(begins), np.array(names) != same))
-    for each in known[order]:
-        place = _past_world(data, each[None])[-1]
-        if (np.linalg.norm((placed - place)[:, [0, 2]], axis=-1) >= clearance_m).all():
-            return each[None]
-    return known[order[:1]]
+        return {name: each.step(observer, companions_of(name, past)) for name, each in self.animals.items()}
 
 
 def rollout_of_all(home: SharedHome, observer: Observer, *, seconds: float, seed: int) -> dict[str, Take]:

@@ -8,6 +8,7 @@ from pipeline.behavior.planning import Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
 from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.homes import Habitat
+from pipeline.environments.residents import ALONE, Resident
 from pipeline.environments.world import AnimalWorld
 from tests.pipeline.behavior.wandering import ARCHITECTURE, room, scaling, wandering
 
@@ -18,4 +19,4 @@ def small_world(config=QUICK):
     volume = room()
     sampler = Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling())
     scenes = Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int))
-    return AnimalWorld(sampler, Habitat.of_one_home(wandering(), scenes), "yaw", config)
+    return AnimalWorld({ALONE: Resident(sampler, Habitat.of_one_home(wandering(), scenes), "yaw")}, config)

@@ -80,7 +80,7 @@ def test_pettingzoo_checks_pass():
 
 def small_world_like(world):
     """Return another world with the same networks."""
-    return AnimalWorld(world.animals.sampler, world.habitat, "yaw", world.config)
+    return AnimalWorld(world.residents, world.config)
 
 
 def test_vectorized_episodes_restart_and_are_seeded(build):

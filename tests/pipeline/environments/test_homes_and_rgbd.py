@@ -124,10 +124,10 @@ def test_rendered_depth_is_relative_to_the_camera():
     body, wall = box((0.2, 0.2, 0.2), RED), box((20, 20, 1.0), BLUE, (0, 0, 2.1))
     weights = np.zeros((8, BONES))
     weights[:, 1] = 1
-    camera = RgbdCamera([wall], SkinnedBody(body, weights, REST, np.zeros(0)))
+    camera = RgbdCamera([wall], [SkinnedBody(body, weights, REST, np.zeros(0))])
     level = rigid.make(np.eye(3), np.array([0.0, 0.0, 1.0]))
     eye = np.zeros(3)
-    _, depth_m = camera.picture(0, eye, 0.0, rigid.make(np.eye(3), np.array([0.0, 50, 0])), REST)
+    _, depth_m = camera.picture(0, eye, 0.0, [(rigid.make(np.eye(3), np.array([0.0, 50, 0])), REST)])
     row = (np.arange(48) + 0.5 - INTRINSICS[1, 2]) / INTRINSICS[1, 1]
     expected = 1.6 / (np.cos(PITCH_RAD) - row * np.sin(PITCH_RAD))
     seen = (expected > 0) & (expected < FAR_M)
@@ -135,7 +135,7 @@ def test_rendered_depth_is_relative_to_the_camera():
     lowered = REST.copy()
     lowered[1, 1, 3] -= 0.3
     for bones, height in ((REST, 0.0), (lowered, -0.3)):
-        rgb, depth_m = camera.picture(0, eye, 0.0, level, bones)
+        rgb, depth_m = camera.picture(0, eye, 0.0, [(level, bones)])
         rows, columns = np.nonzero((rgb == RED).all(-1))
         ray = (np.array([columns.mean(), rows.mean()]) + 0.5 - INTRINSICS[:2, 2]) / INTRINSICS[0, 0]
         ahead = np.array([ray[0], -ray[1] * np.cos(PITCH_RAD) - np.sin(PITCH_RAD)]) / (

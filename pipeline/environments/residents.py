@@ -1,0 +1,121 @@
+"""Animals that live together in a home: which there are, where they begin, and whom they perceive."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.baselines.samplers import sampler_of
+from pipeline.behavior import model as behavior
+from pipeline.behavior.avoidance import clearance_of
+from pipeline.behavior.config import Ego
+from pipeline.behavior.planning import Sampler, TorchNetworks
+from pipeline.behavior.simulator import AnimalBatch
+from pipeline.behavior.trajectories import TRAIN, BehaviorData, Trajectory, as_companions
+from pipeline.core.config import refuse_unknown
+from pipeline.core.errors import InputError
+from pipeline.environments.config import EnvironmentConfig
+from pipeline.environments.homes import Habitat, open_homes
+from pipeline.workflow import artifact
+
+ALONE = "animal"
+"""Name of the animal of a build of one."""
+NEEDED = ("behavior", "behavior_data")
+"""Artifacts of an animal that lives."""
+
+
+@dataclass(frozen=True)
+class Resident:
+    """An animal with networks of its own, and where it lives."""
+
+    sampler: Sampler
+    habitat: Habitat
+    ego: Ego
+
+    @classmethod
+    def load(cls, build: Path, *, homes: Sequence[Path] = (), device: str = "cpu") -> "Resident":
+        """Open an animal's folder, in ``homes`` where there are any: builds, of which one may be its own.
+
+        Raises ART-003 where it lacks the model, ART-007 where another version wrote it, SIM-006 for models
+        without goals, and what `pipeline.environments.other_home` raises for homes that cannot be used.
+        """
+        one_of_several = f"give one of its animals: {build}/animals/<name>"
+        remedy = one_of_several if (build / "animals").is_dir() else "make it: make <agent>.behavior"
+        artifact.require(build, *NEEDED, remedy=remedy)
+        architecture, nets, scaling, schedule, _ = behavior.load(build / "behavior")
+        behavior.refuse_unplayable(architecture, str(build))
+        habitat = open_homes(build, BehaviorData.load(build / "behavior_data"), homes)
+        sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
+        return cls(sampler, habitat, architecture.ego)
+
+    def batch(self, config: EnvironmentConfig) -> AnimalBatch:
+        """Return a batch to simulate it in; it has not begun."""
+        how, scenes = {"sampling": config.sampling, "chaining": config.chaining}, self.habitat.scenes
+        return AnimalBatch(self.sampler, scenes, self.habitat.data.agent_from_bone_rest, self.ego, **how)
+
+
+def folders_of(build: Path, animal: str | None) -> dict[str, Path | None]:
+    """Return the folders of all animals of a build by name, that of a build of one named `ALONE`; None for
+    animals without a model, which are absent.
+
+    Raises REC-001 for an ``animal`` that is not among them, ART-003 where it has no model, or where none is
+    asked for and one of the home has none.
+    """
+    home = build / "animals"
+    found = sorted(path for path in home.iterdir() if path.is_dir()) if home.is_dir() else []
+    every = {path.name: path for path in found} or {ALONE: build}
+    asked = every if animal is None else {animal: None}
+    refuse_unknown(asked, every, where=f"environment: animal of {build}", kind="animal")
+    living = {name: path for name, path in every.items() if all((path / each).is_dir() for each in NEEDED)}
+    if missing := [name for name in asked if found and name not in living]:
+        remedy = "make <agent>.behavior, from longer recordings of it"
+        remedy += f"; or meet another one: animal={next(iter(living))!r}" if living else ""
+        raise InputError("ART-003", f"{missing[0]} has no behavior model", str(build), remedy)
+    return {name: living.get(name) for name in every} if found else {ALONE: build}
+
+
+def recorded_at(data: BehaviorData, window: int) -> tuple[Trajectory, int]:
+    """Return the recording of a window and the window's first frame in it."""
+    return data.trajectories[data.videos[int(data.video[window])]], int(data.start[window])
+
+
+def companions_of(
+    name: str, past_world: Mapping[str, Float[np.ndarray, "*life past_frame 3"]]
+) -> Float[np.ndarray, "*life companion past_frame 4"] | None:
+    """Return all animals but one as companions, from their past positions (meters); None if it is alone."""
+    others = [past_world[other] for other in past_world if other != name]
+    return as_companions(np.stack(others, axis=-3)) if others else None
+
+
+def moments_together(
+    data: Mapping[str, BehaviorData], leading: str, window: int, split: int = TRAIN
+) -> dict[str, int]:
+    """Return a window of each animal: the others' are the nearest in time to the ``window`` of the
+    ``leading`` one, preferably of the same recording, in which bodies do not overlap.
+
+    They are of ``split``, of any for an animal that has none in it.
+    """
+    windows, (track, start) = {leading: window}, recorded_at(data[leading], window)
+    placed, same = [_place(data[leading], window)], data[leading].videos[int(data[leading].video[window])]
+    for name in (other for other in data if other != leading):
+        mine = data[name]
+        known = mine.indices(split) if (mine.split == split).any() else np.arange(len(mine.split))
+        names = [mine.videos[video] for video in mine.video[known]]
+        begins = [
+            mine.trajectories[video].timestamp_s[begin] - track.timestamp_s[start]
+            for video, begin in zip(names, mine.start[known], strict=True)
+        ]
+        clearance_m = clearance_of(mine.agent_from_bone_rest)
+        order = known[np.lexsort((np.abs(begins), np.array(names) != same))]
+        away = (np.linalg.norm((np.stack(placed) - _place(mine, each))[:, [0, 2]], axis=-1) for each in order)
+        free = (each for each, apart in zip(order, away, strict=True) if (apart >= clearance_m).all())
+        windows[name] = int(next(free, order[0]))
+        placed.append(_place(mine, windows[name]))
+    return windows
+
+
+def _place(data: BehaviorData, window: int) -> Float[np.ndarray, "3"]:
+    track, start = recorded_at(data, window)
+    return track.world_from_agent[start + data.past - 1, :3, 3]
