@@ -25,15 +25,16 @@ SEQUENTIAL_REDUCTION = 8
 
 
 def vectorized_speed(world: AnimalWorld, count: int, steps: int) -> tuple[float, float]:
-    """Return animal-steps per second and plans per animal-step of ``count`` animals in parallel."""
+    """Return animal-steps per second and plans per animal-step of ``count`` lives in parallel."""
     rng = np.random.default_rng(0)
     world.begin(count, rng)
-    start, planned = time.process_time(), world.animals.plans_drawn
+    start, planned = time.process_time(), sum(batch.plans_drawn for batch in world.batches.values())
     for _ in range(steps):
         world.step(rng.uniform(-1, 1, (count, world.action_size)))
         person_observation(world)
-    seconds = time.process_time() - start
-    return count * steps / seconds, (world.animals.plans_drawn - planned) / (count * steps)
+    seconds, lived = time.process_time() - start, count * steps * len(world.batches)
+    drawn = sum(batch.plans_drawn for batch in world.batches.values()) - planned
+    return lived / seconds, drawn / lived
 
 
 def sequential_speed(

@@ -7,6 +7,7 @@ import warnings
 
 import numpy as np
 import pytest
+import torch
 
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import BehaviorNets
@@ -243,6 +244,20 @@ def test_rewards_have_their_documented_values():
     assert REWARDS["approach"](near).tolist() == pytest.approx([5.4, -4.9])
     assert REWARDS["follow"](near).tolist() == pytest.approx([-0.6, -0.3])
     assert REWARDS["calm"](near).tolist() == [0.0, -0.5]
+
+
+def test_builds_of_one_animal_live_as_before_homes_of_several():
+    torch.manual_seed(0)
+    world = small_world()
+    world.begin(2, np.random.default_rng(4))
+    for step in range(30):
+        world.step(np.full((2, 3), 0.2))
+        if step == 14:
+            world.restart(np.array([1]))
+    found = np.concatenate([world.animal_position, world.persons.position], axis=1)
+    expected = [[1.3488, 0.1976, -0.3812, 1.9933, -1.7186], [0.3910, 0.2131, 0.3743, -0.3478, 0.1005]]
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+    assert world.names == ("animal",) and world.animals.companions is None
 
 
 def test_folder_without_model_is_refused(tmp_path):

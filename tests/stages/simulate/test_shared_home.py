@@ -5,10 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from pipeline.behavior.diffusion import Schedule
-from pipeline.behavior.model import BehaviorNets
 from pipeline.behavior.trajectories import BehaviorData
 from pipeline.core.errors import InputError
 from pipeline.data import npz, ply
@@ -16,8 +13,7 @@ from pipeline.geometry.meshes import Mesh
 from stages.simulate import stage
 from stages.simulate.config import Config
 from stages.simulate.inputs import Inputs
-from stages.train_behavior.export import write_contract
-from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, scaling, wandering
+from tests.pipeline.environments.home_of_two import write_animals
 
 SETTINGS = Config(seconds=6.0, observer="away", seed=3, goal_steps=4, sequence_steps=2)
 
@@ -25,20 +21,11 @@ SETTINGS = Config(seconds=6.0, observer="away", seed=3, goal_steps=4, sequence_s
 @pytest.fixture(scope="module")
 def animals(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two animals recorded in the same sessions in one room."""
-    folder, volume = tmp_path_factory.mktemp("animals"), room()
-    for seed, name in enumerate(("cat", "dog")):
-        for artifact in ("behavior_data", "behavior", "reconstruction"):
-            (folder / name / artifact).mkdir(parents=True)
-            (folder / name / artifact / "manifest.json").write_text("{}")
-        wandering(seed).save(folder / name / "behavior_data")
-        known = {"allowed": (volume.occupancy == 0).astype(np.uint8), "stands_m": np.full((2, 2), np.nan)}
-        npz.save(folder / name / "behavior_data/volume.npz", **vars(volume), **known)
-        torch.manual_seed(seed)
-        nets = BehaviorNets(ARCHITECTURE)
-        attentive = [parameter for member in nets.perception for parameter in member.others.parameters()]
-        for parameter in (*attentive, *nets.goal.parameters()):
-            torch.nn.init.normal_(parameter, std=0.3)
-        write_contract(folder / name / "behavior", nets, ARCHITECTURE, scaling(), Schedule(), REST)
+    folder = tmp_path_factory.mktemp("animals")
+    write_animals(folder)
+    for name in ("cat", "dog"):
+        (folder / name / "reconstruction").mkdir()
+        (folder / name / "reconstruction/manifest.json").write_text("{}")
         corners = np.array([[-2, 0, -2], [2, 0, -2], [2, 0, 2], [-2, 0, 2]], np.float32)
         floor = Mesh(corners, np.array([[0, 2, 1], [0, 3, 2]], np.int32), np.full((4, 3), 200, np.uint8))
         ply.write_ply(folder / name / "reconstruction/scene.ply", floor)
