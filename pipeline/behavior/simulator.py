@@ -102,16 +102,11 @@ class AnimalBatch:
         self.played, self.planned_others = np.zeros(len(root), int), self._others_now()
         self.intent_end = np.full(len(root), self.plan_frames)
 
-    def restart(
-        self,
-        some: Int[np.ndarray, "some"],
-        context: Context,
-        companions: Float[np.ndarray, "some companion past_frame 4"] | None = None,
-    ) -> None:
-        """Restart some of the animals, each from a window of its own; ``companions`` as in `begin`."""
+    def restart(self, some: Int[np.ndarray, "some"], context: Context) -> None:
+        """Restart some of the animals, each from a window of its own, with its companions if it has any."""
         bones = channels_from_bones(context.agent_from_bone, self.rest)
-        if self.companions is not None and companions is not None:
-            self.companions[some] = companions
+        if self.companions is not None and context.companions is not None:
+            self.companions[some] = context.companions
         if self.video is not None and context.video is not None:
             self.video[some] = context.video
         for frame in range(len(self.past)):
@@ -174,10 +169,8 @@ class AnimalBatch:
     ) -> Float[np.ndarray, "some companion past_frame 4"] | None:
         """Return past positions and kinds of all others but the observer; NaN if of another life."""
         found = [] if self.companions is None else [self.companions[some]]
-        together = self._together(some)
-        if together is not None:
-            mine = as_companions(self.past_world)
-            found.append(np.where(together[..., None, None], mine, np.nan))
+        if (together := self._together(some)) is not None:
+            found.append(np.where(together[..., None, None], as_companions(self.past_world), np.nan))
         return np.concatenate(found, axis=1) if found else None
 
     def _others_now(self) -> Float[np.ndarray, "animal other 3"]:

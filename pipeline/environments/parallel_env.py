@@ -81,18 +81,15 @@ class PersonAnimalEnv(ParallelEnv):
         reward, over, late, agents = float(rewards[0]), bool(ended[0]), bool(out_of_time), self.agents
         if over or late:
             self.agents = []
-        target = self.world.target
+        earned = dict.fromkeys(agents, 0.0) | {PERSON: reward, self.world.target: -reward}
+        away = {name: float(self.world.distance_of_m(name)[0]) for name in self.world.batches}
+        away[PERSON] = away[self.world.target]
         return (
             self._observations(),
-            dict.fromkeys(agents, 0.0) | {PERSON: reward, target: -reward},
+            earned,
             dict.fromkeys(agents, over),
             dict.fromkeys(agents, late),
-            {
-                agent: {
-                    "distance_m": float(self.world.distance_of_m(target if agent == PERSON else agent)[0])
-                }
-                for agent in agents
-            },
+            {agent: {"distance_m": away[agent]} for agent in agents},
         )
 
     def render(self):

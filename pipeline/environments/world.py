@@ -120,13 +120,13 @@ class AnimalWorld:
         zeros = np.zeros((count, 2))
         self.persons = Persons(zeros.copy(), np.zeros(count), zeros.copy())
         self.video = np.zeros(count, int)
-        for name, (context, companions) in self._drawn(np.arange(count), split).items():
-            self.batches[name].begin(context, rng, companions=companions)
+        for name, context in self._drawn(np.arange(count), split).items():
+            self.batches[name].begin(context, rng, companions=context.companions)
 
     def restart(self, some: Int[np.ndarray, "some"], split: str = "train") -> None:
         """Begin some lives anew, by their indices."""
-        for name, (context, companions) in self._drawn(some, split).items():
-            self.batches[name].restart(some, context, companions)
+        for name, context in self._drawn(some, split).items():
+            self.batches[name].restart(some, context)
 
     def step(self, action: Any) -> StepOutcome:
         """Move the persons by their actions (person x command, -1..1 of the highest speeds) and let the
@@ -262,18 +262,13 @@ class AnimalWorld:
             blocked[mine] = self.floors[number].blocks(points[mine])
         return blocked
 
-    def _drawn(
-        self, some: Int[np.ndarray, "some"], split: str
-    ) -> dict[str, tuple[Context, Float[np.ndarray, "some companion past_frame 4"] | None]]:
-        """Draw each animal's windows and companions for some lives, and where the persons have stood, facing
-        the target.
-        """
+    def _drawn(self, some: Int[np.ndarray, "some"], split: str) -> dict[str, Context]:
+        """Draw each animal's windows for some lives, and where the persons have stood, facing the target."""
         data = {name: each.habitat.data for name, each in self.residents.items()}
-        led = self._moments(len(some), split)
-        begun = [moments_together(data, self.target, int(window), SPLITS[split]) for window in led]
-        contexts = {
-            name: mine.windows(np.array([row[name] for row in begun]))[0] for name, mine in data.items()
-        }
+        chosen = self._moments(len(some), split)
+        begun = [moments_together(data, self.target, int(window), SPLITS[split]) for window in chosen]
+        windows = {name: np.array([row[name] for row in begun]) for name in data}
+        contexts = {name: data[name].windows(each)[0] for name, each in windows.items()}
         video = contexts[self.target].video
         assert video is not None, "windows of data always name their recording"
         self.video[some] = video
@@ -284,9 +279,10 @@ class AnimalWorld:
             ahead = here[self.target] - self.persons.position[row]
             self.persons.heading[row] = np.arctan2(ahead[0], ahead[1])
             self.persons.velocity[row] = 0.0
-        seen = {"observer_world": np.repeat(self.eyes[some][:, None], self.data.past, axis=1)}
+        observer = np.repeat(self.eyes[some][:, None], self.data.past, axis=1)
+        seen: dict[str, Any] = {"observer_world": observer, "observer_rotation": None}
         return {
-            name: (replace(context, observer_rotation=None, **seen), companions_of(name, past))
+            name: replace(context, companions=companions_of(name, past), **seen)
             for name, context in contexts.items()
         }
 
