@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from jaxtyping import Float
 from pettingzoo import ParallelEnv
 
 from pipeline.behavior.simulator import AnimalBatch

@@ -43,7 +43,7 @@ def three(pair, tmp_path):
 def test_gymnasium_checker_passes(pair, animal):
     from gymnasium.utils.env_checker import check_env
 
-    import pipeline.environments.registration  # noqa: F401
+    import pipeline.environments  # noqa: F401
 
     how = {"config": QUICK, "episode_s": 3.0, "animal": animal}
     env = gymnasium.make("AgentToSim/Cat-v0", build=str(pair), **how)
@@ -124,7 +124,7 @@ def test_animals_begin_apart_and_restart_together(pair):
 
 
 def test_vectorized_lives_are_seeded_and_others_are_where_they_are(pair):
-    import pipeline.environments.registration  # noqa: F401
+    import pipeline.environments  # noqa: F401
 
     lives = []
     for _ in range(2):
