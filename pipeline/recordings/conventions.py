@@ -21,6 +21,8 @@ UNUSABLE_FACTOR = 4.0
 """residual, in tolerances, beyond which poses are wrong and not merely drifting"""
 UNIT_FACTORS = (0.1, 0.2, 0.5, 2.0, 5.0, 10.0)
 """ratios of units of depth in use: 0.1, 0.2, 1 and 10 mm"""
+MAX_COST_SHARE = 0.5
+"""another convention or unit is preferred if its cost is below this share of the stored one's"""
 MIN_OVERLAP = 0.25
 MIN_TURN_RAD = np.radians(3.0)
 MIN_SHIFT_M = 0.05
@@ -84,6 +86,8 @@ class PoseCheck:
     """median over pairs of the median depth difference; NaN when nothing could be compared"""
     tolerance_m: float = TOLERANCE_M
     """allowed residual, which grows with depth"""
+    depth_factor: float = 1.0
+    """factor on the stored depth with which it would agree with the poses"""
 
 
 def odometry_from_pose(
@@ -120,22 +124,33 @@ def check_poses(
         for convention in among
     }
     check = _judge(scores, documented)
-    odometry = odometry_from_pose(pose[frames], check.convention)
-    return replace(check, reason=check.reason + _unit_hint(odometry, pairs_of_views, views, check))
+    if check.verdict == "other":
+        return check
+    factor = _depth_factor(
+        odometry_from_pose(pose[frames], documented), pairs_of_views, views, scores[documented]
+    )
+    if factor == 1:
+        return check
+    reason = f"poses contradict the depth; depth times {factor:g} would agree with them: check its unit"
+    return replace(check, verdict="unusable", reason=reason, depth_factor=factor)
 
 
-def _unit_hint(
-    odometry_from_camera: np.ndarray, pairs: np.ndarray, views: Sequence[DepthPicture], check: PoseCheck
-) -> str:
-    """Say in which other unit the depth would agree with poses that do not explain it as stored, if any."""
-    best, hint = UNUSABLE_FACTOR, ""
-    for factor in UNIT_FACTORS if check.verdict == "unusable" else ():
+def _depth_factor(
+    odometry_from_camera: np.ndarray, pairs: np.ndarray, views: Sequence[DepthPicture], stored: "_Score"
+) -> float:
+    """Return the factor of another unit in which the depth clearly agrees better with the poses, or 1.
+
+    The cost must fall both in meters, which errors of the poses keep, and relative to the depth, which noise
+    of the depth keeps: so neither is taken for another unit.
+    """
+    best, found = UNUSABLE_FACTOR, 1.0
+    for factor in UNIT_FACTORS:
         scaled = [replace(view, depth=view.depth * np.float32(factor)) for view in views]
         score = _score(odometry_from_camera, pairs, scaled)
-        if score.residual_m < min(best * score.tolerance_m, factor * check.tolerance_m):
-            best = score.residual_m / score.tolerance_m
-            hint = f"; depth times {factor:g} would agree with them: check its unit"
-    return hint
+        clearly = score.cost < MAX_COST_SHARE * min(1.0, factor) * stored.cost
+        if clearly and score.residual_m < min(best * score.tolerance_m, factor * stored.tolerance_m):
+            best, found = score.residual_m / score.tolerance_m, factor
+    return found
 
 
 @dataclass(frozen=True)
@@ -217,7 +232,7 @@ def _judge(scores: dict[Convention, _Score], documented: Convention) -> PoseChec
     verdict: Verdict = "documented"
     if score.accepted:
         reason = "the documented convention explains the depth"
-    elif scores[best].accepted and scores[best].cost < 0.5 * score.cost:
+    elif scores[best].accepted and scores[best].cost < MAX_COST_SHARE * score.cost:
         verdict, documented, score = "other", best, scores[best]
         reason = f"the documented convention is refuted by the depth; {best} explains it"
     elif score.residual_m < UNUSABLE_FACTOR * score.tolerance_m and score.overlap > MIN_OVERLAP:

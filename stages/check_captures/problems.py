@@ -108,7 +108,7 @@ def _of_depth(seen: CaptureMeasurements, role: Role) -> dict[str, str]:
         found["CAP-037"] = f"{1 - sample.depth_valid:.0%} of the depth is unknown"
     if sample.beyond > MAX_BEYOND:
         found["CAP-038"] = f"{sample.beyond:.0%} of the depth is beyond the sensor's range"
-    if seen.misalignment:
+    if seen.misalignment and sample.plan.pose_check.depth_factor == 1:
         found["CAP-060"] = f"depth steps lie on edges of pictures if the depth camera {seen.misalignment}"
     return found
 

@@ -10,14 +10,14 @@ from tests.stages import textured_room
 from tests.stages.extract_frames.made_recordings import COLOR_SIZE, DEPTH_SIZE, walk
 
 
-def _check(made, pose, size=1.0):
-    """Check poses of a walk through a room scaled by a factor, with LiDAR noise."""
+def _check(made, pose, size=1.0, unit=1.0):
+    """Check poses of a walk through a room scaled by a factor, with LiDAR noise, in some unit."""
     intrinsics = cameras.scale_intrinsics(made.intrinsics, COLOR_SIZE, DEPTH_SIZE)
     rng = np.random.default_rng(0)
 
     def view(frame):
         noisy = size * made.depth(frame) + rng.normal(0, 0.003, DEPTH_SIZE)
-        return conventions.DepthPicture(noisy, intrinsics)
+        return conventions.DepthPicture(unit * noisy, intrinsics)
 
     return conventions.check_poses(pose, made.timestamp_s, view)
 
@@ -93,6 +93,37 @@ def test_drifting_poses_are_accepted_in_rooms_of_any_size(size):
     check = _check(made, pose, size)
     assert check.verdict == "documented"
     assert check.tolerance_m < check.residual_m < 4 * check.tolerance_m
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor", "speed"),
+    [
+        (0.1, 10, 0.3),
+        (0.1, 10, 1),
+        (0.2, 5, 0.3),
+        (0.5, 2, 1),
+        (1, 1, 0.3),
+        (1, 1, 1),
+        (2, 0.5, 1),
+        (10, 0.1, 0.3),
+    ],
+)
+def test_depth_in_another_unit_is_not_taken_for_drift(unit, factor, speed):
+    """Near depth differs by few centimeters even if its unit is wrong."""
+    made = walk(60)
+    made.timestamp_s[:] /= speed
+    check = _check(made, made.poses(), unit=unit)
+    assert check.depth_factor == factor
+    assert (check.verdict == "unusable") == (unit != 1)
+
+
+@pytest.mark.parametrize("shake_m", [0.03, 0.06, 0.1, 0.2])
+def test_shaking_poses_of_a_turning_phone_are_not_taken_for_another_unit(shake_m):
+    made, rng = walk(60), np.random.default_rng(0)
+    made.world_from_camera[:, :3, 3] = made.world_from_camera[0, :3, 3]
+    pose = made.poses()
+    pose[:, 4:] += rng.normal(0, shake_m / np.sqrt(3), (60, 3))
+    assert _check(made, pose).depth_factor == 1
 
 
 def test_static_phone_is_inconclusive():

@@ -102,7 +102,7 @@ def _drift(made):
 
 def _near(made):
     inner = made.depth
-    made.depth = lambda frame: (inner(frame) / 2).astype("<f4")
+    made.depth = lambda frame: (0.8 * inner(frame)).astype("<f4")
 
 
 def _turning(made):
@@ -221,6 +221,17 @@ def test_depth_of_a_camera_beside_the_color_camera_is_reported(shift_m, found):
         shots.append(dataclasses.replace(colored, depth=moved))
     assert found in alignment.misalignment(shots)
     assert bool(found) == bool(alignment.misalignment(shots))
+
+
+@pytest.mark.parametrize(("factor", "codes"), [(1.0, {"CAP-060"}), (10.0, {"CAP-050"})])
+def test_another_unit_of_depth_hides_what_follows_from_it(tmp_path, factor, codes):
+    """Depth of a wrong unit is reprojected to a wrong place."""
+    sample = sampling.sample(open_recording(_made().write(tmp_path / "a.r3d")), 20, max_depth_m=6.0)
+    check = dataclasses.replace(sample.plan.pose_check, depth_factor=factor)
+    odometry = sample.plan.odometry_from_camera if factor == 1 else None
+    plan = dataclasses.replace(sample.plan, pose_check=check, odometry_from_camera=odometry)
+    seen = problems.CaptureMeasurements(dataclasses.replace(sample, plan=plan), misalignment="is elsewhere")
+    assert {each.code for each in problems.problems(seen, "heldout")} == codes
 
 
 def test_movers_are_counted():
