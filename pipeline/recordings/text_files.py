@@ -13,6 +13,8 @@ INTRINSICS = ("intrinsics.txt", "camera-intrinsics.txt", "camera_matrix.csv")
 """3 x 3 or 4 x 4 matrix, or the four numbers fx fy cx cy, in color pixels"""
 DEPTH_INTRINSICS, DEPTH_FROM_COLOR = "depth_intrinsics.txt", "depth_from_color.txt"
 """intrinsics of a separate depth camera, in depth pixels, and its extrinsics: a 4 x 4 matrix, meters"""
+MAX_BASELINE_M = 0.5
+"""largest distance of two cameras of one handheld device"""
 
 
 def lines(container: Container, name: str) -> list[str]:
@@ -83,7 +85,8 @@ def depth_camera(
     """Return the depth camera of `depth_intrinsics.txt` and `depth_from_color.txt`, if any, and a remark.
 
     ``sizes`` are (height, width) of color and of depth as stored. Without the latter file the cameras have
-    the same pose, without the former the same lens. Raises CAP-004 for a matrix that is not a rigid motion.
+    the same pose, without the former the same lens. Raises CAP-004 for a matrix that is not a rigid motion
+    or moves too far.
     """
     color_size, depth_size = sizes
     if not {DEPTH_INTRINSICS, DEPTH_FROM_COLOR} & container.names:
@@ -99,6 +102,10 @@ def depth_camera(
             why = "it is no rigid motion: rotation and translation in meters, four rows"
             raise errors.broken_metadata(container.place(DEPTH_FROM_COLOR), why)
     found = DepthCamera(intrinsics, depth_from_color)
+    if found.baseline_m > MAX_BASELINE_M:
+        what = f"its cameras are {found.baseline_m:g} m apart, further than in one device"
+        remedy = "write the translation, the last column, in meters, not in millimeters"
+        raise InputError("CAP-004", what, container.place(DEPTH_FROM_COLOR), remedy)
     return found, (depth_camera_remark(found, color_intrinsics),)
 
 

@@ -71,3 +71,7 @@ def test_sidecar_describes_the_depth_camera(tmp_path):
     (folder / "depth_from_color.txt").write_text("2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
     with pytest.raises(InputError, match="CAP-004"):
         open_recording(folder)
+    for apart in ("30", "2.5"):
+        (folder / "depth_from_color.txt").write_text(f"1 0 0 {apart}\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+        with pytest.raises(InputError, match=f"(?s)CAP-004.*{apart} m apart.*in meters"):
+            open_recording(folder)
