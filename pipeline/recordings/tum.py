@@ -24,6 +24,10 @@ PER_METER, OTHERS = 5000.0, (1000.0, 10_000.0)
 """depth units per meter of the data set, and of other cameras"""
 MAX_RESIDUAL_RATIO = 0.6
 """another unit is chosen if their residual is below this share of the other unit's"""
+TIME_UNITS = {1.0: "seconds", 1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+"""names of units of time, by units per second"""
+LONGEST_STEP_S = 8.0
+"""typical steps beyond this are in a smaller unit: RGB-D cameras take at most 125 pictures per second"""
 NEAREST_S = 0.02
 """maximum time difference between a color picture, its depth and its pose, seconds"""
 DEFAULT = (525.0, 525.0, 319.5, 239.5)
@@ -38,8 +42,10 @@ def open_recording(path: Path) -> Recording:
         raise errors.no_depth(container.where, "depth.txt lists nothing")
     if not color:
         raise errors.no_frames(container.where, "rgb.txt lists nothing")
-    times = np.array([time for time, _ in color])
-    partner = nearest(times, np.array([time for time, _ in depth_files]), NEAREST_S)
+    ticks, depth_ticks = (np.array([time for time, _ in files]) for files in (color, depth_files))
+    per_second = units_per_second(ticks)
+    times = ticks / per_second
+    partner = nearest(times, depth_ticks / per_second, NEAREST_S)
     paired = np.flatnonzero(partner >= 0)
     pairs = [(color[i][1], depth_files[partner[i]][1]) for i in paired]
     present = np.array([set(pair) <= container.names for pair in pairs], bool)
@@ -50,7 +56,9 @@ def open_recording(path: Path) -> Recording:
     default = DEFAULT if color_size == DEFAULT_SIZE else None
     intrinsics, remarks = text_files.read_intrinsics(container, len(pairs), default)
     camera, camera_remarks = text_files.depth_camera(container, intrinsics[0], (color_size, depth_size))
-    pose = _poses(container, times[paired])
+    pose = _poses(container, times[paired], per_second)
+    if per_second != 1:
+        remarks += (f"time stamps seem to be {TIME_UNITS[per_second]}, and are read as such",)
 
     def view(number: int, per_meter: float) -> DepthPicture:
         depth = container.meters(pairs[number][1], depth_size, per_meter)
@@ -72,6 +80,12 @@ def open_recording(path: Path) -> Recording:
         remarks=remarks + scale_remarks + camera_remarks,
         listed=len(present),
     )
+
+
+def units_per_second(times: Float[np.ndarray, "frame"]) -> float:
+    """Return the units per second of increasing times of pictures, the largest unit that is plausible."""
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    return next((each for each in TIME_UNITS if step <= LONGEST_STEP_S * each), max(TIME_UNITS))
 
 
 def nearest(
@@ -102,7 +116,7 @@ def _listed(container: FolderContainer, name: str) -> list[tuple[float, str]]:
 
 
 def _poses(
-    container: FolderContainer, times: Float[np.ndarray, "frame"]
+    container: FolderContainer, times: Float[np.ndarray, "frame"], per_second: float
 ) -> Float[np.ndarray, "frame 7"] | None:
     """Return the pose nearest in time to each frame, NaN if there is none within 20 ms."""
     if "groundtruth.txt" not in container.names:
@@ -112,7 +126,7 @@ def _poses(
     if len(table) == 0:
         return None
     table = table[np.argsort(table[:, 0], kind="stable")]
-    partner = nearest(times, table[:, 0], NEAREST_S)
+    partner = nearest(times, table[:, 0] / per_second, NEAREST_S)
     pose = table[partner][:, [4, 5, 6, 7, 1, 2, 3]]
     pose[partner < 0] = np.nan
     return pose

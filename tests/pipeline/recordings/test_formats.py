@@ -322,6 +322,27 @@ def test_depth_scale_file_gives_the_depth_unit(tmp_path):
             open_recording(path)
 
 
+@pytest.mark.parametrize(
+    ("per_second", "unit"), [(1, ""), (1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")]
+)
+def test_time_stamps_in_other_units_are_read(tmp_path, per_second, unit):
+    made = walk(12)
+    path = made_formats.tum(tmp_path / "a", made)
+    for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):
+        cells = [line.split(" ", 1) for line in (path / name).read_text().splitlines() if line[0] != "#"]
+        lines = [f"{float(time) * per_second:.6f} {rest}" for time, rest in cells]
+        (path / name).write_text("\n".join(lines))
+    recording = open_recording(path)
+    np.testing.assert_allclose(recording.timestamp_s, made.timestamp_s, atol=1e-5)
+    assert np.isfinite(recording.pose).all()
+    assert any(f"seem to be {unit}" in each for each in recording.remarks) == bool(unit)
+
+
+@pytest.mark.parametrize(("seconds", "per_second"), [(0.01, 1), (1 / 30, 1), (5, 1), (0.01, 1e3), (1, 1e3)])
+def test_unit_of_time_is_guessed_by_the_frame_rate(seconds, per_second):
+    assert tum.units_per_second(np.arange(9.0) * seconds * per_second) == per_second
+
+
 def test_streams_are_associated_by_time():
     times = np.array([0.0, 0.1, 0.2, 5.0])
     assert tum.nearest(times, np.array([0.015, 0.19]), 0.02).tolist() == [0, -1, 1, -1]
