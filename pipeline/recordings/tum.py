@@ -47,11 +47,15 @@ def open_recording(path: Path) -> Recording:
     times = ticks / per_second
     partner = nearest(times, depth_ticks / per_second, NEAREST_S)
     paired = np.flatnonzero(partner >= 0)
+    if not len(paired):
+        raise errors.no_frames(container.where, "no color picture has depth within 20 ms")
     pairs = [(color[i][1], depth_files[partner[i]][1]) for i in paired]
     present = np.array([set(pair) <= container.names for pair in pairs], bool)
+    if not present.any():
+        absent = [name for pair in pairs for name in pair if name not in container.names]
+        which = f"{len(absent)} of {2 * len(pairs)} listed files, e.g. {absent[0]},"
+        raise errors.no_frames(container.where, f"{which} do not exist; links are not followed")
     paired, pairs = paired[present], [pair for pair, there in zip(pairs, present, strict=True) if there]
-    if not pairs:
-        raise errors.no_frames(container.where, "no color picture has depth within 20 ms")
     color_size, depth_size = container.color(pairs[0][0]).shape[:2], container.meters(pairs[0][1]).shape
     default = DEFAULT if color_size == DEFAULT_SIZE else None
     intrinsics, remarks = text_files.read_intrinsics(container, len(pairs), default)

@@ -343,6 +343,17 @@ def test_unit_of_time_is_guessed_by_the_frame_rate(seconds, per_second):
     assert tum.units_per_second(np.arange(9.0) * seconds * per_second) == per_second
 
 
+def test_listed_files_that_are_absent_are_named(tmp_path):
+    path = made_formats.tum(tmp_path / "a", walk(6))
+    (path / "depth").rename(tmp_path / "elsewhere")
+    first = (path / "depth.txt").read_text().split()[-11]
+    with pytest.raises(InputError, match=f"CAP-007.*6 of 12 listed files, e.g. {first}, do not exist"):
+        open_recording(path)
+    (path / "rgb").rename(tmp_path / "rgb")
+    with pytest.raises(InputError, match="CAP-007.*12 of 12 listed files, e.g. rgb/.*do not exist"):
+        open_recording(path)
+
+
 def test_streams_are_associated_by_time():
     times = np.array([0.0, 0.1, 0.2, 5.0])
     assert tum.nearest(times, np.array([0.015, 0.19]), 0.02).tolist() == [0, -1, 1, -1]
