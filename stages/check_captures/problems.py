@@ -3,6 +3,7 @@
 CAP-001 to CAP-022 (cannot be read or used) come from `pipeline.recordings`; these here are warnings.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,7 +89,7 @@ def _of_pictures(sample: RecordingSample, role: Role) -> dict[str, str]:
     elif sample.damaged > MAX_DAMAGED:
         found["CAP-030"] = f"{sample.damaged:.0%} of the pictures are damaged or missing"
     if sample.duration_s < SHORTEST_S[role]:
-        found["CAP-031"] = f"only {sample.duration_s:.0f} s long"
+        found["CAP-031"] = f"only {math.floor(10 * sample.duration_s) / 10:g} s long"
     if sample.dark > MAX_DARK:
         found["CAP-032"] = f"{sample.dark:.0%} of the pictures are dark"
     if sample.blurred > MAX_BLURRED:

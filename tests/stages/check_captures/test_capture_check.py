@@ -129,6 +129,10 @@ def test_problem_is_reported_with_its_code(tmp_path, code):
 
 def test_short_or_sparse_recording_is_reported(tmp_path):
     assert "CAP-031" in _codes(_made(3.0).write(tmp_path / "a.r3d"))
+    sample = sampling.sample(open_recording(tmp_path / "a.r3d"), 20, max_depth_m=6.0)
+    times = np.linspace(0.0, 4.96, len(sample.recording.index))
+    almost = dataclasses.replace(sample, recording=dataclasses.replace(sample.recording, timestamp_s=times))
+    assert problems._of_pictures(almost, "heldout")["CAP-031"] == "only 4.9 s long"
     sparse = _made(12.0, rate_hz=1.0)
     assert "CAP-035" in _codes(made_formats.polycam(tmp_path / "b", sparse), "session")
     assert "CAP-035" not in _codes(tmp_path / "b", "walkthrough")
