@@ -59,7 +59,7 @@ REMEDIES = {
     "CAP-037": "avoid mirrors, glass and black things; do not cover the sensor",
     "CAP-038": "stay within 4 m of floor, walls and animal",
     "CAP-039": "record it with a LiDAR phone, or let a session with depth go where it went",
-    "CAP-050": "correct a unit that is named; begin when tracking is ready; the build goes on, less surely",
+    "CAP-050": "begin when tracking is ready; the build goes on without them, less surely",
     "CAP-051": "nothing to do; if pictures look wrong, report the app's version",
     "CAP-052": "move smoothly, keep textured things in view; the build repairs what depth shows",
     "CAP-053": "film the walk-through again and include this part of the room, or leave the file out",
@@ -77,8 +77,19 @@ def problems(seen: CaptureMeasurements, role: Role) -> list[CaptureProblem]:
     """Return what is wrong with a recording in its role, worst first."""
     found = _of_pictures(seen.sample, role) | _of_depth(seen, role)
     found |= _of_poses(seen) | _of_content(seen, role)
-    remedies = REMEDIES | {"CAP-031": f"record at least {SHORTEST_S[role]:.0f} s for a {role}"}
+    remedies = REMEDIES | _remedies(seen, role)
     return [CaptureProblem(code, what, remedies[code]) for code, what in found.items()]
+
+
+def _remedies(seen: CaptureMeasurements, role: Role) -> dict[str, str]:
+    """Return the remedies that depend on the recording."""
+    recording, plan = seen.sample.recording, seen.sample.plan
+    found = {"CAP-031": f"record at least {SHORTEST_S[role]:.0f} s for a {role}"}
+    if plan is not None and plan.pose_check.depth_factor != 1:
+        found["CAP-050"] = "correct the unit of its depth, or that of its poses"
+    elif recording.pose is None:
+        found["CAP-050"] = "add poses if its app can store them; the build finds the cameras, less surely"
+    return found
 
 
 def _of_pictures(sample: RecordingSample, role: Role) -> dict[str, str]:

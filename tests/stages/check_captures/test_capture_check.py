@@ -238,6 +238,17 @@ def test_another_unit_of_depth_hides_what_follows_from_it(tmp_path, factor, code
     assert {each.code for each in problems.problems(seen, "heldout")} == codes
 
 
+@pytest.mark.parametrize(("posed", "remedy"), [(True, "when tracking is ready"), (False, "add poses")])
+def test_remedy_for_missing_poses_depends_on_why_they_are_missing(tmp_path, posed, remedy):
+    made = _made(4.0, rate_hz=15.0)
+    folder = made_formats.video_and_depth(tmp_path / "a", made, poses=posed)
+    if posed:
+        (folder / "poses.txt").write_text("\n".join(f"{i} 0 0 0 0 0 0 1" for i in range(60)))
+    sample = sampling.sample(open_recording(folder), 20, max_depth_m=6.0)
+    found = problems.problems(problems.CaptureMeasurements(sample), "session")
+    assert remedy in {each.code: each.remedy for each in found}["CAP-050"]
+
+
 def test_movers_are_counted():
     def one(frame):
         return [((0.6 * np.sin(frame), 0.2, 0.6 * np.cos(frame)), 0.14)]
