@@ -5,10 +5,12 @@ CAP-001 to CAP-022 (cannot be read or used) come from `pipeline.recordings`; the
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from pipeline.core.videos import Role
+from pipeline.recordings.text_files import DEPTH_FROM_COLOR
 from stages.check_captures.moving_objects import MotionShare
 from stages.check_captures.parallax import Parallax
 from stages.check_captures.sampling import RecordingSample
@@ -89,6 +91,8 @@ def _remedies(seen: CaptureMeasurements, role: Role) -> dict[str, str]:
         found["CAP-050"] = "correct the unit of its depth, or that of its poses"
     elif recording.pose is None:
         found["CAP-050"] = "add poses if its app can store them; the build finds the cameras, less surely"
+    if Path(recording.where, DEPTH_FROM_COLOR).is_file():
+        found["CAP-060"] = f"check {DEPTH_FROM_COLOR} (is it the inverse?) and depth_intrinsics.txt"
     return found
 
 

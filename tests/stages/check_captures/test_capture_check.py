@@ -249,6 +249,16 @@ def test_remedy_for_missing_poses_depends_on_why_they_are_missing(tmp_path, pose
     assert remedy in {each.code: each.remedy for each in found}["CAP-050"]
 
 
+@pytest.mark.parametrize(("described", "remedy"), [(False, "describe the"), (True, "is it the inverse")])
+def test_a_described_depth_camera_is_to_be_checked(tmp_path, described, remedy):
+    folder = made_formats.video_and_depth(tmp_path / "a", _made(2.0, rate_hz=15.0))
+    if described:
+        (folder / "depth_from_color.txt").write_text("1 0 0 0.03\n0 1 0 0\n0 0 1 0\n0 0 0 1")
+    sample = sampling.sample(open_recording(folder), 20, max_depth_m=6.0)
+    found = problems.problems(problems.CaptureMeasurements(sample, misalignment="is elsewhere"), "session")
+    assert remedy in {each.code: each.remedy for each in found}["CAP-060"]
+
+
 def test_movers_are_counted():
     def one(frame):
         return [((0.6 * np.sin(frame), 0.2, 0.6 * np.cos(frame)), 0.14)]
