@@ -35,7 +35,8 @@ SIGNIFICANCE = 0.01
 DECOY_DEG = 3.0
 """rotation of deliberately wrong poses"""
 
-Clock = Literal["", "earlier", "later"]
+CLOCKS = (-2, -1, 1, 2)
+"""steps in time, in frames, by which depth and poses may be early or late"""
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,10 @@ class PosedPicture:
     gray: Num[np.ndarray, "height width"]
     """gray values 0 to 255; inside `check`, divided by local contrast"""
     intrinsics: Float[np.ndarray, "3 3"]
-    depth: dict[Clock, Float[np.ndarray, "depth_height depth_width"]]
-    """meters, 0 = unknown; of this frame and of those a little earlier and later"""
+    depth: dict[int, Float[np.ndarray, "depth_height depth_width"]]
+    """meters, 0 = unknown; of this frame (0) and of those `CLOCKS` later"""
     depth_intrinsics: Float[np.ndarray, "3 3"]
-    world_from_camera: dict[Clock, Float[np.ndarray, "4 4"]]
+    world_from_camera: dict[int, Float[np.ndarray, "4 4"]]
     """likewise; the world is the phone's own"""
 
 
@@ -64,8 +65,9 @@ class Reading:
     center: tuple[float, float] = (0.0, 0.0)
     """shift of the principal point, shares of width and height"""
     mirrored: tuple[Literal["picture", "depth"], ...] = ()
-    depth_of: Clock = ""
-    pose_of: Clock = ""
+    depth_of: int = 0
+    pose_of: int = 0
+    """frames by which depth or pose are taken later"""
     turn_deg: tuple[float, float] = (0.0, 0.0)
     """rotation of the second camera about its x and y axes"""
 
@@ -84,10 +86,8 @@ READINGS = (
     Reading("mirrored pictures", mirrored=("picture",)),
     Reading("mirrored depth", mirrored=("depth",)),
     Reading("mirrored pictures and depth", mirrored=("picture", "depth")),
-    Reading("the depth of earlier frames", depth_of="earlier"),
-    Reading("the depth of later frames", depth_of="later"),
-    Reading("the device poses of earlier frames", pose_of="earlier"),
-    Reading("the device poses of later frames", pose_of="later"),
+    *(Reading(f"depth {{:.2g}} s {'later' if step > 0 else 'earlier'}", depth_of=step) for step in CLOCKS),
+    *(Reading(f"poses {{:.2g}} s {'later' if step > 0 else 'earlier'}", pose_of=step) for step in CLOCKS),
 )
 DECOYS = tuple(
     Reading("wrong poses", turn_deg=turn)
@@ -126,8 +126,8 @@ class PictureAgreement:
                 return "too few pictures show the same things from another place"
 
 
-def check(pairs: Sequence[tuple[PosedPicture, PosedPicture]]) -> PictureAgreement:
-    """Compare the recording as stored with all readings and with deliberately wrong poses."""
+def check(pairs: Sequence[tuple[PosedPicture, PosedPicture]], step_s: float) -> PictureAgreement:
+    """Compare the recording as stored with all readings and with wrong poses; ``step_s``: between frames."""
     pairs = [(_normalized(first), _normalized(second)) for first, second in pairs]
     stored = np.array([correlation(*pair, STORED) for pair in pairs])
     pairs = [pair for pair, value in zip(pairs, stored, strict=True) if np.isfinite(value)]
@@ -141,7 +141,8 @@ def check(pairs: Sequence[tuple[PosedPicture, PosedPicture]]) -> PictureAgreemen
         values = np.array([correlation(*pair, reading) for pair in pairs])
         if beats(values, stored) and all(beats(values, each) for each in decoys):
             better = float(np.median(values[np.isfinite(values)])), int((values > stored).sum())
-            found.append(PictureAgreement("contradict", median, len(pairs), reading.what, *better))
+            what = reading.what.format(step_s * abs(reading.depth_of + reading.pose_of))
+            found.append(PictureAgreement("contradict", median, len(pairs), what, *better))
     if found:
         return max(found, key=lambda each: each.better_correlation)
     confirmed = all(beats(stored, each) for each in decoys)

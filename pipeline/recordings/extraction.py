@@ -16,7 +16,7 @@ from pipeline.data import images
 from pipeline.geometry import align, cameras, rigid
 from pipeline.geometry.subsampling import evenly
 from pipeline.mapping import picture_agreement
-from pipeline.mapping.picture_agreement import Clock, PictureAgreement, PosedPicture
+from pipeline.mapping.picture_agreement import CLOCKS, PictureAgreement, PosedPicture
 from pipeline.recordings import conventions, errors, upright
 from pipeline.recordings.conventions import PoseCheck
 from pipeline.recordings.recording import Picture, Recording, grid_size, reproject
@@ -39,8 +39,8 @@ NEAREST_TYPICAL_M, FARTHEST_TYPICAL = 0.1, 2.0
 """limits of the median depth: meters, and multiples of the maximum depth that is used"""
 MAX_STRETCHED, MAX_OFF_CENTER = 0.03, 0.15
 """maximum relative differences: of aspect ratios of pictures and depth, of principal point and middle"""
-AGREEMENT_PAIRS, AGREEMENT_GAP_S, CLOCK_FRAMES = 40, 1.2, 2
-"""pairs of pictures whose agreement is checked, seconds between the two, and frames of `Clock`"""
+AGREEMENT_PAIRS, AGREEMENT_GAP_S = 40, 1.2
+"""pairs of pictures whose agreement is checked, and seconds between the two"""
 SHARPNESS_WIDTH_PX = 240
 DARK = 0.15
 """mean brightness (0..1) below which a picture loses quality"""
@@ -257,15 +257,16 @@ def picture_agreement_of(
 ) -> PictureAgreement:
     """Check a recording's pictures against its depth, intrinsics and poses; without poses it is untested."""
     if plan.odometry_from_camera is None:
-        return picture_agreement.check([])
+        return picture_agreement.check([], 0.0)
     pairs = conventions.moving_pairs(
         plan.odometry_from_camera, plan.timestamp_s, AGREEMENT_PAIRS, AGREEMENT_GAP_S
     )
-    around = (pairs >= CLOCK_FRAMES) & (pairs < len(plan.chosen) - CLOCK_FRAMES)
+    around = (pairs >= -min(CLOCKS)) & (pairs < len(plan.chosen) - max(CLOCKS))
     pairs = pairs[around.all(1)]
     views = {row: _posed_picture(recording, plan, row, max_depth_m) for row in np.unique(pairs).tolist()}
     shown = [(views[first], views[second]) for first, second in pairs.tolist()]
-    return picture_agreement.check([(a, b) for a, b in shown if a is not None and b is not None])
+    step_s = float(np.median(np.diff(plan.timestamp_s))) if len(plan.chosen) > 1 else 0.0
+    return picture_agreement.check([(a, b) for a, b in shown if a is not None and b is not None], step_s)
 
 
 def _posed_picture(
@@ -275,8 +276,8 @@ def _posed_picture(
     color = picture(recording, int(plan.chosen[row]), plan.stored_size)
     if color is None or plan.odometry_from_camera is None:
         return None
-    rows: dict[Clock, int] = {"": row, "earlier": row - CLOCK_FRAMES, "later": row + CLOCK_FRAMES}
-    depth: dict[Clock, np.ndarray] = {
+    rows = {step: row + step for step in (0, *CLOCKS)}
+    depth = {
         clock: cameras.turn_image(
             stored_depth(recording, int(recording.index[plan.chosen[other]]), max_depth_m), plan.quarter_turns
         )

@@ -91,6 +91,11 @@ def _remedies(seen: CaptureMeasurements, role: Role) -> dict[str, str]:
         found["CAP-050"] = "correct the unit of its depth, or that of its poses"
     elif recording.pose is None:
         found["CAP-050"] = "add poses if its app can store them; the build finds the cameras, less surely"
+    agreement = seen.sample.agreement
+    if agreement is not None and agreement.better.endswith(("earlier", "later")):
+        found["CAP-057"] = (
+            "they were not taken at one time: shift the time stamps (or numbers) of one by that"
+        )
     if Path(recording.where, DEPTH_FROM_COLOR).is_file():
         found["CAP-060"] = f"check {DEPTH_FROM_COLOR} (is it the inverse?) and depth_intrinsics.txt"
     return found

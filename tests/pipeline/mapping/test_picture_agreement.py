@@ -28,7 +28,7 @@ def _recording(seed: int = 0, frames: int = 40) -> list[PosedPicture]:
         light = rng.uniform(0.5, 1.0), rng.normal(0, 3, size)
         color = hits.interpolate(mesh, mesh.color).reshape(*size, 3).mean(-1)
         gray.append(np.clip(light[0] * color + light[1], 0, 255).astype(np.uint8))
-    rows = {"": 0, "earlier": -CLOCK, "later": CLOCK}
+    rows = {step: step for step in (0, *picture_agreement.CLOCKS)}
     return [
         PosedPicture(
             gray[row],
@@ -42,7 +42,7 @@ def _recording(seed: int = 0, frames: int = 40) -> list[PosedPicture]:
 
 
 def _check(pictures: list[PosedPicture]) -> picture_agreement.PictureAgreement:
-    return picture_agreement.check(list(zip(pictures[:-APART], pictures[APART:], strict=True)))
+    return picture_agreement.check(list(zip(pictures[:-APART], pictures[APART:], strict=True)), 0.1)
 
 
 def _depth(factor):
@@ -82,9 +82,12 @@ def _mirrored(*parts):
     return faulty
 
 
-def _late(each):
-    earlier = each.depth["earlier"]
-    return replace(each, depth={"": earlier, "earlier": np.zeros_like(earlier), "later": each.depth[""]})
+def _late(frames):
+    def faulty(each):
+        nothing = np.zeros_like(each.depth[0])
+        return replace(each, depth={step: each.depth.get(step - frames, nothing) for step in each.depth})
+
+    return faulty
 
 
 FAULTS = {
@@ -95,7 +98,9 @@ FAULTS = {
     "mirrored pictures": _mirrored("picture"),
     "mirrored depth": _mirrored("depth"),
     "mirrored pictures and depth": _mirrored("picture", "depth"),
-    "the depth of later frames": _late,
+    "depth 0.2 s later": _late(2),
+    "depth 0.1 s later": _late(1),
+    "depth 0.1 s earlier": _late(-1),
 }
 
 
@@ -117,7 +122,7 @@ def test_correct_recording_agrees(seed):
 def test_unrelated_poses_are_not_confirmed():
     pictures, others = _recording(), textured_room.walk(40, seed=2)
     elsewhere = [
-        replace(each, world_from_camera=dict.fromkeys(("", "earlier", "later"), pose))
+        replace(each, world_from_camera=dict.fromkeys((0, *picture_agreement.CLOCKS), pose))
         for each, pose in zip(pictures, others[::-1], strict=True)
     ]
     assert _check(elsewhere).verdict == "unconfirmed"

@@ -259,6 +259,16 @@ def test_a_described_depth_camera_is_to_be_checked(tmp_path, described, remedy):
     assert remedy in {each.code: each.remedy for each in found}["CAP-060"]
 
 
+def test_remedy_for_late_depth_speaks_of_time(tmp_path):
+    sample = sampling.sample(open_recording(_made(2.0).write(tmp_path / "a.r3d")), 20, max_depth_m=6.0)
+    for better, remedy in (("depth 0.2 s later", "shift the time stamps"), ("mirrored depth", "mirrored it")):
+        agreement = picture_agreement.PictureAgreement("contradict", 0.5, 40, better, 0.9, 38)
+        seen = problems.CaptureMeasurements(dataclasses.replace(sample, agreement=agreement))
+        found = {each.code: each for each in problems.problems(seen, "heldout")}["CAP-057"]
+        assert f"agree better with {better} than as stored" in found.what
+        assert remedy in found.remedy
+
+
 def test_movers_are_counted():
     def one(frame):
         return [((0.6 * np.sin(frame), 0.2, 0.6 * np.cos(frame)), 0.14)]
