@@ -11,8 +11,9 @@ from jaxtyping import Float
 
 from pipeline.geometry import align, rigid
 from pipeline.mapping import sift
+from pipeline.mapping.picture_agreement import beats
 from pipeline.mapping.sift import SiftPoints
-from pipeline.recordings.conventions import DepthPicture, compare
+from pipeline.recordings.conventions import UNIT_FACTORS, DepthPicture, compare
 from stages.check_captures.sampling import SampledFrame
 
 POINTS = 600
@@ -64,6 +65,28 @@ def placed_share(
     meters = np.linalg.norm(places[:, None, :3, 3] - places[None, :, :3, 3], axis=-1)
     agreeing = int(((degrees < AGREE[0]) & (meters < AGREE[1])).sum(1).max())
     return agreeing / len(session) if agreeing >= 2 else 0.0
+
+
+def depth_factor(
+    walkthrough: Sequence[DescribedFrame], session: Sequence[DescribedFrame], rng: np.random.Generator
+) -> float:
+    """Return the factor with which a session's depth clearly better fits the walk-through: its unit; or 1.
+
+    Each frame is fitted to the walk-through's most similar one; a sign test compares inliers.
+    """
+    inliers = []
+    for frame in session if walkthrough else ():
+        pairs = [sift.matches(frame.points.descriptors, each.points.descriptors) for each in walkthrough]
+        best = int(np.argmax([len(each) for each in pairs]))
+        mine, theirs = pairs[best].T
+        points = frame.points.points_camera[mine], walkthrough[best].points.points_camera[theirs]
+        fit = {"threshold_m": WITHIN_M, "iterations": TRIALS, "rng": rng}
+        scaled = [(factor * points[0], points[1]) for factor in (1.0, *UNIT_FACTORS)]
+        inliers.append([float(align.ransac_rigid(*each, **fit)[1].sum()) for each in scaled])
+    stored, *others = np.array(inliers).reshape(-1, 1 + len(UNIT_FACTORS)).T
+    found = zip(UNIT_FACTORS, others, strict=True)
+    better = {each: inlier.sum() for each, inlier in found if beats(inlier, stored, len(UNIT_FACTORS))}
+    return max(better, key=lambda each: better[each], default=1.0)
 
 
 def _best_place(

@@ -71,10 +71,13 @@ def _seen(
     if role == "walkthrough":
         room += overlap.describe(sample.shots)
         return CaptureMeasurements(sample, drift_m, moving, misalignment=misalignment)
-    placed = None
+    placed, factor = None, 1.0
     if room and role != "turnaround":  # may be filmed anywhere: only the animal's template is made from it
-        placed = overlap.placed_share(room, overlap.describe(sample.shots), rng)
-    return CaptureMeasurements(sample, drift_m, moving, placed, misalignment=misalignment)
+        described = overlap.describe(sample.shots)
+        placed = overlap.placed_share(room, described, rng)
+        if sample.plan.odometry_from_camera is None:
+            factor = overlap.depth_factor(room, described, rng)
+    return CaptureMeasurements(sample, drift_m, moving, placed, None, misalignment, factor)
 
 
 def _described(name: str, role: Role, seen: CaptureMeasurements) -> str:

@@ -269,6 +269,26 @@ def test_remedy_for_late_depth_speaks_of_time(tmp_path):
         assert remedy in found.remedy
 
 
+@pytest.mark.parametrize("factor", [1.0, 5.0])
+def test_walk_through_gives_the_unit_of_depth_without_poses(tmp_path, factor):
+    room = overlap.describe(_shots(0, 24))
+    shots = [
+        dataclasses.replace(shot, depth=shot.depth / np.float32(factor), odometry_from_camera=None)
+        for shot in _shots(0, 20)
+    ]
+    assert overlap.depth_factor(room, overlap.describe(shots), np.random.default_rng(0)) == factor
+    folder = made_formats.video_and_depth(tmp_path / "a", _made(2.0, rate_hz=15.0), poses=False)
+    sample = sampling.sample(open_recording(folder), 20, max_depth_m=6.0)
+    seen = problems.CaptureMeasurements(sample, misalignment="is elsewhere", room_factor=factor)
+    found = {each.code: each.what for each in problems.problems(seen, "session")}
+    assert ("CAP-060" in found) == (factor == 1)
+    assert ("times 5 would agree with the walk-through's" in found["CAP-050"]) == (factor == 5)
+
+
+def test_no_unit_without_a_walk_through():
+    assert overlap.depth_factor([], overlap.describe(_shots(0, 4)), np.random.default_rng(0)) == 1
+
+
 def test_movers_are_counted():
     def one(frame):
         return [((0.6 * np.sin(frame), 0.2, 0.6 * np.cos(frame)), 0.14)]
