@@ -8,9 +8,11 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.distance import pdist
 
 from pipeline.data.clips import Clip
 from pipeline.geometry import align, cameras, ground, rigid
+from pipeline.geometry.subsampling import evenly
 from pipeline.mapping.bundle_adjustment import MAD_TO_SIGMA
 from pipeline.mapping.colmap import SparseModel
 from stages.build_scene_template.refine import Keyframe
@@ -28,6 +30,8 @@ HOPS = (1, 3, 8)
 """Index distances of keyframes whose depth images are compared."""
 GAP_QUANTILE, MIN_OVERLAP = 0.75, 50
 """Quantile of a pair's depth differences, and least number of overlapping points of a pair."""
+SCALE_CAMERAS = 300
+"""Most cameras whose distances are compared with odometry's."""
 MIN_DEPTH_M = 0.1
 """Smaller depth counts as missing, meters."""
 
@@ -43,8 +47,6 @@ class InitialTrajectory:
     registered: Int[np.ndarray, "key"]
     scale_deviation: float | None
     """Robust relative standard deviation of depth over SfM depth."""
-    odometry_scale: float | None
-    """Path length of odometry over that of SfM, at registered keyframes; ideally 1."""
     gap_m: dict[str, float]
     """`depth_gap` of each candidate trajectory."""
 
@@ -106,7 +108,7 @@ def choose_trajectory(
     """
     odometry = clip.odometry_from_camera
     gap = {} if odometry is None else {"odometry": depth_gap(keyframes, odometry[frames])}
-    deviation = ratio = poses = None
+    deviation = poses = None
     if sparse is None:
         reason, registered = "COLMAP found no model", np.zeros(0, int)
     elif (measured := metric_scale(sparse, clip)) is None:
@@ -118,15 +120,25 @@ def choose_trajectory(
         poses = propagate(clip, registered, poses)
         gap["colmap"] = depth_gap(keyframes, poses[frames])
         reason = _rejection_reason(len(registered) / len(frames), deviation, gap)
-        if odometry is not None:
-            steps = (np.diff(path[registered, :3, 3], axis=0) for path in (odometry, poses))
-            odometry_m, sfm_m = (np.linalg.norm(step, axis=1).sum() for step in steps)
-            ratio = float(odometry_m / max(sfm_m, 1e-9))
     if odometry is not None and (poses is None or reason):
-        return InitialTrajectory(odometry, "odometry", reason, registered, deviation, ratio, gap)
+        return InitialTrajectory(odometry, "odometry", reason, registered, deviation, gap)
     if poses is None:
         return None
-    return InitialTrajectory(poses, "colmap", reason, registered, deviation, ratio, gap)
+    return InitialTrajectory(poses, "colmap", reason, registered, deviation, gap)
+
+
+def odometry_scale(
+    odometry_from_camera: Float[np.ndarray, "frame 4 4"], world_from_camera: Float[np.ndarray, "frame 4 4"]
+) -> float | None:
+    """Return the robust scale of odometry over the world, ideally 1; None without two cameras.
+
+    It is the median ratio of distances between cameras, of the farther half: noise, which lengthens paths,
+    changes those least.
+    """
+    rows = evenly(len(world_from_camera), SCALE_CAMERAS)
+    odometry_m, world_m = (pdist(pose[rows, :3, 3]) for pose in (odometry_from_camera, world_from_camera))
+    far = world_m >= np.median(world_m) if len(world_m) else np.zeros(0, bool)
+    return float(np.median(odometry_m[far] / np.maximum(world_m[far], 1e-9))) if far.any() else None
 
 
 def _rejection_reason(registered, deviation, gap):

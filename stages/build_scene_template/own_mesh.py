@@ -59,7 +59,7 @@ def build(
         world_from_camera=poses,
         registered=np.nan_to_num(gap, nan=np.inf) < REGISTERED_WITHIN_M,
         gap_m=gap,
-        start=anchor.InitialTrajectory(poses, "odometry", "", np.arange(len(clip)), None, None, {}),
+        start=anchor.InitialTrajectory(poses, "odometry", "", np.arange(len(clip)), None, {}),
         keyframe=np.ones(len(clip), bool),
         reprojection_px=None,
         gravity=gravity,

@@ -78,12 +78,12 @@ def checks(template: SceneTemplate) -> list[Check]:
     if template.own_mesh:
         return surface
     registered = len(start.registered) / int(template.keyframe.sum())
-    odometry = None if start.odometry_scale is None else abs(start.odometry_scale - 1)
+    odometry = None if template.odometry_scale is None else abs(template.odometry_scale - 1)
     return [
         Check("keyframes registered by COLMAP", registered, "share", 0.8, 0.0, "higher"),
         Check("reprojection error", template.reprojection_px, "px", 1.5),
         Check("scale against depth, relative spread", start.scale_deviation, "", 0.05),
-        Check("scale against odometry", odometry, "relative difference", 0.05),
+        Check("scale of map against odometry; either may be off", odometry, "relative difference", 0.05),
         *surface,
     ]
 
@@ -114,7 +114,7 @@ def world(template: SceneTemplate) -> dict:
         "keyframes_registered": len(start.registered),
         "reprojection_px": template.reprojection_px,
         "scale_spread": start.scale_deviation,
-        "scale_against_odometry": start.odometry_scale,
+        "scale_against_odometry": template.odometry_scale,
         "depth_gap_m": start.gap_m,
         "surface_gap_m": float(np.nanmedian(template.gap_m)),
     }

@@ -46,6 +46,8 @@ class SceneTemplate:
     """Height of the floor, world y."""
     scale: str
     """Source of metric scale (`Clip.scale`)."""
+    odometry_scale: float | None = None
+    """`anchor.odometry_scale` of the registered frames; None if it was not measured."""
     own_mesh: bool = False
     """Whether the mesh came with the recording."""
 
@@ -81,11 +83,13 @@ def build(
     if mesh is None:
         raise _no_surface_error(clip)
     log(f"{len(mesh.faces)} faces; median gap of depth from the surface {np.nanmedian(gap) * 100:.1f} cm")
+    registered = np.nan_to_num(gap, nan=np.inf) < REGISTERED_WITHIN_M
+    odometry = clip.odometry_from_camera
     built = SceneTemplate(
         mesh=mesh,
         features=fuse.vertex_features(clip, features, mesh, poses, config.fusion.feature_frames),
         world_from_camera=poses,
-        registered=np.nan_to_num(gap, nan=np.inf) < REGISTERED_WITHIN_M,
+        registered=registered,
         gap_m=gap,
         start=start,
         keyframe=np.isin(np.arange(len(clip)), frames),
@@ -93,6 +97,9 @@ def build(
         gravity=gravity,
         floor_m=floor_height(mesh),
         scale=clip.scale,
+        odometry_scale=None
+        if odometry is None
+        else anchor.odometry_scale(odometry[registered], poses[registered]),
     )
     return built, sparse
 

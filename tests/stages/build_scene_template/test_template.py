@@ -40,6 +40,7 @@ def test_template_is_metric_upright_and_accurate(clip, tmp_path):
     assert np.median(rotation) < 0.5, "degrees"
     assert np.median(distance) < 0.015, "meters, without any scale"
     assert made.start.source == "colmap"
+    assert abs(made.odometry_scale - 1) < 0.05
     assert len(sparse.frame) >= 10
     up_error = (
         made.world_from_camera[:, :3, :3] @ np.swapaxes(clip.truth[:, :3, :3], 1, 2) @ np.array([0, 1.0, 0])
@@ -50,6 +51,19 @@ def test_template_is_metric_upright_and_accurate(clip, tmp_path):
     assert (np.linalg.norm(made.features, axis=1) > 0.9).mean() > 0.5
     template.write_model(sparse, made.world_from_camera, tmp_path / "colmap")
     assert (tmp_path / "colmap" / "images.txt").exists()
+
+
+def test_scale_of_odometry_is_robust_to_noise_and_lost_frames():
+    world, rng = walk(60), np.random.default_rng(0)
+    odometry = world.copy()
+    odometry[:, :3, 3] = 1.1 * (world[:, :3, 3] @ rigid.rotation_from_yaw(0.7).T + 3) + rng.normal(
+        0, 0.02, (60, 3)
+    )
+    odometry[20:24, :3, 3] += 1.0
+    lengths = [np.linalg.norm(np.diff(pose[:, :3, 3], axis=0), axis=1).sum() for pose in (odometry, world)]
+    assert lengths[0] / lengths[1] > 1.2
+    assert anchor.odometry_scale(odometry, world) == pytest.approx(1.1, abs=0.02)
+    assert anchor.odometry_scale(odometry[:1], world[:1]) is None
 
 
 def test_points_per_frame_are_limited_by_memory(clip, monkeypatch):
