@@ -87,7 +87,7 @@ class PoseCheck:
     tolerance_m: float = TOLERANCE_M
     """allowed residual, which grows with depth"""
     depth_factor: float = 1.0
-    """factor on the stored depth with which it would agree with the poses"""
+    """factor on the stored depth with which it would agree with poses or the walk-through"""
 
 
 def odometry_from_pose(
@@ -123,13 +123,9 @@ def check_poses(
         convention: _score(odometry_from_pose(pose[frames], convention), pairs_of_views, views)
         for convention in among
     }
-    check = _judge(scores, documented)
-    if check.verdict == "other":
-        return check
-    factor = _depth_factor(
-        odometry_from_pose(pose[frames], documented), pairs_of_views, views, scores[documented]
-    )
-    if factor == 1:
+    check, odometry = _judge(scores, documented), odometry_from_pose(pose[frames], documented)
+    factor = _depth_factor(odometry, pairs_of_views, views, scores[documented])
+    if check.verdict == "other" or factor == 1:
         return check
     reason = f"poses contradict the depth; depth times {factor:g} would agree with them: check its unit"
     return replace(check, verdict="unusable", reason=reason, depth_factor=factor)
@@ -140,8 +136,7 @@ def _depth_factor(
 ) -> float:
     """Return the factor of another unit in which the depth clearly agrees better with the poses, or 1.
 
-    The cost must fall both in meters, which errors of the poses keep, and relative to the depth, which noise
-    of the depth keeps: so neither is taken for another unit.
+    The cost must fall both in meters (errors of poses do not) and relative to the depth (its noise does not).
     """
     best, found = UNUSABLE_FACTOR, 1.0
     for factor in UNIT_FACTORS:

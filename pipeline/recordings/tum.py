@@ -25,9 +25,8 @@ PER_METER, OTHERS = 5000.0, (1000.0, 10_000.0)
 MAX_RESIDUAL_RATIO = 0.6
 """another unit is chosen if their residual is below this share of the other unit's"""
 TIME_UNITS = {1.0: "seconds", 1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
-"""names of units of time, by units per second"""
 LONGEST_STEP_S = 8.0
-"""typical steps beyond this are in a smaller unit: RGB-D cameras take at most 125 pictures per second"""
+"""units per second, and longest typical step: RGB-D cameras take at most 125 pictures per second"""
 NEAREST_S = 0.02
 """maximum time difference between a color picture, its depth and its pose, seconds"""
 DEFAULT = (525.0, 525.0, 319.5, 239.5)
@@ -43,18 +42,19 @@ def open_recording(path: Path) -> Recording:
     if not color:
         raise errors.no_frames(container.where, "rgb.txt lists nothing")
     ticks, depth_ticks = (np.array([time for time, _ in files]) for files in (color, depth_files))
-    per_second = units_per_second(ticks)
+    step = float(np.median(np.diff(ticks, prepend=ticks[0])))
+    per_second = next((each for each in TIME_UNITS if step <= LONGEST_STEP_S * each), max(TIME_UNITS))
     times = ticks / per_second
     partner = nearest(times, depth_ticks / per_second, NEAREST_S)
     paired = np.flatnonzero(partner >= 0)
-    if not len(paired):
-        raise errors.no_frames(container.where, "no color picture has depth within 20 ms")
     pairs = [(color[i][1], depth_files[partner[i]][1]) for i in paired]
     present = np.array([set(pair) <= container.names for pair in pairs], bool)
     if not present.any():
         absent = [name for pair in pairs for name in pair if name not in container.names]
-        which = f"{len(absent)} of {2 * len(pairs)} listed files, e.g. {absent[0]},"
-        raise errors.no_frames(container.where, f"{which} do not exist; links are not followed")
+        which = (
+            f"{len(absent)} of {2 * len(pairs)} listed files, e.g. {absent[0]}, do not exist" if pairs else ""
+        )
+        raise errors.no_frames(container.where, which or "no color picture has depth within 20 ms")
     paired, pairs = paired[present], [pair for pair, there in zip(pairs, present, strict=True) if there]
     color_size, depth_size = container.color(pairs[0][0]).shape[:2], container.meters(pairs[0][1]).shape
     default = DEFAULT if color_size == DEFAULT_SIZE else None
@@ -84,12 +84,6 @@ def open_recording(path: Path) -> Recording:
         remarks=remarks + scale_remarks + camera_remarks,
         listed=len(present),
     )
-
-
-def units_per_second(times: Float[np.ndarray, "frame"]) -> float:
-    """Return the units per second of increasing times of pictures, the largest unit that is plausible."""
-    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
-    return next((each for each in TIME_UNITS if step <= LONGEST_STEP_S * each), max(TIME_UNITS))
 
 
 def nearest(

@@ -12,7 +12,6 @@ from scipy.spatial.distance import pdist
 
 from pipeline.data.clips import Clip
 from pipeline.geometry import align, cameras, ground, rigid
-from pipeline.geometry.subsampling import evenly
 from pipeline.mapping.bundle_adjustment import MAD_TO_SIGMA
 from pipeline.mapping.colmap import SparseModel
 from stages.build_scene_template.refine import Keyframe
@@ -30,8 +29,6 @@ HOPS = (1, 3, 8)
 """Index distances of keyframes whose depth images are compared."""
 GAP_QUANTILE, MIN_OVERLAP = 0.75, 50
 """Quantile of a pair's depth differences, and least number of overlapping points of a pair."""
-SCALE_CAMERAS = 300
-"""Most cameras whose distances are compared with odometry's."""
 MIN_DEPTH_M = 0.1
 """Smaller depth counts as missing, meters."""
 
@@ -127,18 +124,19 @@ def choose_trajectory(
     return InitialTrajectory(poses, "colmap", reason, registered, deviation, gap)
 
 
-def odometry_scale(
-    odometry_from_camera: Float[np.ndarray, "frame 4 4"], world_from_camera: Float[np.ndarray, "frame 4 4"]
-) -> float | None:
-    """Return the robust scale of odometry over the world, ideally 1; None without two cameras.
+def odometry_scale(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]) -> float | None:
+    """Return the median ratio of odometry's distances between distant cameras to the world's, ideally 1.
 
-    It is the median ratio of distances between cameras, of the farther half: noise, which lengthens paths,
-    changes those least.
+    Noise hardly changes them, unlike lengths of paths. Unknown (NaN) cameras are left out.
     """
-    rows = evenly(len(world_from_camera), SCALE_CAMERAS)
-    odometry_m, world_m = (pdist(pose[rows, :3, 3]) for pose in (odometry_from_camera, world_from_camera))
-    far = world_m >= np.median(world_m) if len(world_m) else np.zeros(0, bool)
-    return float(np.median(odometry_m[far] / np.maximum(world_m[far], 1e-9))) if far.any() else None
+    known = np.isfinite(world_from_camera).all((1, 2))
+    if clip.odometry_from_camera is None or known.sum() < 2:
+        return None
+    odometry_m, world_m = (
+        pdist(each[known, :3, 3]) for each in (clip.odometry_from_camera, world_from_camera)
+    )
+    far = world_m >= np.median(world_m)
+    return float(np.median(odometry_m[far] / np.maximum(world_m[far], 1e-9)))
 
 
 def _rejection_reason(registered, deviation, gap):

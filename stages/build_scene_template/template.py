@@ -84,7 +84,6 @@ def build(
         raise _no_surface_error(clip)
     log(f"{len(mesh.faces)} faces; median gap of depth from the surface {np.nanmedian(gap) * 100:.1f} cm")
     registered = np.nan_to_num(gap, nan=np.inf) < REGISTERED_WITHIN_M
-    odometry = clip.odometry_from_camera
     built = SceneTemplate(
         mesh=mesh,
         features=fuse.vertex_features(clip, features, mesh, poses, config.fusion.feature_frames),
@@ -97,9 +96,7 @@ def build(
         gravity=gravity,
         floor_m=floor_height(mesh),
         scale=clip.scale,
-        odometry_scale=None
-        if odometry is None
-        else anchor.odometry_scale(odometry[registered], poses[registered]),
+        odometry_scale=anchor.odometry_scale(clip, np.where(registered[:, None, None], poses, np.nan)),
     )
     return built, sparse
 

@@ -70,23 +70,19 @@ def placed_share(
 def depth_factor(
     walkthrough: Sequence[DescribedFrame], session: Sequence[DescribedFrame], rng: np.random.Generator
 ) -> float:
-    """Return the factor with which a session's depth clearly better fits the walk-through: its unit; or 1.
-
-    Each frame is fitted to the walk-through's most similar one; a sign test compares inliers.
-    """
-    inliers = []
-    for frame in session if walkthrough else ():
-        pairs = [sift.matches(frame.points.descriptors, each.points.descriptors) for each in walkthrough]
-        best = int(np.argmax([len(each) for each in pairs]))
-        mine, theirs = pairs[best].T
-        points = frame.points.points_camera[mine], walkthrough[best].points.points_camera[theirs]
-        fit = {"threshold_m": WITHIN_M, "iterations": TRIALS, "rng": rng}
-        scaled = [(factor * points[0], points[1]) for factor in (1.0, *UNIT_FACTORS)]
-        inliers.append([float(align.ransac_rigid(*each, **fit)[1].sum()) for each in scaled])
-    stored, *others = np.array(inliers).reshape(-1, 1 + len(UNIT_FACTORS)).T
-    found = zip(UNIT_FACTORS, others, strict=True)
-    better = {each: inlier.sum() for each, inlier in found if beats(inlier, stored, len(UNIT_FACTORS))}
-    return max(better, key=lambda each: better[each], default=1.0)
+    """Return the unit's factor with which frames clearly fit their most similar ones of the room, or 1."""
+    inliers = np.zeros((len(session), 1 + len(UNIT_FACTORS)))
+    for row, frame in enumerate(session):
+        found = [
+            (each, sift.matches(frame.points.descriptors, each.points.descriptors)) for each in walkthrough
+        ]
+        known, pairs = max(found, key=lambda each: len(each[1]))
+        mine, theirs = frame.points.points_camera[pairs[:, 0]], known.points.points_camera[pairs[:, 1]]
+        for column, factor in enumerate((1.0, *UNIT_FACTORS)):
+            trial = {"threshold_m": WITHIN_M, "iterations": TRIALS, "rng": rng}
+            inliers[row, column] = align.ransac_rigid(factor * mine, theirs, **trial)[1].sum()
+    better = [beats(each, inliers[:, 0], len(UNIT_FACTORS)) for each in inliers.T[1:]]
+    return (1.0, *UNIT_FACTORS)[int(np.argmax(inliers.sum(0) * [True, *better]))]
 
 
 def _best_place(

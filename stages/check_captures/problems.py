@@ -3,7 +3,6 @@
 CAP-001 to CAP-022 (cannot be read or used) come from `pipeline.recordings`; these here are warnings.
 """
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,14 +38,6 @@ class CaptureMeasurements:
     """of a walk-through without depth"""
     misalignment: str = ""
     """how the depth camera seems to differ from what the recording states"""
-    room_factor: float = 1.0
-    """factor on depth with which it would agree with the walk-through's, if poses do not give its unit"""
-
-    @property
-    def in_other_unit(self) -> bool:
-        """Whether poses or the walk-through say that depth is in another unit."""
-        plan = self.sample.plan
-        return self.room_factor != 1 or (plan is not None and plan.pose_check.depth_factor != 1)
 
 
 SHORTEST_S: dict[Role, float] = {"walkthrough": 30.0, "turnaround": 8.0, "session": 15.0, "heldout": 5.0}
@@ -93,17 +84,14 @@ def problems(seen: CaptureMeasurements, role: Role) -> list[CaptureProblem]:
 
 def _remedies(seen: CaptureMeasurements, role: Role) -> dict[str, str]:
     """Return the remedies that depend on the recording."""
-    recording = seen.sample.recording
+    recording, plan, agreement = seen.sample.recording, seen.sample.plan, seen.sample.agreement
     found = {"CAP-031": f"record at least {SHORTEST_S[role]:.0f} s for a {role}"}
-    if seen.in_other_unit:
+    if plan is not None and plan.pose_check.depth_factor != 1:
         found["CAP-050"] = "correct the unit of its depth (TUM: depth_scale.txt), or that of the other"
     elif recording.pose is None:
         found["CAP-050"] = "add poses if its app can store them; the build finds the cameras, less surely"
-    agreement = seen.sample.agreement
     if agreement is not None and agreement.better.endswith(("earlier", "later")):
-        found["CAP-057"] = (
-            "they were not taken at one time: shift the time stamps (or numbers) of one by that"
-        )
+        found["CAP-057"] = "they were not taken at one time: shift the time stamps (numbers) of one by that"
     if Path(recording.where, DEPTH_FROM_COLOR).is_file():
         found["CAP-060"] = f"check {DEPTH_FROM_COLOR} (is it the inverse?) and depth_intrinsics.txt"
     return found
@@ -117,7 +105,7 @@ def _of_pictures(sample: RecordingSample, role: Role) -> dict[str, str]:
     elif sample.damaged > MAX_DAMAGED:
         found["CAP-030"] = f"{sample.damaged:.0%} of the pictures are damaged or missing"
     if sample.duration_s < SHORTEST_S[role]:
-        found["CAP-031"] = f"only {math.floor(10 * sample.duration_s) / 10:g} s long"
+        found["CAP-031"] = f"only {int(10 * sample.duration_s) / 10:g} s long"
     if sample.dark > MAX_DARK:
         found["CAP-032"] = f"{sample.dark:.0%} of the pictures are dark"
     if sample.blurred > MAX_BLURRED:
@@ -137,7 +125,7 @@ def _of_depth(seen: CaptureMeasurements, role: Role) -> dict[str, str]:
         found["CAP-037"] = f"{1 - sample.depth_valid:.0%} of the depth is unknown"
     if sample.beyond > MAX_BEYOND:
         found["CAP-038"] = f"{sample.beyond:.0%} of the depth is beyond the sensor's range"
-    if seen.misalignment and not seen.in_other_unit:
+    if seen.misalignment and sample.plan.pose_check.depth_factor == 1:
         found["CAP-060"] = f"depth steps lie on edges of pictures if the depth camera {seen.misalignment}"
     return found
 
@@ -159,10 +147,7 @@ def _of_poses(seen: CaptureMeasurements) -> dict[str, str]:
     if plan is None:
         return found
     if plan.odometry_from_camera is None:
-        what = f"device poses are not used: {plan.pose_check.reason}"
-        if seen.room_factor != 1:
-            what += f"; depth times {seen.room_factor:g} would agree with the walk-through's: check its unit"
-        return {"CAP-050": what}
+        return {"CAP-050": f"device poses are not used: {plan.pose_check.reason}"}
     if plan.pose_check.verdict == "other":
         found["CAP-051"] = plan.pose_check.reason
     agreement = seen.sample.agreement

@@ -3,7 +3,7 @@
 import math
 import traceback
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -71,13 +71,18 @@ def _seen(
     if role == "walkthrough":
         room += overlap.describe(sample.shots)
         return CaptureMeasurements(sample, drift_m, moving, misalignment=misalignment)
-    placed, factor = None, 1.0
+    placed = None
     if room and role != "turnaround":  # may be filmed anywhere: only the animal's template is made from it
         described = overlap.describe(sample.shots)
         placed = overlap.placed_share(room, described, rng)
-        if sample.plan.odometry_from_camera is None:
+        check, factor = sample.plan.pose_check, 1.0
+        if sample.plan.odometry_from_camera is None and check.depth_factor == 1:
             factor = overlap.depth_factor(room, described, rng)
-    return CaptureMeasurements(sample, drift_m, moving, placed, None, misalignment, factor)
+        if factor != 1:
+            reason = f"{check.reason}; depth times {factor:g} would fit the walk-through: check its unit"
+            plan = replace(sample.plan, pose_check=replace(check, reason=reason, depth_factor=factor))
+            sample = replace(sample, plan=plan)
+    return CaptureMeasurements(sample, drift_m, moving, placed, misalignment=misalignment)
 
 
 def _described(name: str, role: Role, seen: CaptureMeasurements) -> str:

@@ -62,8 +62,11 @@ def test_scale_of_odometry_is_robust_to_noise_and_lost_frames():
     odometry[20:24, :3, 3] += 1.0
     lengths = [np.linalg.norm(np.diff(pose[:, :3, 3], axis=0), axis=1).sum() for pose in (odometry, world)]
     assert lengths[0] / lengths[1] > 1.2
-    assert anchor.odometry_scale(odometry, world) == pytest.approx(1.1, abs=0.02)
-    assert anchor.odometry_scale(odometry[:1], world[:1]) is None
+    clip = MemoryClip(None, world, odometry)
+    world[30:] = np.nan
+    assert anchor.odometry_scale(clip, world) == pytest.approx(1.1, abs=0.02)
+    world[1:] = np.nan
+    assert anchor.odometry_scale(clip, world) is None
 
 
 def test_points_per_frame_are_limited_by_memory(clip, monkeypatch):

@@ -14,7 +14,7 @@ from pipeline.mapping import picture_agreement
 from pipeline.recordings.formats import open_recording
 from pipeline.recordings.recording import DepthCamera, reproject
 from stages.check_captures import __main__ as front
-from stages.check_captures import alignment, moving_objects, overlap, parallax, problems, sampling
+from stages.check_captures import alignment, moving_objects, overlap, parallax, problems, sampling, stage
 from stages.check_captures.sampling import SampledFrame
 from tests.pipeline.recordings import made_formats
 from tests.stages import textured_room
@@ -278,15 +278,12 @@ def test_walk_through_gives_the_unit_of_depth_without_poses(tmp_path, factor):
     ]
     assert overlap.depth_factor(room, overlap.describe(shots), np.random.default_rng(0)) == factor
     folder = made_formats.video_and_depth(tmp_path / "a", _made(2.0, rate_hz=15.0), poses=False)
-    sample = sampling.sample(open_recording(folder), 20, max_depth_m=6.0)
-    seen = problems.CaptureMeasurements(sample, misalignment="is elsewhere", room_factor=factor)
+    sample = dataclasses.replace(sampling.sample(open_recording(folder), 20, max_depth_m=6.0), shots=shots)
+    seen = stage._seen(sample, "session", room, np.random.default_rng(0))
+    seen = dataclasses.replace(seen, misalignment="is elsewhere")
     found = {each.code: each.what for each in problems.problems(seen, "session")}
     assert ("CAP-060" in found) == (factor == 1)
-    assert ("times 5 would agree with the walk-through's" in found["CAP-050"]) == (factor == 5)
-
-
-def test_no_unit_without_a_walk_through():
-    assert overlap.depth_factor([], overlap.describe(_shots(0, 4)), np.random.default_rng(0)) == 1
+    assert ("times 5 would fit the walk-through" in found["CAP-050"]) == (factor == 5)
 
 
 def test_movers_are_counted():
