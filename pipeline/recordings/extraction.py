@@ -277,16 +277,12 @@ def _posed_picture(
     if color is None or plan.odometry_from_camera is None:
         return None
     rows = {step: row + step for step in (0, *CLOCKS)}
-    depth = {
-        clock: cameras.turn_image(
-            stored_depth(recording, int(recording.index[plan.chosen[other]]), max_depth_m), plan.quarter_turns
-        )
-        for clock, other in rows.items()
-    }
+    numbers = {step: int(recording.index[plan.chosen[other]]) for step, other in rows.items()}
+    depth = {step: stored_depth(recording, number, max_depth_m) for step, number in numbers.items()}
     return PosedPicture(
         cv2.cvtColor(cameras.turn_image(color, plan.quarter_turns), cv2.COLOR_RGB2GRAY),
         plan.intrinsics[row],
-        depth,
+        {step: cameras.turn_image(each, plan.quarter_turns) for step, each in depth.items()},
         plan.depth_intrinsics[row],
         {clock: plan.odometry_from_camera[other] for clock, other in rows.items()},
     )

@@ -104,8 +104,8 @@ def depth_camera(
     found = DepthCamera(intrinsics, depth_from_color)
     if found.baseline_m > MAX_BASELINE_M:
         what = f"its cameras are {found.baseline_m:g} m apart, further than in one device"
-        remedy = "write the translation, the last column, in meters, not in millimeters"
-        raise InputError("CAP-004", what, container.place(DEPTH_FROM_COLOR), remedy)
+        where, remedy = container.place(DEPTH_FROM_COLOR), "write its last column in meters"
+        raise InputError("CAP-004", what, where, remedy)
     return found, (depth_camera_remark(found, color_intrinsics),)
 
 

@@ -129,12 +129,10 @@ def odometry_scale(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]
 
     Noise hardly changes them, unlike lengths of paths. Unknown (NaN) cameras are left out.
     """
-    known = np.isfinite(world_from_camera).all((1, 2))
-    if clip.odometry_from_camera is None or known.sum() < 2:
+    odometry, known = clip.odometry_from_camera, np.isfinite(world_from_camera).all((1, 2))
+    if odometry is None or known.sum() < 2:
         return None
-    odometry_m, world_m = (
-        pdist(each[known, :3, 3]) for each in (clip.odometry_from_camera, world_from_camera)
-    )
+    odometry_m, world_m = (pdist(each[known, :3, 3]) for each in (odometry, world_from_camera))
     far = world_m >= np.median(world_m)
     return float(np.median(odometry_m[far] / np.maximum(world_m[far], 1e-9)))
 

@@ -72,12 +72,11 @@ def depth_factor(
 ) -> float:
     """Return the unit's factor with which frames clearly fit their most similar ones of the room, or 1."""
     inliers = np.zeros((len(session), 1 + len(UNIT_FACTORS)))
-    for row, frame in enumerate(session):
-        found = [
-            (each, sift.matches(frame.points.descriptors, each.points.descriptors)) for each in walkthrough
-        ]
+    room = [each.points for each in walkthrough]
+    for row, points in enumerate(each.points for each in session):
+        found = [(each, sift.matches(points.descriptors, each.descriptors)) for each in room]
         known, pairs = max(found, key=lambda each: len(each[1]))
-        mine, theirs = frame.points.points_camera[pairs[:, 0]], known.points.points_camera[pairs[:, 1]]
+        mine, theirs = points.points_camera[pairs[:, 0]], known.points_camera[pairs[:, 1]]
         for column, factor in enumerate((1.0, *UNIT_FACTORS)):
             trial = {"threshold_m": WITHIN_M, "iterations": TRIALS, "rng": rng}
             inliers[row, column] = align.ransac_rigid(factor * mine, theirs, **trial)[1].sum()

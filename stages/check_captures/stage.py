@@ -80,8 +80,8 @@ def _seen(
             factor = overlap.depth_factor(room, described, rng)
         if factor != 1:
             reason = f"{check.reason}; depth times {factor:g} would fit the walk-through: check its unit"
-            plan = replace(sample.plan, pose_check=replace(check, reason=reason, depth_factor=factor))
-            sample = replace(sample, plan=plan)
+            check = replace(check, reason=reason, depth_factor=factor)
+            sample = replace(sample, plan=replace(sample.plan, pose_check=check))
     return CaptureMeasurements(sample, drift_m, moving, placed, misalignment=misalignment)
 
 
