@@ -35,7 +35,7 @@ SIGNIFICANCE = 0.01
 DECOY_DEG = 3.0
 """rotation of deliberately wrong poses"""
 
-CLOCKS = (-2, -1, 1, 2)
+CLOCKS = (-2, 2)
 """steps in time, in frames, by which depth and poses may be early or late"""
 
 

@@ -99,8 +99,7 @@ FAULTS = {
     "mirrored depth": _mirrored("depth"),
     "mirrored pictures and depth": _mirrored("picture", "depth"),
     "depth 0.2 s later": _late(2),
-    "depth 0.1 s later": _late(1),
-    "depth 0.1 s earlier": _late(-1),
+    "depth 0.2 s earlier": _late(-2),
 }
 
 
