@@ -101,9 +101,9 @@ def depth_camera(
         if not np.isfinite(pose_from_matrix(depth_from_color[None])).all():
             why = "it is no rigid motion: rotation and translation in meters, four rows"
             raise errors.broken_metadata(container.place(DEPTH_FROM_COLOR), why)
-    found = DepthCamera(intrinsics, depth_from_color)
-    if found.baseline_m > MAX_BASELINE_M:
-        what = f"its cameras are {found.baseline_m:g} m apart, further than in one device"
+    found, apart_m = DepthCamera(intrinsics, depth_from_color), np.linalg.norm(depth_from_color[:3, 3])
+    if apart_m > MAX_BASELINE_M:
+        what = f"its cameras are {apart_m:g} m apart, further than in one device"
         where, remedy = container.place(DEPTH_FROM_COLOR), "write its last column in meters"
         raise InputError("CAP-004", what, where, remedy)
     return found, (depth_camera_remark(found, color_intrinsics),)
