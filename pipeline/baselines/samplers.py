@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import Architecture, Scaling
-from pipeline.behavior.path_encoding import PATH_CHANNELS
+from pipeline.behavior.path_encoding import PATH_CHANNELS_OF
 from pipeline.behavior.planning import Array, PlanCondition, SampledPlan, Sampler, TorchNetworks
 
 MEAN_STEP, LOG_STD_STEP = 0.0, 1.0
@@ -28,13 +28,14 @@ def sampler_of(
     architecture: Architecture, networks: TorchNetworks, schedule: Schedule, scaling: Scaling
 ) -> Sampler:
     """Return the sampler for the architecture's family."""
+    settings = networks, schedule, scaling, architecture.guided, architecture.corrections
     match architecture.family:
         case "diffusion":
-            return Sampler(networks, schedule, scaling, architecture.guided)
+            return Sampler(*settings)
         case "one_stage":
-            return OneStageSampler(networks, schedule, scaling, architecture.guided)
+            return OneStageSampler(*settings)
         case "gaussian":
-            return GaussianSampler(networks, schedule, scaling, architecture.guided)
+            return GaussianSampler(*settings)
         case _:
             assert_never(architecture.family)
 
@@ -89,7 +90,8 @@ class GaussianSampler(Sampler):
 
     def _path(self, codes: PlanCondition, goal: Float[np.ndarray, "plan 3"]) -> list[Array]:
         control = self.scaling.scaled_goal(goal)
-        zeros = np.zeros((len(goal), PATH_CHANNELS, self.scaling.path_std.shape[1]), np.float32)
+        channels, frames = PATH_CHANNELS_OF[self.scaling.encoding], self.scaling.path_std.shape[1]
+        zeros = np.zeros((len(goal), channels, frames), np.float32)
         keep = _keep_mask(zeros, float(codes.sampling.goal))
         return [
             self.networks.path(zeros, _step(zeros, t), codes.full, control, keep)
@@ -113,7 +115,8 @@ class OneStageSampler(Sampler):
         assert goal is None and path is None, "a one-stage model takes no goal and no path"
         sequence = self._sequence(codes, rng)
         path = self._path(codes, sequence)
-        body = np.swapaxes(sequence[:, PATH_CHANNELS:], 1, 2) * self.scaling.body_std + self.scaling.body_mean
+        body = np.swapaxes(sequence[:, PATH_CHANNELS_OF[self.scaling.encoding] :], 1, 2)
+        body = body * self.scaling.body_std + self.scaling.body_mean
         return SampledPlan(path[:, -1], path, body)
 
     def plan_paths(self, codes: PlanCondition, rng: np.random.Generator) -> Float[np.ndarray, "plan frame 3"]:
@@ -128,26 +131,26 @@ class OneStageSampler(Sampler):
         return np.concatenate([path[:, -1] for path in paths])
 
     def _path(self, codes: PlanCondition, sequence: Array) -> Float[np.ndarray, "plan frame 3"]:
-        path = self.scaling.path(sequence[:, :PATH_CHANNELS], codes.start)
+        path = self.scaling.path(sequence[:, : PATH_CHANNELS_OF[self.scaling.encoding]], codes.start)
         return codes.constrained(path, self.scaling.rate_hz)
 
     def _sequence(self, codes: PlanCondition, rng: np.random.Generator) -> Array:
-        frames = self.scaling.path_std.shape[1]
+        frames, lead = self.scaling.path_std.shape[1], PATH_CHANNELS_OF[self.scaling.encoding]
         control = np.zeros((len(codes.full), 3, frames), np.float32)
 
         def denoise(code: Array):
             return lambda x, t: self.networks.body(x, _step(x, t), code, control, _keep_mask(x, 0.0))
 
         def correct(x: Array) -> Array:
-            path = self.paths_out_of_solid(codes, x[:, :PATH_CHANNELS])
-            return np.concatenate([path, x[:, PATH_CHANNELS:]], axis=1)
+            path = self.paths_out_of_solid(codes, x[:, :lead])
+            return np.concatenate([path, x[:, lead:]], axis=1)
 
         body = len(self.scaling.body_mean)
-        shape = len(codes.full), PATH_CHANNELS + body, frames
+        shape = len(codes.full), lead + body, frames
         denoisers = [denoise(code) for code in (codes.full, *codes.references)]
         solver, steps = self.of_sequences(codes.sampling)
         stds = solver.path_noise_std, solver.body_noise_std
-        noise_std = np.repeat(stds, (PATH_CHANNELS, body))[:, None]
+        noise_std = np.repeat(stds, (lead, body))[:, None]
         return self._denoised(denoisers, shape, solver, steps, rng, correct, noise_std)
 
 

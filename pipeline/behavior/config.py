@@ -17,6 +17,9 @@ ObservedPast = Literal["positions", "poses"]
 Guided = Literal["observer", "all"]
 """Conditions that the reference of guidance lacks: observer and goal; or all, as in the paper,
 which needs `joint_dropout` in training."""
+Encoding = Literal["strides", "positions"]
+"""What is diffused: strides and goals by a power of their distance, bodies relative to the current posture;
+or, as in the paper, positions, and bodies as they are."""
 AblatedInput = Literal["nothing", "scene", "observer", "past"]
 """The part of perception that an ablation replaces by its learned null."""
 NoiseCourse = Literal["linear", "rectified"]

@@ -34,15 +34,17 @@ class GoalMLP(nn.Module):
     def __init__(
         self, code: int, hidden: int = 128, layers: int = 6, schedule: Schedule = STANDARD, *,
         ensemble_size: int = 1, map_cells: int = 0, attended_channels: int = 0,
+        length_power: float = GOAL_LENGTH_POWER,
     ):  # fmt: skip
+        """``length_power``: of the lengths of goals."""
         super().__init__()
         code += attended_channels
         self.noise, self.code, self.ensemble_size = NoiseFromVelocity(schedule), code, ensemble_size
-        self.others = OthersLikelihood(attended_channels) if attended_channels else None
+        self.others = OthersLikelihood(attended_channels, length_power) if attended_channels else None
         self.map_numbers = 2 * MAP_KEY_CHANNELS * map_cells**2
         code_channels = TIME_CHANNELS + HORIZON_CHANNELS + code
         self.clean, self.staying = CleanGoalEstimate(schedule), GoalLikelihood(REST_STDS)
-        self.map = MapAttention(map_cells, code_channels, ensemble_size) if map_cells else None
+        self.map = MapAttention(map_cells, code_channels, ensemble_size, length_power) if map_cells else None
         inputs = 3 + code_channels + self.staying.numbers + (self.map.NUMBERS if self.map else 0)
         inputs += self.others.numbers if self.others else 0
         sizes, inner = [inputs] + [hidden] * (layers - 1), []
@@ -152,8 +154,9 @@ class OthersLikelihood(nn.Module):
 
     goal_std: Tensor
 
-    def __init__(self, channels: int):
+    def __init__(self, channels: int, length_power: float = GOAL_LENGTH_POWER):
         super().__init__()
+        self.length_power = length_power
         self.channels, self.likelihood = channels, GoalLikelihood(BESIDE_STDS)
         self.numbers = channels // ATTENDED_CHANNELS * (ATTENDED_CHANNELS + self.likelihood.numbers)
         self.register_buffer("goal_std", torch.ones(3))
@@ -167,7 +170,7 @@ class OthersLikelihood(nn.Module):
         """Return presence, and weighted by it the scaled position and the likelihoods, of each head."""
         presence, x, z = attended.unflatten(-1, (-1, ATTENDED_CHANNELS)).split(1, dim=-1)
         position = torch.cat([x, 0 * x, z], dim=-1) / (presence + MIN_WEIGHT)
-        position = with_powered_length(position, GOAL_LENGTH_POWER) / self.goal_std
+        position = with_powered_length(position, self.length_power) / self.goal_std
         read = [position[..., ::2], self.likelihood(mean[:, None] - position, variance[:, None])]
         return torch.cat([presence, *(presence * each for each in read)], dim=-1).flatten(-2)
 
@@ -191,14 +194,16 @@ class MapAttention(nn.Module):
     power: Tensor
     goal_std: Tensor
 
-    def __init__(self, cells: int, code_channels: int, ensemble_size: int):
+    def __init__(
+        self, cells: int, code_channels: int, ensemble_size: int, length_power: float = GOAL_LENGTH_POWER
+    ):
         super().__init__()
         half_m = GRID_SHAPE[0] * GRID_CELL_M / 2
         axis = (torch.arange(cells) + 0.5) * (2 * half_m / cells) - half_m
         z, x = torch.meshgrid(axis, axis, indexing="ij")
         place = torch.stack([x, torch.zeros_like(x), z], dim=-1).flatten(0, 1)
         self.register_buffer("place", place[:, ::2] / half_m, persistent=False)
-        self.register_buffer("power", with_powered_length(place, GOAL_LENGTH_POWER)[:, ::2], persistent=False)
+        self.register_buffer("power", with_powered_length(place, length_power)[:, ::2], persistent=False)
         self.register_buffer("goal_std", torch.ones(3))
         self.query = EnsembleLinear(
             ensemble_size, code_channels, self.HEADS * (MAP_KEY_CHANNELS + self.PLACE)

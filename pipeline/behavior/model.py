@@ -65,6 +65,10 @@ class Architecture:
     ensemble_size: int = 3
     guided: config.Guided = "observer"
     """conditions that guidance amplifies: all if trained with `joint_dropout`"""
+    encoding: config.Encoding = "strides"
+    """what is diffused; with positions, bodies have no prior (`body_components` 0)"""
+    corrections: bool = True
+    """whether plans are corrected after the networks (`PlanSamplingConfig.networks_only`)"""
 
     @property
     def body_channels(self) -> int:
@@ -129,28 +133,35 @@ class Scaling:
     body_std: Float[np.ndarray, "channel"]
     rate_hz: float = RATE_HZ
     """frames per second"""
+    encoding: config.Encoding = "strides"
+    """of goals and paths"""
 
     def scaled_goal(self, goal: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
         """Convert goals in meters to the units of diffusion and of the control of paths."""
-        return (with_powered_length(goal, path_encoding.GOAL_LENGTH_POWER) / self.goal_std).astype(np.float32)
+        power = path_encoding.GOAL_POWER_OF[self.encoding]
+        return (with_powered_length(goal, power) / self.goal_std).astype(np.float32)
 
     def goal(self, scaled: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
         """Undo `scaled_goal`."""
-        return with_powered_length(scaled * self.goal_std, 1 / path_encoding.GOAL_LENGTH_POWER)
+        return with_powered_length(scaled * self.goal_std, 1 / path_encoding.GOAL_POWER_OF[self.encoding])
 
     def path(
-        self, scaled: Float[np.ndarray, "plan 4 frame"], start: Float[np.ndarray, "plan 3"]
+        self, scaled: Float[np.ndarray, "plan channel frame"], start: Float[np.ndarray, "plan 3"]
     ) -> Float[np.ndarray, "plan frame 3"]:
-        """Integrate scaled strides from ``start`` to paths in meters."""
+        """Integrate scaled strides from ``start`` to paths in meters, or convert scaled positions."""
+        if self.encoding == "positions":
+            return self.path_of_scaled(scaled)
         return path_from_velocity_channels(np.swapaxes(scaled, 1, 2) * self.velocity_std, start, self.rate_hz)
 
     def warped_path(
         self,
-        scaled: Float[np.ndarray, "plan 4 frame"],
+        scaled: Float[np.ndarray, "plan channel frame"],
         start: Float[np.ndarray, "plan 3"],
         path: Float[np.ndarray, "plan frame 3"],
-    ) -> Float[np.ndarray, "plan 4 frame"]:
-        """Return scaled strides that follow other paths in meters."""
+    ) -> Float[np.ndarray, "plan channel frame"]:
+        """Return scaled strides or positions that follow other paths in meters."""
+        if self.encoding == "positions":
+            return self.scaled_path(path)
         strides = np.swapaxes(scaled, 1, 2) * self.velocity_std
         return np.swapaxes(warped_path(strides, start, path, self.rate_hz) / self.velocity_std, 1, 2)
 
@@ -178,32 +189,37 @@ class BehaviorNets(nn.Module):
             ensemble_size=a.ensemble_size,
             map_cells=a.map_cells,
             attended_channels=a.attended_channels,
+            length_power=GOAL_POWER_OF[a.encoding],
         )
+        positions = a.encoding == "positions"
+        assert not (positions and a.body_components), "bodies beside positions have no prior"
         bones = 6 * a.bones
         gates = min(a.body_components, bones)
         components = gates or bones
         corrected = ROOT_CHANNELS + components
         widths = tuple(a.unet_width * multiplier for multiplier in a.unet_multipliers)
         sizes = (a.code_length, widths, schedule)
+        along, lead = 3 if positions else CONTROL_CHANNELS, path_encoding.PATH_CHANNELS_OF[a.encoding]
         match a.control:
             case "unet":
-                self.path = denoisers.ControlUNet(path_encoding.PATH_CHANNELS, 3, *sizes)
-                body = denoisers.ControlUNet(corrected, CONTROL_CHANNELS, *sizes, outputs=corrected + gates)
+                self.path = denoisers.ControlUNet(lead, 3, *sizes)
+                body = denoisers.ControlUNet(corrected, along, *sizes, outputs=corrected + gates)
             case "concatenation":
-                self.path = denoisers.ConcatenationUNet(path_encoding.PATH_CHANNELS, 3, *sizes)
-                along = CONTROL_CHANNELS * a.future
+                self.path = denoisers.ConcatenationUNet(lead, 3, *sizes)
+                along *= a.future
                 body = denoisers.ConcatenationUNet(corrected, along, *sizes, outputs=corrected + gates)
             case _:
                 assert_never(a.control)
         if a.family == "one_stage":  # one network for path and body, without control
             read = denoisers.TrailingLinear(a.code_length, denoisers.EMBEDDING)
-            corrected += path_encoding.PATH_CHANNELS
+            corrected += lead
             body = denoisers.UncontrolledUNet(corrected, read, *sizes[1:], outputs=corrected + gates)
-            denoiser, leading = body_denoiser.OneStageDenoiser, path_encoding.PATH_CHANNELS + ROOT_CHANNELS
+            denoiser, leading = body_denoiser.OneStageDenoiser, lead + ROOT_CHANNELS
         else:
             denoiser, leading = body_denoiser.BodyDenoiser, ROOT_CHANNELS
         prior = body_denoiser.GaussianPrior(leading, bones, components, a.future, schedule)
-        self.body = denoiser(body, prior, a.body_channels, a.future, schedule, a.rate_hz)
+        relative = denoiser(body, prior, a.body_channels, a.future, schedule, a.rate_hz)
+        self.body: body_denoiser.BodyDenoiser | denoisers.SequenceDenoiser = body if positions else relative
 
 
 def channels_from_bones(
@@ -258,7 +274,10 @@ def contract(
     """Return the content of `behavior.json`, for samplers in other languages."""
     bone = ["rotation_x", "rotation_y", "rotation_z", "shift_x", "shift_y", "shift_z"]
     root = ["right_x", "right_y", "right_z", "up_x", "up_y", "up_z"]
+    place, stride = ["x", "y", "z"], [*(f"root_of_velocity_{axis}" for axis in "xyz"), "moves"]
     sampling = config.PlanSamplingConfig(schedule.method, schedule.sampled_steps, sequence_steps=SOLVER_STEPS)
+    sampling = sampling if architecture.corrections else sampling.networks_only()
+    scales = {name: value for name, value in vars(scaling).items() if name != "encoding"}
     return {
         "units": "metres, radians, seconds",
         "up": [0, 1, 0],
@@ -280,8 +299,8 @@ def contract(
                 "per_bone": bone,
                 "order": "frame, (root, bones); oldest first",
             },
-            "goal": ["x", "y", "z"],
-            "path": ["root_of_velocity_x", "root_of_velocity_y", "root_of_velocity_z", "moves"],
+            "goal": place,
+            "path": place if architecture.encoding == "positions" else stride,
             "body": {"root": root, "per_bone": bone},
             "keep": ["scene", "observer", "past"],
         },
@@ -292,16 +311,16 @@ def contract(
             "order": "channel, x, y, z",
         },
         "path_encoding": {
-            "channels": path_encoding.PATH_CHANNELS,
+            "channels": path_encoding.PATH_CHANNELS_OF[architecture.encoding],
             "velocity_power": path_encoding.VELOCITY_POWER,
-            "goal_length_power": path_encoding.GOAL_LENGTH_POWER,
+            "goal_length_power": path_encoding.GOAL_POWER_OF[architecture.encoding],
             "rest_damping": path_encoding.REST_DAMPING,
             "min_squared_m2": path_encoding.MIN_SQUARED_M2,
             "rest_speed_m_s": path_encoding.REST_SPEED_M_S,
             "goal_tolerance_m": path_encoding.GOAL_TOLERANCE_M,
             "goal_tolerance_share": path_encoding.GOAL_TOLERANCE_SHARE,
         },
-        "scaling": {name: np.asarray(value, float).tolist() for name, value in vars(scaling).items()},
+        "scaling": {name: np.asarray(value, float).tolist() for name, value in scales.items()},
         "schedule": {**asdict(schedule), "alpha_bar": schedule.alpha_bar.tolist()},
         "sampling": asdict(sampling),
     }
@@ -328,7 +347,7 @@ def load(folder: Path) -> tuple[Architecture, BehaviorNets, Scaling, Schedule, F
         architecture = Architecture(**shape | {"unet_multipliers": tuple(shape["unet_multipliers"])})
         scales = {name: value for name, value in document["scaling"].items() if name != "rate_hz"}
         arrays = {name: np.asarray(value, np.float64) for name, value in scales.items()}
-        scaling = Scaling(**arrays, rate_hz=float(document["rate_hz"]))
+        scaling = Scaling(**arrays, rate_hz=float(document["rate_hz"]), encoding=architecture.encoding)
         schedule = Schedule(**{field.name: document["schedule"][field.name] for field in fields(Schedule)})
         rest = np.asarray(document["agent_from_bone_rest"], np.float64)
         expected = json.loads(json.dumps(contract(architecture, scaling, schedule, rest)))

@@ -1,4 +1,5 @@
-"""Goals and paths as channels of diffusion: goals with power-transformed length, paths as strides.
+"""Goals and paths as channels of diffusion: goals with power-transformed length, paths as strides; or both as
+positions, as in the paper.
 
 An animal rests most of the time. In positions, rest is as uncertain as a walk, and residual sampling noise
 makes a path tremble. In strides rest is zero, the square root separates it from the slowest walk, and an
@@ -12,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pipeline.behavior.config import Encoding
 from pipeline.behavior.trajectories import RATE_HZ
 
 PATH_CHANNELS = 4
@@ -23,6 +25,10 @@ REST_DAMPING = 0.6
 recorded ones at rest"""
 VELOCITY_POWER, GOAL_LENGTH_POWER = 0.5, 0.7
 """powers of the lengths of velocities and goals (0.7 better than 0.5 and 1 on a held-out home)"""
+PATH_CHANNELS_OF: dict[Encoding, int] = {"strides": PATH_CHANNELS, "positions": 3}
+"""channels of a path by encoding"""
+GOAL_POWER_OF: dict[Encoding, float] = {"strides": GOAL_LENGTH_POWER, "positions": 1.0}
+"""power of the lengths of goals by encoding"""
 GOAL_TOLERANCE_M, GOAL_TOLERANCE_SHARE = 0.1, 0.25
 """tolerance of a path's end from its goal, meters, or relative to the goal's distance if that is more"""
 MIN_SQUARED_M2 = 1e-12

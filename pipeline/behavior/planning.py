@@ -16,7 +16,7 @@ from torch import nn
 from pipeline.behavior import model
 from pipeline.behavior.config import Ego, Guided, PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule, guided, sample
-from pipeline.behavior.path_encoding import PATH_CHANNELS, goal_error, snapped_to_goal
+from pipeline.behavior.path_encoding import PATH_CHANNELS_OF, goal_error, snapped_to_goal
 from pipeline.behavior.perception import FeatureVolume, world_from_ego
 from pipeline.behavior.scenes import SceneConstraint, Scenes
 from pipeline.behavior.trajectories import ABSENT_M, Context, nearest
@@ -159,6 +159,8 @@ class Sampler:
     scaling: model.Scaling
     guided: Guided = "observer"
     """conditions that guidance amplifies"""
+    corrections: bool = True
+    """whether plans are corrected after the networks; else only the networks are sampled"""
 
     def plan(
         self,
@@ -187,6 +189,7 @@ class Sampler:
 
     def codes(self, observation: Observation, sampling: PlanSamplingConfig, count: int = 1) -> PlanCondition:
         """Encode the kept conditions and the references of guidance, repeating rows ``count`` times."""
+        sampling = sampling if self.corrections else sampling.networks_only()
         conditions = [[sampling.scene, sampling.observer, sampling.past]]
         keep = np.repeat(np.array(conditions, np.float32), len(observation), axis=0)
 
@@ -244,7 +247,7 @@ class Sampler:
 
         denoisers = [denoise(codes.full, float(codes.sampling.goal)), *map(denoise, codes.references)]
         correct = partial(self.paths_out_of_solid, codes)
-        shape = (len(goal), PATH_CHANNELS, self.scaling.path_std.shape[1])
+        shape = (len(goal), PATH_CHANNELS_OF[self.scaling.encoding], self.scaling.path_std.shape[1])
         solver, steps = self.of_sequences(codes.sampling)
         path = self._denoised(denoisers, shape, solver, steps, rng, correct, solver.path_noise_std)
         return self.decode_paths(codes, path, goal)
@@ -280,8 +283,8 @@ class Sampler:
         return ancestral, self.schedule.sampled_steps
 
     def paths_out_of_solid(
-        self, codes: PlanCondition, scaled: Float[np.ndarray, "plan 4 frame"]
-    ) -> Float[np.ndarray, "plan 4 frame"]:
+        self, codes: PlanCondition, scaled: Float[np.ndarray, "plan channel frame"]
+    ) -> Float[np.ndarray, "plan channel frame"]:
         """Project scaled paths out of solid space."""
         if codes.constraint is None:
             return scaled
@@ -291,7 +294,7 @@ class Sampler:
     def decode_paths(
         self,
         codes: PlanCondition,
-        scaled: Float[np.ndarray, "plan 4 frame"],
+        scaled: Float[np.ndarray, "plan channel frame"],
         goal: Float[np.ndarray, "plan 3"],
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Convert scaled paths to meters, snap them to the goals that condition them, and constrain them."""

@@ -75,7 +75,8 @@ class AnimalBatch:
     ):
         self.sampler, self.scenes, self.rest = sampler, scenes, rest
         self.ego: Ego = ego
-        self.sampling, self.chaining, self.clearance_m = sampling, chaining, clearance_of(rest)
+        self.sampling, self.clearance_m = sampling, clearance_of(rest)
+        self.chaining = chaining if sampler.corrections else replace(chaining, candidates=1)
 
     def begin(
         self,
@@ -277,7 +278,9 @@ class AnimalBatch:
         start_world: Float[np.ndarray, "some 3"],
         some: Int[np.ndarray, "some"],
     ) -> Float[np.ndarray, "some frame 3"]:
-        """Deform paths (ego frames) around the bodies of the others, the observer's last."""
+        """Deform paths (ego frames) around the bodies of the others, the observer's last, if corrected."""
+        if not self.sampler.corrections:
+            return path
         video = None if self.video is None else self.video[some]
 
         def clear(points: Float[np.ndarray, "some 3"]) -> Float[np.ndarray, "some 3"]:

@@ -109,7 +109,7 @@ def refuse_homes(agent: str, table: Mapping[str, Any], where: str) -> None:
 
 
 def trials(table: Mapping[str, Any]) -> Iterator[Trial]:
-    """Yield every trained method of the tables with every seed; a method is the variant of that name."""
+    """Yield every trained method of the tables with every seed; a method is that variant's training."""
     settings = {**vars(sources.config_of(TABLES_STAGE)()), **table}
     count, methods = settings["seeds"], settings["methods"]
     if OURS not in methods or not count:
@@ -119,7 +119,10 @@ def trials(table: Mapping[str, Any]) -> Iterator[Trial]:
     for method in methods:
         path = Path("agents", "variants", f"{method}.toml")
         overlay, _ = read(path)
-        config.refuse_unknown(overlay, (TRIED_TABLE,), where=f"{path}, a method of the tables", kind="table")
+        if TRIED_TABLE not in overlay:
+            config.refuse_unknown(
+                overlay, (TRIED_TABLE,), where=f"{path}, a method of the tables", kind="table"
+            )
         for seed, id in enumerate(trial_ids((method,), count)):
             yield Trial(id, {**overlay.get(TRIED_TABLE, {}), "seed": seed})
 

@@ -10,7 +10,6 @@ from torch import Tensor
 from pipeline.baselines.samplers import LOG_STD_BOUNDS, LOG_STD_STEP, MEAN_STEP
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import BehaviorNets
-from pipeline.behavior.path_encoding import PATH_CHANNELS
 from pipeline.core import distributed
 from stages.train_behavior.batches import TrainingBatch
 from stages.train_behavior.config import ObjectiveConfig
@@ -78,9 +77,10 @@ def one_stage_losses(
     whole = torch.cat([batch.path, seen], dim=1)
     nothing = torch.zeros_like(batch.places), torch.zeros(len(code), 1, device=code.device)
     motion = torch.full((whole.shape[1], 1), MOTION_WEIGHT[objective.weighting], device=code.device)
-    motion[:PATH_CHANNELS] = 0
+    lead = batch.path.shape[1]
+    motion[:lead] = 0
     weights = objective.weighting, generator, motion
     error = squared_error(lambda x, t: nets.body(x, t, code, *nothing), whole, schedule, *weights)
-    body = error[:, PATH_CHANNELS:] * known[:, None, None]
+    body = error[:, lead:] * known[:, None, None]
     rows = distributed.mean(known.sum().float()).clamp_min(1 / distributed.size())
-    return {"path": error[:, :PATH_CHANNELS].mean(), "body": body.sum() / (rows * body[0].numel())}
+    return {"path": error[:, :lead].mean(), "body": body.sum() / (rows * body[0].numel())}

@@ -12,14 +12,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from pipeline.behavior.config import Encoding
 from pipeline.behavior.diffusion import STANDARD
 from pipeline.behavior.encoders import other_channels_torch
 from pipeline.behavior.model import ROOT_CHANNELS, Architecture, Scaling, channels_from_bones
-from pipeline.behavior.path_encoding import (
-    GOAL_LENGTH_POWER,
-    velocity_channels_from_path,
-    with_powered_length,
-)
+from pipeline.behavior.path_encoding import GOAL_POWER_OF, velocity_channels_from_path, with_powered_length
 from pipeline.behavior.perception import POSITION, PerceptionEnsemble, world_from_ego
 from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.geometry import rigid, rigid_torch
@@ -73,6 +70,8 @@ class TrainingWindows:
     """windows with an approaching observer, repeated to balance distances"""
     rate_hz: float = RATE_HZ
     """frames per second"""
+    encoding: Encoding = "strides"
+    """of goals and paths"""
 
     @property
     def past(self) -> int:
@@ -122,8 +121,8 @@ class TrainingBatch:
     goal: Float[Tensor, "batch 3"]
     track: Float[Tensor, "batch 3 frame"]
     """positions of all frames, encoded as goals"""
-    path: Float[Tensor, "batch 4 frame"]
-    """strides"""
+    path: Float[Tensor, "batch path_channel frame"]
+    """strides or positions"""
     places: Float[Tensor, "batch 3 frame"]
     """the path as it controls the body"""
     body: Float[Tensor, "batch body_channel frame"]
@@ -153,7 +152,7 @@ def windows_from_data(homes: TrainingHomes, architecture: Architecture) -> Train
     approaching = approaching[:0] if architecture.ablated_input == "observer" else approaching
     known = homes.home[data.video[index]] == 0
     indices = (torch.from_numpy(index) for index in (rows, number, known, approaching))
-    return TrainingWindows(*tables, *indices, rate_hz=data.rate_hz)
+    return TrainingWindows(*tables, *indices, rate_hz=data.rate_hz, encoding=architecture.encoding)
 
 
 def approached(
@@ -202,8 +201,8 @@ def statistics_from_windows(windows: TrainingWindows, turn_rad: float) -> Window
     body_std = np.concatenate([np.full(3, heading_std), std[3:]])
     strides = velocity_channels_from_path(tracks.root[:, past:], tracks.root[:, past - 1], rate_hz)
     velocity_std = np.array([[*_axis_rms(strides[..., :3].double().numpy().reshape(-1, 3)), 1.0]])
-    goal_std = _axis_rms(with_powered_length(future[:, -1], GOAL_LENGTH_POWER))
-    scaling = Scaling(goal_std, velocity_std, path_std, mean, body_std, rate_hz)
+    goal_std = _axis_rms(with_powered_length(future[:, -1], GOAL_POWER_OF[windows.encoding]))
+    scaling = Scaling(goal_std, velocity_std, path_std, mean, body_std, rate_hz, windows.encoding)
     position = tracks.root[:, :past].std().clip(MIN_WAY_STD).expand(3)
     mean, std = (torch.from_numpy(numbers).float() for numbers in (mean, std))
     return WindowStatistics(scaling, torch.cat([torch.zeros(3), mean]), torch.cat([position, std]))
@@ -312,9 +311,11 @@ def draw_batch(
     body = body_channels(rotation[:, posed], windows.bones[frames[:, posed]])
     body = body - torch.from_numpy(scaling.body_mean).float()
     device, future = scene.points.device, root[:, count:]
-    track = with_powered_length(future, GOAL_LENGTH_POWER) / torch.from_numpy(scaling.goal_std).float()
+    track = with_powered_length(future, GOAL_POWER_OF[scaling.encoding])
+    track = track / torch.from_numpy(scaling.goal_std).float()
     strides = velocity_channels_from_path(future, root[:, count - 1], windows.rate_hz)
     strides = strides / torch.from_numpy(scaling.velocity_std).float()
+    places = future.mT / torch.from_numpy(scaling.path_std).float()
     return TrainingBatch(
         scene(ego.to(device), side.to(device), windows.scene[index].to(device)),
         other_channels_torch(observer, facing, tracks.companions, new_from_old),
@@ -325,7 +326,7 @@ def draw_batch(
         chosen,
         track[:, -1],
         track.mT,
-        strides.mT,
-        future.mT / torch.from_numpy(scaling.path_std).float(),
+        places if scaling.encoding == "positions" else strides.mT,
+        places,
         (body / torch.from_numpy(scaling.body_std).float()).mT,
     ).to(device)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from pipeline.behavior.config import AblatedInput, Control, Ego, Family, ObservedPast, SceneEncoder
+from pipeline.behavior.config import AblatedInput, Control, Ego, Encoding, Family, ObservedPast, SceneEncoder
 
 Weighting = Literal["noise", "velocity", "flow"]
 """Prediction target whose error has equal weight at all noise levels, see `objective.squared_error`."""
@@ -115,6 +115,12 @@ class Config:
     observed_past: ObservedPast = "positions"
     """Encoding of the observer's past: positions, with distance and approach speed as features, or SE(3)
     poses as in the paper; unknown rotations look at the agent."""
+    encoding: Encoding = "strides"
+    """What is diffused: paths as strides, goals by a power of their distance, bodies relative to the current
+    posture; or, as in the paper, all as they are: positions, and bodies controlled by the path alone."""
+    corrections: bool = True
+    """Whether plans are moved out of solids, snapped to their goals and drawn again wherever the model is
+    used; off: they are what the networks predict, as in the paper."""
     ensemble_size: int = 3
     """Size of the ensemble of perception and goal networks, whose predictions are averaged, against
     overfitting."""

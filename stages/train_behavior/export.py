@@ -16,7 +16,7 @@ from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.encoders import POSE_CHANNELS
 from pipeline.behavior.model import Architecture, BehaviorNets, Scaling, contract, other_channels
-from pipeline.behavior.path_encoding import PATH_CHANNELS
+from pipeline.behavior.path_encoding import PATH_CHANNELS_OF
 from pipeline.behavior.perception import GRID_SHAPE
 from pipeline.behavior.planning import Observation, Sampler, TorchNetworks
 from pipeline.behavior.trajectories import UP
@@ -41,7 +41,7 @@ def write_contract(
     document = contract(architecture, scaling, schedule, rest)
     (folder / "behavior.json").write_text(json.dumps(document, indent=1) + "\n")
     if architecture.family == "diffusion":
-        sampler = Sampler(TorchNetworks(nets), schedule, scaling)
+        sampler = Sampler(TorchNetworks(nets), schedule, scaling, corrections=architecture.corrections)
         golden = golden_plan(sampler, architecture)
         (folder / "golden.json").write_text(json.dumps(golden) + "\n")
 
@@ -100,7 +100,8 @@ def signature(name: str, a: Architecture) -> tuple[dict[str, tuple[int, ...]], s
         case "goal":
             return {"x": (3,)} | step, "epsilon"
         case "path":
-            return {"x": (PATH_CHANNELS, a.future)} | step | {"control": (3,), "keep": (1,)}, "epsilon"
+            x = (PATH_CHANNELS_OF[a.encoding], a.future)
+            return {"x": x} | step | {"control": (3,), "keep": (1,)}, "epsilon"
         case _:
             controlled = {"control": (3, a.future), "keep": (1,)}
             return {"x": (a.body_channels, a.future)} | step | controlled, "epsilon"
@@ -131,7 +132,7 @@ def golden_plan(sampler: Sampler, architecture: Architecture) -> dict:
     noise = np.random.default_rng(0)
     shapes = {
         "goal": (1, 3),
-        "path": (1, PATH_CHANNELS, architecture.future),
+        "path": (1, PATH_CHANNELS_OF[architecture.encoding], architecture.future),
         "body": (1, architecture.body_channels, architecture.future),
     }
     drawn = {name: noise.standard_normal(shape, dtype=np.float32) for name, shape in shapes.items()}

@@ -29,9 +29,11 @@ BODY_COMPONENTS = 24
 
 def preconditioned(config: Config) -> bool:
     """Return whether bodies have a Gaussian prior: not if they are regressed or not trained, nor with the
-    paper's loss.
+    paper's loss or encoding.
     """
     objective = config.training.objective
+    if config.encoding == "positions":
+        return False
     trained = config.family == "one_stage" or objective.body_share > 0
     return trained and config.family != "gaussian" and objective.weighting != "noise"
 
@@ -57,6 +59,8 @@ def architecture_for(config: Config, data: BehaviorData, scenes: Scenes) -> Arch
         rate_hz=data.rate_hz,
         ensemble_size=config.ensemble_size,
         guided="all" if config.training.objective.joint_dropout else "observer",
+        encoding=config.encoding,
+        corrections=config.corrections,
     )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from pipeline.behavior.body_denoiser import OneStageDenoiser
+from pipeline.behavior.body_denoiser import BodyDenoiser, OneStageDenoiser
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import ROOT_CHANNELS, Architecture, BehaviorNets, Scaling
 from pipeline.behavior.perception import POSITION, VolumeScene
@@ -124,7 +124,8 @@ def accelerate(nets: BehaviorNets, optimization: BehaviorOptimizerConfig, device
     for scene in (member.scene for member in nets.perception):
         if optimization.precision == "bfloat16" and isinstance(scene, VolumeScene):
             scene.code = torch.autocast(kind, torch.bfloat16)(scene.code)
-    for net, unet in ((nets.path, nets.path), (nets.body, nets.body.unet)):
+    of_body = nets.body.unet if isinstance(nets.body, BodyDenoiser) else nets.body
+    for net, unet in ((nets.path, nets.path), (nets.body, of_body)):
         if optimization.precision == "bfloat16":
             unet.velocity = torch.autocast(kind, torch.bfloat16)(unet.velocity)
         if optimization.compile:
@@ -150,10 +151,11 @@ def initial_nets(
     for member in nets.perception:
         member.past.mean[:], member.past.std[:] = statistics.past_mean, statistics.past_std
     scaling, body = statistics.scaling, nets.body
-    body.path_std[:] = torch.from_numpy(scaling.path_std)
-    body.root_mean[:] = torch.from_numpy(scaling.body_mean[:ROOT_CHANNELS])
-    body.root_std[:] = statistics.past_std[POSITION : POSITION + ROOT_CHANNELS]
-    body.rotation_std[:] = torch.from_numpy(scaling.body_std[:ROOT_CHANNELS])
+    if isinstance(body, BodyDenoiser):
+        body.path_std[:] = torch.from_numpy(scaling.path_std)
+        body.root_mean[:] = torch.from_numpy(scaling.body_mean[:ROOT_CHANNELS])
+        body.root_std[:] = statistics.past_std[POSITION : POSITION + ROOT_CHANNELS]
+        body.rotation_std[:] = torch.from_numpy(scaling.body_std[:ROOT_CHANNELS])
     for part in (nets.goal.map, nets.goal.others):
         if part is not None:
             part.goal_std[:] = torch.from_numpy(scaling.goal_std)
@@ -174,18 +176,19 @@ def fit_body_prior(
     bones. All processes fit the same.
     """
     generator, rows, count = torch.Generator().manual_seed(seed), [], 0
-    augmentation = replace(augmentation, mirror=0.0)
+    augmentation, denoiser = replace(augmentation, mirror=0.0), nets.body
+    assert isinstance(denoiser, BodyDenoiser), "only bodies relative to the posture have a prior"
     while count < PRIOR_WINDOWS:
         batch = draw_batch(windows, scene, statistics, augmentation, PRIOR_BATCH, generator)
         body, along = batch.body[batch.bones_known], batch.places[batch.bones_known]
         now = torch.zeros_like(along[:, 0, 0])
         held = nets.perception.now(batch.held[batch.bones_known], now + 1)
-        lead = batch.path[batch.bones_known] if isinstance(nets.body, OneStageDenoiser) else body[:, :0]
+        lead = batch.path[batch.bones_known] if isinstance(denoiser, OneStageDenoiser) else body[:, :0]
         clean = torch.cat([lead, body], dim=1)
-        rows.append((nets.body.posture(clean, now, held, along)[0], clean))
+        rows.append((denoiser.posture(clean, now, held, along)[0], clean))
         count += len(clean)
     posture, clean = (torch.cat(part) for part in zip(*rows, strict=True))
-    nets.body.prior.fit(posture, clean)
+    denoiser.prior.fit(posture, clean)
 
 
 def two_cosines(progress: float, turn: float) -> float:

@@ -1,5 +1,5 @@
-// Goals and paths in the channels that are diffused. Counterpart of pipeline/behavior/path_encoding.py, whose
-// constants come with the contract as `path_encoding`.
+// Goals, and paths as strides, in the channels that are diffused. Counterpart of
+// pipeline/behavior/path_encoding.py, whose constants come with the contract as `path_encoding`.
 
 // The same direction, the length raised to a power.
 function withPoweredLength(way, power, minSquared) {

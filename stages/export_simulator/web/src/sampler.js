@@ -126,7 +126,8 @@ export class Sampler {
       noise,
       { method: 'dpm_solver', count: steps, interactivity, correct },
     );
-    const pull = commanded ? 1 : keepGoal * Math.min(interactivity, 1);
+    const snapped = this.contract.sampling.snap_to_goal ? keepGoal * Math.min(interactivity, 1) : 0;
+    const pull = commanded ? 1 : snapped;
     return this.snappedPaths(drawn, goals, codes.start, pull);
   }
 
@@ -143,32 +144,41 @@ export class Sampler {
     );
   }
 
-  // Scaled strides, moved to where the animal may be.
+  // The places that sampled channels lead to: strides from `start` on, or positions, as in the paper.
+  placesOf(drawn, start) {
+    const { architecture, scaling, path_encoding: encoding, rate_hz: rate } = this.contract;
+    return architecture.encoding === 'positions'
+      ? this.positions(drawn)
+      : pathFrom(drawn, this.frames, scaling.velocity_std, start, rate, encoding);
+  }
+
+  // Sampled channels that lead along other places.
+  channelsAlong(drawn, start, places) {
+    const { architecture, scaling, path_encoding: encoding, rate_hz: rate } = this.contract;
+    return architecture.encoding === 'positions'
+      ? this.scaledPath(places)
+      : velocityChannelsAlong(drawn, this.frames, scaling.velocity_std, start, places, rate, encoding);
+  }
+
+  // Sampled channels of paths, moved to where the animal may be.
   pathsCleared(frame, start, scaled) {
-    const {
-      contract: { scaling, path_encoding: encoding, rate_hz: rate },
-      frames,
-    } = this;
-    const [egoFromWorld, length] = [inverse(frame), this.pathChannels * frames];
+    const [egoFromWorld, length] = [inverse(frame), this.pathChannels * this.frames];
     const out = new Float32Array(scaled.length);
     for (let at = 0; at < scaled.length; at += length) {
       const mine = scaled.subarray(at, at + length);
-      const path = pathFrom(mine, frames, scaling.velocity_std, start, rate, encoding);
-      const moved = path.map((place) => apply(egoFromWorld, this.senses.cleared(apply(frame, place))));
-      out.set(velocityChannelsAlong(mine, frames, scaling.velocity_std, start, moved, rate, encoding), at);
+      const moved = this.placesOf(mine, start).map((place) =>
+        apply(egoFromWorld, this.senses.cleared(apply(frame, place))),
+      );
+      out.set(this.channelsAlong(mine, start, moved), at);
     }
     return out;
   }
 
-  // Scaled places [3, frames] that scaled strides lead to, snapped to scaled goals.
+  // Scaled places [3, frames] that sampled channels lead to, snapped to scaled goals.
   snappedPaths(drawn, goals, start, pull) {
-    const {
-      contract: { scaling, path_encoding: encoding, rate_hz: rate },
-      frames,
-    } = this;
+    const length = this.pathChannels * this.frames;
     const each = Array.from({ length: goals.length / 3 }, (_, i) => {
-      const mine = drawn.subarray(i * this.pathChannels * frames, (i + 1) * this.pathChannels * frames);
-      const path = pathFrom(mine, frames, scaling.velocity_std, start, rate, encoding);
+      const path = this.placesOf(drawn.subarray(i * length, (i + 1) * length), start);
       return this.scaledPath(snappedToGoal(path, start, this.goal(goals, i), pull));
     });
     return Float32Array.from(each.flat());
@@ -237,16 +247,18 @@ export class Sampler {
     };
   }
 
-  // How a plan is drawn; `frame` is among it where the scene, which plans are kept to, is perceived.
+  // How a plan is drawn; `frame` is among it where the scene, which plans are kept to, is perceived. Plans that
+  // are what the networks predict are kept neither to it nor away from bodies.
   drawing(frame, { seed, steps, interactivity, keep, observer, companions = [] }) {
+    const { avoid_solid: kept } = this.contract.sampling;
     return {
       method: this.contract.sampling.method,
       draw: normals(seed),
       steps,
       interactivity,
-      frame: keep.scene ? frame : null,
+      frame: keep.scene && kept ? frame : null,
       detour: keep.scene ? this.senses.detour : null,
-      bodies: [observer, ...companions].map((places) => [places.at(-1)[0], places.at(-1)[2]]),
+      bodies: (kept ? [observer, ...companions] : []).map((places) => [places.at(-1)[0], places.at(-1)[2]]),
     };
   }
 
@@ -276,7 +288,9 @@ export class Sampler {
     const scaled = given ?? (await this.sampledGoals(codes, question.samples, options));
     const keepGoal = commanded ? 1 : question.keep.goal;
     const goals = this.goalsInWorld(frame, scaled);
-    const tried = given ? Array(CANDIDATES).fill(0) : this.insideFirst(goals).slice(0, CANDIDATES);
+    const { avoid_solid: chosen } = this.contract.sampling; // else the first goal and path are taken
+    const count = chosen ? CANDIDATES : 1;
+    const tried = given ? Array(count).fill(0) : (chosen ? this.insideFirst(goals) : [0]).slice(0, count);
     const targets = Float32Array.from(
       tried.flatMap((index) => Array.from(scaled.subarray(3 * index, 3 * index + 3))),
     );
