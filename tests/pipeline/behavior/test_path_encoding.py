@@ -1,15 +1,19 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from pipeline.behavior.path_encoding import (
     GOAL_LENGTH_POWER,
+    PATH_CHANNELS_OF,
     path_from_velocity_channels,
     snapped_to_goal,
     velocity_channels_from_path,
     warped_path,
     with_powered_length,
 )
+from tests.pipeline.behavior.wandering import scaling
 
 
 def stroll(seed=0, count=20):
@@ -57,6 +61,20 @@ def test_warped_path_reaches_its_goal_and_keeps_rests():
         np.linalg.norm(np.diff(far - path, axis=1), axis=-1)
         <= np.linalg.norm(np.diff(path, axis=1), axis=-1) + 1e-9
     ).all()
+
+
+@pytest.mark.parametrize("encoding", ["strides", "positions"])
+def test_scaled_goals_and_paths_are_inverted_in_both_encodings(encoding):
+    (path, start), scale = stroll(), replace(scaling(), encoding=encoding)
+    np.testing.assert_allclose(scale.goal(scale.scaled_goal(path[:, -1])), path[:, -1], atol=1e-5)
+    moved = path + np.linspace(0, 0.2, 56)[:, None]
+    scaled = np.zeros((20, PATH_CHANNELS_OF[encoding], 56), np.float32)
+    for places in (path, moved):
+        scaled = scale.warped_path(scaled, start, places)
+        np.testing.assert_allclose(scale.path(scaled, start), places, atol=1e-5)
+    if encoding == "positions":
+        np.testing.assert_allclose(scaled, scale.scaled_path(moved))
+        np.testing.assert_allclose(scale.scaled_goal(path[:, -1]) * scale.goal_std, path[:, -1], atol=1e-5)
 
 
 def test_strides_follow_a_warped_path():

@@ -33,6 +33,13 @@ def test_every_method_has_every_seed():
     assert found[3].overlay["ego"] == "world" and found[3].overlay["seed"] == 1
 
 
+def test_a_method_trains_as_its_variant_does_whatever_else_that_changes():
+    (_, trial) = recipes.trials({"methods": ["ats", "paper_small"], "seeds": 1})
+    assert trial.overlay["encoding"] == "positions" and not trial.overlay["corrections"]
+    with pytest.raises(InputError, match="REC-001.*reconstruct"):
+        list(recipes.trials({"methods": ["ats", "mlp_fields"], "seeds": 1}))
+
+
 @pytest.mark.parametrize("table", [{"seeds": 0}, {"methods": ["world"]}, {"methods": []}])
 def test_empty_tables_and_tables_without_ours_are_refused(table):
     with pytest.raises(InputError, match="REC-002.*tabulate_behavior(.|\n)*'ats' among the methods"):

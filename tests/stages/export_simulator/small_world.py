@@ -124,7 +124,7 @@ def trajectory(frames: int, seed: int) -> Trajectory:
     )
 
 
-def networks_that_flee(architecture: Architecture, steps: int = 250) -> tuple[BehaviorNets, Scaling]:
+def networks_that_flee(architecture: Architecture, steps: int = 250) -> BehaviorNets:
     """Train perception and goal network briefly to flee from a near observer, and the path network to go
     straight; the body is random.
     """
@@ -162,12 +162,17 @@ def networks_that_flee(architecture: Architecture, steps: int = 250) -> tuple[Be
         loss.backward()
         optimizer.step()
     _teach_paths(nets, architecture, schedule)
+    return nets
+
+
+def scales(architecture: Architecture) -> Scaling:
+    """Return a plain normalization: goals and paths in meters, positions more widely spread later."""
     grow = np.arange(1, FUTURE + 1) / FUTURE
     path_std = np.stack([grow, 0.02 + 0 * grow, grow])
     channels = architecture.body_channels
     mean = np.zeros(channels)
     mean[[0, 4]] = 1.0
-    return nets, Scaling(np.ones(3), np.ones((1, 4)), path_std, mean, np.full(channels, 0.05))
+    return Scaling(np.ones(3), np.ones((1, 4)), path_std, mean, np.full(channels, 0.05))
 
 
 def _teach_paths(
@@ -196,9 +201,9 @@ def _teach_paths(
         optimizer.step()
 
 
-def write(build: Path, *, accompanied: bool = False) -> None:
+def write(build: Path, *, accompanied: bool = False, paper: bool = False) -> None:
     """Write the four artifacts that `export_simulator` reads (without manifests); an ``accompanied`` animal
-    also perceives and flees other animals.
+    also perceives and flees other animals; that of the ``paper`` is untrained, in its encoding.
     """
     for name in ("reconstruction", "splats", "behavior_data", "behavior"):
         (build / name).mkdir(parents=True)
@@ -238,7 +243,11 @@ def write(build: Path, *, accompanied: bool = False) -> None:
         ensemble_size=1,
         companions=accompanied,
     )
-    nets, scaling = networks_that_flee(architecture)
+    if paper:
+        architecture = replace(architecture, ego="full", encoding="positions", corrections=False)
+        nets, scaling = BehaviorNets(architecture).eval(), replace(scales(architecture), encoding="positions")
+    else:
+        nets, scaling = networks_that_flee(architecture), scales(architecture)
     write_contract(build / "behavior", nets, architecture, scaling, Schedule(), rest())
     write_networks(build / "behavior", nets, architecture)
     assert json.loads((build / "behavior/behavior.json").read_bytes())["rate_hz"] == 10

@@ -97,6 +97,17 @@ def test_page_runs_and_animal_reacts_to_the_observer(simulator: Path, chromium: 
         assert wrong == []
 
 
+def test_page_samples_positions_without_corrections_as_python_does(chromium: Browser, tmp_path: Path) -> None:
+    small_world.write(tmp_path / "raw", paper=True)
+    golden = json.loads((tmp_path / "raw/behavior/golden.json").read_bytes())
+    simulator = small_world.exported(tmp_path / "raw", tmp_path / "simulator")
+    with browser.shown(chromium, (simulator / "index.html").as_uri()) as (page, wrong):
+        check_golden(golden, page.evaluate("golden => ats.golden(golden)", golden))
+        tick = page.evaluate("ats.state()")["tick"]
+        page.wait_for_function(f"ats.state().tick > {tick + 5}", timeout=120_000)
+        assert wrong == []
+
+
 def test_goals_and_paths_are_followed_and_takes_are_saved(
     simulator: Path, chromium: Browser, tmp_path: Path
 ) -> None:

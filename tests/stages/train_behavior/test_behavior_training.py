@@ -6,6 +6,8 @@ import onnxruntime
 import pytest
 import torch
 
+from pipeline.baselines.predictors import Ats
+from pipeline.baselines.samplers import sampler_of
 from pipeline.behavior import model
 from pipeline.behavior.body_denoiser import OneStageDenoiser
 from pipeline.behavior.config import PlanSamplingConfig
@@ -13,7 +15,7 @@ from pipeline.behavior.diffusion import Schedule, noised
 from pipeline.behavior.perception import GRID_SHAPE
 from pipeline.behavior.planning import Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.trajectories import PAST, frames_from_seconds
+from pipeline.behavior.trajectories import PAST, TEST, frames_from_seconds
 from pipeline.core import training as fit
 from pipeline.core.errors import InputError
 from pipeline.geometry import rigid_torch
@@ -50,6 +52,16 @@ from stages.train_behavior.scene_sampler import SceneSampler
 from stages.train_behavior.training import initial_nets, train, two_cosines
 from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
 
+PAPER = replace(
+    ARCHITECTURE,
+    ego="full",
+    observed_past="poses",
+    body_components=0,
+    ensemble_size=1,
+    encoding="positions",
+    corrections=False,
+    guided="all",
+)
 PLAIN = AugmentationConfig(turn=0, mirror=0, past=0, posture_offset=0, hide_bones=0)
 
 
@@ -144,8 +156,9 @@ def test_bodies_have_a_prior_unless_they_are_regressed_or_trained_as_in_the_pape
             data,
             scenes,
         ).body_components,
+        "positions": outcome.architecture_for(Config(encoding="positions"), data, scenes).body_components,
     }
-    assert components["ours"] > 0 == components["gaussian"] == components["paper"]
+    assert components["ours"] > 0 == components["gaussian"] == components["paper"] == components["positions"]
 
 
 def test_windows_start_at_the_origin_facing_forward(windows):
@@ -340,7 +353,7 @@ def test_mixed_precision_is_accurate_and_keeps_float32_weights(data, shape, name
     [
         replace(ARCHITECTURE, control="concatenation"),
         replace(ARCHITECTURE, companions=True),
-        replace(ARCHITECTURE, scene="volume", observed_past="poses", body_components=0),
+        replace(PAPER, scene="volume"),
     ],
     ids=["concatenation", "companions", "paper"],
 )
@@ -354,6 +367,41 @@ def test_models_of_other_architectures_are_written_and_read(data, tmp_path, shap
     assert (architecture, schedule) == (shape, Schedule(course="rectified"))
     np.testing.assert_allclose(scaling.velocity_std, fitted.scaling.velocity_std)
     assert write_networks(tmp_path, nets.eval(), shape) < 5e-4
+
+
+def test_model_as_in_the_paper_is_trained_read_and_sampled(data, tmp_path):
+    """Paths, goals and bodies are denoised as they are, and plans are what the networks predict."""
+    schedule, homes = Schedule(method="ddpm"), TrainingHomes.of_one(data, Scenes.of(room()))
+    objective = ObjectiveConfig(joint_dropout=0.1, weighting="noise", goal_draws=1, earlier_share=0.0)
+    settings = BehaviorTrainingConfig(
+        BehaviorOptimizerConfig(steps=3, goal_steps=0, batch=8, precision="bfloat16"), PLAIN, objective
+    )
+    fitted = train(homes, PAPER, schedule, settings, seed=0)
+    assert all(np.isfinite(values).all() for values in fitted.record.terms.values())
+    outcome.write_trained(tmp_path, fitted, PAPER, schedule, REST)
+    assert json.loads((tmp_path / "behavior.json").read_text())["channels"]["path"] == ["x", "y", "z"]
+    plain = Ats.load(tmp_path, Scenes.of(room()), PlanSamplingConfig())
+    corrected = replace(plain, sampler=replace(plain.sampler, corrections=True))
+    networks = replace(corrected, sampling=corrected.sampling.networks_only())
+    context, _ = data.windows(data.indices(TEST)[:2])
+    plans = [ats.sample(context, 2, np.random.default_rng(0)) for ats in (plain, networks, corrected)]
+    np.testing.assert_array_equal(plans[0].path, plans[1].path)
+    np.testing.assert_array_equal(plans[0].rotation, plans[1].rotation)
+    assert np.abs(plans[0].path - plans[2].path).max() > 0.01
+    assert np.linalg.norm(plans[0].path[:, :, -1] - plans[0].goal, axis=-1).min() > 1e-3, "snapped"
+
+
+@pytest.mark.parametrize(
+    "change", [{"family": "gaussian"}, {"family": "one_stage"}, {"control": "concatenation"}]
+)
+def test_baselines_and_ablations_of_positions_are_trained_and_sampled(data, change):
+    shape = replace(PAPER, observed_past="positions", guided="observer", **change)
+    settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=2, goal_steps=0, batch=4))
+    fitted = train(TrainingHomes.of_one(data, Scenes.of(room())), shape, Schedule(), settings, seed=0)
+    sampler = sampler_of(shape, TorchNetworks(fitted.nets), Schedule(), fitted.scaling)
+    plan = sampler.plan(golden_observation(shape), PlanSamplingConfig(), np.random.default_rng(0), count=2)
+    assert plan.path.shape == (2, 56, 3) and plan.body.shape == (2, 56, shape.body_channels)
+    assert np.isfinite(plan.path).all() and np.isfinite(plan.body).all()
 
 
 @pytest.mark.slow
