@@ -11,8 +11,8 @@ class Config:
         "ats", "gaussian", "one_stage", "world", "no_observer", "no_scene", "no_past", "concatenation",
         "horizon_4_0", "horizon_7_2",
     )  # fmt: skip
-    """Trained methods, which are variants in `agents/variants/`; `ats` is unchanged, `paper_small` the paper's
-    with few steps."""
+    """Trained methods, which are variants in `agents/variants/`; `ats` is unchanged, `paper_small` the
+    paper's with few steps."""
     seeds: int = 5
     """Trainings of each method."""
     trials: int = 12
