@@ -11,6 +11,8 @@ import pytest
 from pipeline.behavior.config import ReplanningConfig
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import BehaviorNets
+from pipeline.behavior.perception import world_from_ego
+from pipeline.behavior.planning import observe
 from pipeline.behavior.simulator import AnimalBatch, PoseFrames, blended_frames
 from pipeline.core.errors import InputError
 from pipeline.data import glb, npz
@@ -109,6 +111,25 @@ def test_plans_are_followed_until_they_end_or_the_observer_moves(simulator):
     for frame in range(40):
         blind.step(person * frame)
     np.testing.assert_array_equal(blind.goal, first)
+
+
+def test_plans_without_corrections_are_what_the_networks_predict(simulator):
+    """Although the person stands in the way, and several candidates are allowed."""
+    context, _ = simulator.data.windows(np.array([0, 40]))
+    beside = context.world_from_agent[..., :3, 3] + np.array([0.05, 0.0, 0.05])
+    context = replace(context, video=None, observer_world=beside, observer_rotation=None)
+    animals, roots = simulator.animals, []
+    for corrections in (False, True):
+        sampler = replace(animals.sampler, corrections=corrections)
+        settings = {"sampling": animals.sampling, "chaining": ReplanningConfig(candidates=4)}
+        batch = AnimalBatch(sampler, animals.scenes, animals.rest, "yaw", **settings)
+        batch.begin(context, np.random.default_rng(0))
+        seen = observe(context, animals.scenes, animals.rest, "yaw")
+        plan = sampler.plan(seen, animals.sampling.networks_only(), np.random.default_rng(0))
+        frame = world_from_ego(context.world_from_agent[:, -1], "yaw")
+        roots.append((batch.plan.root, plan.world_from_agent(frame)))
+    np.testing.assert_allclose(*roots[0], atol=1e-5)
+    assert np.abs(roots[1][0] - roots[1][1]).max() > 0.01
 
 
 def test_plans_depend_on_the_posture(simulator):

@@ -17,6 +17,8 @@ from tests.pipeline.behavior.wandering import REST, room, wandering
 class Breathing:
     """A sampler whose animal stays where it is and breathes."""
 
+    corrections = True
+
     def codes(self, observation, sampling, count=1):
         rows = count * len(observation)
         return PlanCondition(np.zeros((rows, 1)), (), np.zeros((rows, 3)), sampling, None, count)
