@@ -222,7 +222,7 @@ class ConcatenationUNet(UncontrolledUNet):
         schedule: Schedule = STANDARD,
         outputs: int | None = None,
     ):
-        """``control``: channels of the flattened control, 3 for a goal, 8 per frame for a path."""
+        """``control``: channels of the flattened control, 3 for a goal, 8 or 3 per frame for a path."""
         read = nn.Sequential(
             nn.Linear(condition + control + 1, EMBEDDING), nn.SiLU(), nn.Linear(EMBEDDING, EMBEDDING)
         )
