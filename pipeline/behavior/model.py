@@ -189,7 +189,7 @@ class BehaviorNets(nn.Module):
             ensemble_size=a.ensemble_size,
             map_cells=a.map_cells,
             attended_channels=a.attended_channels,
-            length_power=GOAL_POWER_OF[a.encoding],
+            length_power=path_encoding.GOAL_POWER_OF[a.encoding],
         )
         positions = a.encoding == "positions"
         assert not (positions and a.body_components), "bodies beside positions have no prior"
