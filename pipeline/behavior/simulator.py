@@ -1,11 +1,8 @@
 """The behavior model as an environment: `reset(seed)`, then `step(observer)` ten times a second.
 
-Each step plays one frame of the current plan. A plan is followed until it ends or the observer has moved
-noticeably; the next one is sampled from the last 8 frames and blended in. Replanning at every step would
-switch goals in the middle of walks and delay the next one. Goals and paths are not conditioned on bones:
-sampled gaits are less distinct than recorded ones, and the animal would stop. Where a plan leaves the allowed
-voxels, further candidates are drawn and the best is taken, so that chained plans do not drift through walls.
-`AnimalBatch` simulates many animals in one batch, `Simulator` one.
+Each step plays one frame of the current plan. The next plan is sampled from the last 8 frames and blended in.
+Replanning at every step would switch goals in the middle of walks and delay the next one. `AnimalBatch`
+simulates many animals in one batch, `Simulator` one.
 """
 
 from collections import deque
@@ -56,11 +53,10 @@ GOAL_CHANGE_M = 0.3
 class AnimalBatch:
     """Animals simulated together, each in the scene of its recording.
 
-    Animals of the same ``life``, and companions from outside of the batch, are perceived and avoided. All
-    animals that need a plan share one batch of sampling. A plan is followed until it ends, a perceived being
-    moves, or the commanded goal changes. Beside companions, which move all the time, an animal keeps its goal
-    until the horizon has passed: of several paths there it takes the one nearest to what is left of its plan.
-    ``plans_drawn`` counts the plans.
+    Animals of the same ``life``, and companions from outside of the batch, are perceived and avoided. A plan
+    is followed until it ends, a perceived being moves, or the commanded goal changes; for one that leaves the
+    allowed voxels, candidates are drawn. Beside companions, which move all the time, an animal keeps its goal
+    until the horizon has passed, with the path nearest to its plan. ``plans_drawn`` counts the plans.
     """
 
     def __init__(
@@ -107,6 +103,7 @@ class AnimalBatch:
         """Restart some of the animals, each from a window of its own, with its companions if it has any."""
         bones = channels_from_bones(context.agent_from_bone, self.rest)
         if self.companions is not None and context.companions is not None:
+            self.companions = self.companions.copy()
             self.companions[some] = context.companions
         if self.video is not None and context.video is not None:
             self.video[some] = context.video
