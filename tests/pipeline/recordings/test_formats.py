@@ -202,7 +202,7 @@ def test_missing_confidence_is_zero_for_that_frame_only(tmp_path, app, folder):
     sorted((path / folder).iterdir())[3].unlink()
     recording = open_recording(path)
     depth = np.ones(recording.depth_size, np.float32)
-    confidence = [extraction._confidence(recording, int(number), depth) for number in recording.index]
+    confidence = [extraction.confidence_of(recording, int(number), depth) for number in recording.index]
     assert [np.unique(each).tolist() for each in confidence] == [[0] if i == 3 else [1] for i in range(8)]
 
 
