@@ -124,8 +124,10 @@ def check_poses(
         for convention in among
     }
     check, odometry = _judge(scores, documented), odometry_from_pose(pose[frames], documented)
+    if check.verdict == "other":
+        return check
     factor = _depth_factor(odometry, pairs_of_views, views, scores[documented])
-    if check.verdict == "other" or factor == 1:
+    if factor == 1:
         return check
     reason = f"poses contradict the depth; depth times {factor:g} would agree with them: check its unit"
     return replace(check, verdict="unusable", reason=reason, depth_factor=factor)
