@@ -12,11 +12,18 @@ MIN_PIXELS = 100
 """minimum pixels at depth steps"""
 
 
-def relative_gradient(gray: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-    """Return gradients of a picture relative to their local mean, which light and texture change."""
+def relative_slopes(gray: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "height width 2"]:
+    """Return derivatives by x and y relative to the local mean gradient, which light and texture change."""
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), BLUR_PX)
-    gradient = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
-    return gradient / (cv2.blur(gradient, (NEIGHBORHOOD_PX, NEIGHBORHOOD_PX)) + MIN_GRADIENT)
+    x, y = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
+    mean = cv2.blur(np.hypot(x, y), (NEIGHBORHOOD_PX, NEIGHBORHOOD_PX)) + np.float32(MIN_GRADIENT)
+    return np.stack([x / mean, y / mean], axis=-1)
+
+
+def relative_gradient(gray: UInt8[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
+    """Return the length of `relative_slopes`."""
+    slopes = relative_slopes(gray)
+    return np.hypot(slopes[..., 0], slopes[..., 1])
 
 
 def edge_contrast(

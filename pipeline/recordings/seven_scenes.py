@@ -6,16 +6,13 @@ camera's lens state the same intrinsics, so edges of pictures at depth steps dec
 """
 
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.geometry.subsampling import evenly
-from pipeline.mapping.edge_agreement import edge_contrast, relative_gradient
 from pipeline.mapping.picture_agreement import beats
 from pipeline.recordings import errors, extraction, text_files
 from pipeline.recordings.containers import FolderContainer
@@ -87,22 +84,9 @@ def open_recording(path: Path) -> Recording:
         depth_camera=camera,
         remarks=(*remarks, text_files.depth_camera_remark(camera, lens[0])),
     )
-    as_stored, as_raw = _edge_contrasts((stored, raw)).T
+    rows = evenly(len(index), FRAMES, rounded=True)
+    as_stored, as_raw = extraction.edge_contrasts((stored, raw), rows, FARTHEST_M).T
     return stored if beats(as_stored, as_raw, tests=1) else raw
-
-
-def _edge_contrasts(readings: Sequence[Recording]) -> Float[np.ndarray, "frame reading"]:
-    """Return `edge_contrast` of frames spread over a recording, by its readings."""
-    recording, found = readings[0], []
-    for row in evenly(len(recording.index), FRAMES, rounded=True).tolist():
-        color = extraction.picture(recording, row)
-        if color is None:
-            continue
-        gradient = relative_gradient(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY))
-        number = int(recording.index[row])
-        depths = [extraction.stored_depth(each, number, FARTHEST_M) for each in readings]
-        found.append([edge_contrast(gradient, depth) for depth in depths])
-    return np.array(found, float).reshape(-1, len(readings))
 
 
 def _poses(

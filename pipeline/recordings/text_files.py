@@ -95,18 +95,23 @@ def depth_camera(
     if DEPTH_INTRINSICS in container.names:
         numbers = read_coefficients(container, DEPTH_INTRINSICS)[None]
         intrinsics = intrinsics_from_coefficients(numbers, container.place(DEPTH_INTRINSICS))[0]
-    depth_from_color = np.eye(4)
+    depth_from_color, place = np.eye(4), container.place(DEPTH_FROM_COLOR)
     if DEPTH_FROM_COLOR in container.names:
         depth_from_color = table(container, DEPTH_FROM_COLOR, 4, rows=4)
-        if not np.isfinite(pose_from_matrix(depth_from_color[None])).all():
-            why = "it is no rigid motion: rotation and translation in meters, four rows"
-            raise errors.broken_metadata(container.place(DEPTH_FROM_COLOR), why)
-    found, apart_m = DepthCamera(intrinsics, depth_from_color), np.linalg.norm(depth_from_color[:3, 3])
+    found = possible(DepthCamera(intrinsics, depth_from_color), place)
+    return found, (depth_camera_remark(found, color_intrinsics),)
+
+
+def possible(camera: DepthCamera, where: str) -> DepthCamera:
+    """Return a camera. Raises CAP-004 if its matrix is not a rigid motion or moves too far."""
+    if not np.isfinite(pose_from_matrix(camera.depth_from_color[None])).all():
+        why = "it is no rigid motion: rotation and translation in meters, four rows"
+        raise errors.broken_metadata(where, why)
+    apart_m = np.linalg.norm(camera.depth_from_color[:3, 3])
     if apart_m > MAX_BASELINE_M:
         what = f"its cameras are {apart_m:g} m apart, further than in one device"
-        where, remedy = container.place(DEPTH_FROM_COLOR), "write its last column in meters"
-        raise InputError("CAP-004", what, where, remedy)
-    return found, (depth_camera_remark(found, color_intrinsics),)
+        raise InputError("CAP-004", what, where, "write its last column in meters")
+    return camera
 
 
 def depth_camera_remark(camera: DepthCamera, color_intrinsics: Float[np.ndarray, "3 3"]) -> str:
