@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.calibration import given
 from pipeline.core import config
 from pipeline.core.errors import InputError
 from pipeline.data import clicks, gaussian_ply, images, npz, ply
@@ -127,6 +128,7 @@ READERS = {
 'role = "session"\nsplit = "train"\noffset_s = '
 '1.5\nsynchronized_with = "b.r3d"\n'
 ), _sidecar),
+    "depth_toml": Reader(_text("registered = false\ndepth_intrinsics = [26.5, 26.5, 12.0, 16.0]\ndelay_s = 0.1\n"), given.read),
 }  # fmt: skip
 
 

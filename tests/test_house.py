@@ -30,6 +30,7 @@ PACKAGES = (
     "mapping",
     "data",
     "recordings",
+    "calibration",
     "workflow",
     "backends",
     "localization",

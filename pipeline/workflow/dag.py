@@ -133,7 +133,8 @@ OF_HOMES = (
 # fmt: off
 FLOW: tuple[Node, ...] = (
     Node("synthetic_capture", "synthesize_capture", threads=2),
-    Node("frames", "extract_frames", (RECORDING,), roles=(*VIEWED, "heldout"), seconds_per_frame=0.006),
+    Node("frames", "extract_frames", (RECORDING,),
+         roles=(*VIEWED, "heldout"), sidecars=("depth",), seconds_per_frame=0.006),
     Node("pictures", "extract_frames", (RECORDING,),
          roles=AGENT, table="extract_frames", mapped=True, seconds_per_frame=0.006),
     Node("feature_basis", "fit_feature_basis", (Need("frames", VIEWED, ("train", "none"), measured=True),)),

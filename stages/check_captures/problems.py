@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.calibration.recordings import as_given, describe
 from pipeline.core.videos import Role
-from pipeline.recordings.text_files import DEPTH_FROM_COLOR
 from stages.check_captures.moving_objects import MotionShare
 from stages.check_captures.parallax import Parallax
 from stages.check_captures.sampling import RecordingSample
@@ -36,8 +36,6 @@ class CaptureMeasurements:
     """share of frames localized in the walk-through, 0..1"""
     parallax: Parallax | None = None
     """of a walk-through without depth"""
-    misalignment: str = ""
-    """how the depth camera seems to differ from what the recording states"""
 
 
 SHORTEST_S: dict[Role, float] = {"walkthrough": 30.0, "turnaround": 8.0, "session": 15.0, "heldout": 5.0}
@@ -70,7 +68,6 @@ REMEDIES = {
     "CAP-057": "copy the file unedited; check the unit of its depth, its intrinsics and what mirrored it",
     "CAP-058": "leave poses out that are not its own; else move slowly, along things with a pattern",
     "CAP-059": "film the room again with nobody in it; if nobody was there, ignore it (large panes of glass)",
-    "CAP-060": "describe the depth camera by depth_from_color.txt and depth_intrinsics.txt",
 }
 
 
@@ -92,8 +89,13 @@ def _remedies(seen: CaptureMeasurements, role: Role) -> dict[str, str]:
         found["CAP-050"] = "add poses if its app can store them; the build finds the cameras, less surely"
     if agreement is not None and agreement.better.endswith(("earlier", "later")):
         found["CAP-057"] = "they were not taken at one time: shift the time stamps (numbers) of one by that"
-    if Path(recording.where, DEPTH_FROM_COLOR).is_file():
-        found["CAP-060"] = f"check {DEPTH_FROM_COLOR} (is it the inverse?) and depth_intrinsics.txt"
+    depth = seen.sample.calibration
+    if depth is not None and depth.estimate is not None and depth.clear:
+        given = as_given(recording, depth.estimate, depth.clear)
+        keys = ", ".join(f"{key} = {value}" for key, value in given.items())
+        found["CAP-060"] = f"to fix this, write {Path(recording.where).name}.depth.toml: {keys}"
+        if depth.used != depth.clear:
+            found["CAP-060"] = f"check what is given (is depth_from_color the inverse?); these fit: {keys}"
     return found
 
 
@@ -125,8 +127,12 @@ def _of_depth(seen: CaptureMeasurements, role: Role) -> dict[str, str]:
         found["CAP-037"] = f"{1 - sample.depth_valid:.0%} of the depth is unknown"
     if sample.beyond > MAX_BEYOND:
         found["CAP-038"] = f"{sample.beyond:.0%} of the depth is beyond the sensor's range"
-    if seen.misalignment and sample.plan.pose_check.depth_factor == 1:
-        found["CAP-060"] = f"depth steps lie on edges of pictures if the depth camera {seen.misalignment}"
+    depth = sample.calibration
+    same_unit = sample.plan.pose_check.depth_factor == 1
+    if depth is not None and depth.estimate is not None and depth.clear and same_unit:
+        used = "the build corrects it" if depth.used == depth.clear else "what is given is used nevertheless"
+        what = describe(depth.estimate, depth.clear)
+        found["CAP-060"] = f"depth is not aligned with the pictures: {what}; {used}"
     return found
 
 

@@ -7,6 +7,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from pipeline.calibration import recordings as calibration
+from pipeline.calibration.given import NOTHING, GivenCalibration
+from pipeline.calibration.recordings import DepthCalibration
 from pipeline.geometry import rigid
 from pipeline.geometry.subsampling import evenly
 from pipeline.mapping.picture_agreement import PictureAgreement
@@ -59,6 +62,8 @@ class RecordingSample:
     """share of the sample (0..1) that cannot be decoded"""
     agreement: PictureAgreement | None = None
     """of pictures with depth, intrinsics and device poses"""
+    calibration: DepthCalibration | None = None
+    """of the depth camera, which is applied in ``recording`` as far as it is used"""
 
     @property
     def duration_s(self) -> float:
@@ -104,11 +109,16 @@ class RecordingSample:
         return float(np.mean([shot.beyond for shot in self.shots]))
 
 
-def sample(recording: Recording, count: int, *, max_depth_m: float) -> RecordingSample:
+def sample(
+    recording: Recording, count: int, *, max_depth_m: float, given: GivenCalibration = NOTHING
+) -> RecordingSample:
     """Read about ``count`` frames spread over a recording; `InputError` if it is unusable."""
     if recording.depth_size is None:
         return _look_at_pictures(recording, count)
-    plan = extraction.understand(recording, rate_hz=RATE_HZ, max_depth_m=max_depth_m, max_side_px=SIDE_PX)
+    calibrated, plan = calibration.understand(
+        recording, given, rate_hz=RATE_HZ, max_depth_m=max_depth_m, max_side_px=SIDE_PX
+    )
+    recording = calibrated.recording
     rows, shots = evenly(len(plan.chosen), count, rounded=True), []
     sample = replace(plan, chosen=plan.chosen[rows])
     frames = extraction.frames(recording, sample, max_depth_m=max_depth_m)
@@ -119,7 +129,7 @@ def sample(recording: Recording, count: int, *, max_depth_m: float) -> Recording
             shots.append(_shot(plan, row, frame, beyond))
     _refuse_empty(recording, shots)
     agreement = extraction.picture_agreement_of(recording, plan, max_depth_m=max_depth_m)
-    return RecordingSample(recording, plan, shots, 1 - len(shots) / len(rows), agreement)
+    return RecordingSample(recording, plan, shots, 1 - len(shots) / len(rows), agreement, calibrated)
 
 
 def _shot(plan: ExtractionPlan, row: int, frame: extraction.ExtractedFrame, beyond: float) -> SampledFrame:

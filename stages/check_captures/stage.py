@@ -8,15 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.calibration import given
+from pipeline.calibration.recordings import describe
 from pipeline.core.errors import InputError
 from pipeline.core.videos import Role
 from pipeline.recordings import errors
 from pipeline.recordings.formats import open_recording
-from stages.check_captures import alignment, moving_objects, overlap, parallax, sampling
+from stages.check_captures import moving_objects, overlap, parallax, sampling
 from stages.check_captures.overlap import DescribedFrame
 from stages.check_captures.problems import CaptureMeasurements, problems
 
 MAX_DEPTH_M = 6.0
+GIVEN = ".depth.toml"
+"""suffix of the file beside a recording that describes its depth"""
 SAMPLES, SEED = 40, 0
 """frames sampled per recording; seed of the robust fits"""
 
@@ -37,7 +41,9 @@ def run(files: Sequence[tuple[Path, Role]]) -> Iterator[CaptureVerdict]:
     rng = np.random.default_rng(SEED)
     for path, role in sorted(files, key=lambda file: (file[1] != "walkthrough", file[0].name)):
         try:
-            sample = sampling.sample(open_recording(path), SAMPLES, max_depth_m=MAX_DEPTH_M)
+            file = path.with_name(path.name + GIVEN)
+            stated = given.read(file if file.is_file() else None)
+            sample = sampling.sample(open_recording(path), SAMPLES, max_depth_m=MAX_DEPTH_M, given=stated)
             seen = _seen(sample, role, room, rng)
         except InputError as error:
             yield refused(path, role, error)
@@ -66,11 +72,11 @@ def _seen(
             raise errors.no_depth(sample.recording.where, "the held-out phone measures it")
         shifted = parallax.parallax(sample.shots) if role == "walkthrough" else None
         return CaptureMeasurements(sample, parallax=shifted)
-    drift_m, misalignment = overlap.drift_m(sample.shots), alignment.misalignment(sample.shots)
+    drift_m = overlap.drift_m(sample.shots)
     moving = moving_objects.find_motion(sample.shots) if role in ("walkthrough", "session") else None
     if role == "walkthrough":
         room += overlap.describe(sample.shots)
-        return CaptureMeasurements(sample, drift_m, moving, misalignment=misalignment)
+        return CaptureMeasurements(sample, drift_m, moving)
     placed = None
     if room and role != "turnaround":  # may be filmed anywhere: only the animal's template is made from it
         described = overlap.describe(sample.shots)
@@ -82,7 +88,7 @@ def _seen(
             reason = f"{check.reason}; depth times {factor:g} would fit the walk-through: check its unit"
             check = replace(check, reason=reason, depth_factor=factor)
             sample = replace(sample, plan=replace(sample.plan, pose_check=check))
-    return CaptureMeasurements(sample, drift_m, moving, placed, misalignment=misalignment)
+    return CaptureMeasurements(sample, drift_m, moving, placed)
 
 
 def _described(name: str, role: Role, seen: CaptureMeasurements) -> str:
@@ -100,6 +106,8 @@ def _described(name: str, role: Role, seen: CaptureMeasurements) -> str:
         lines[-1] += f"; depth: typically {sample.depth_m:.1f} m, known {sample.depth_valid:.0%}"
         lines[-1] += f", beyond range {sample.beyond:.0%}"
         lines.append(f"  device poses: {_poses(seen)}")
+    if sample.calibration is not None and sample.calibration.estimate is not None:
+        lines.append(f"  depth against pictures: {describe(sample.calibration.estimate)}")
     if seen.placed is not None:
         lines.append(f"  found in the walk-through: {seen.placed:.0%} of the frames")
     if seen.moving is not None and role == "session":

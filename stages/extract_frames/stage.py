@@ -4,6 +4,8 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.calibration import given
+from pipeline.calibration import recordings as calibration
 from pipeline.core import progress
 from pipeline.core.videos import Video
 from pipeline.recordings import extraction
@@ -20,6 +22,8 @@ class Inputs:
     """File or folder as the recording app exported it."""
     captures: Path | None = None
     """Folder of all recordings, which may supply metric scale to a walk-through without depth."""
+    depth: Path | None = None
+    """`<recording>.depth.toml`: its depth camera and delay."""
 
 
 def run(
@@ -44,9 +48,18 @@ def run(
             plan, frames, summary = photogrammetry.map_pictures(recording, sources, config, Path(workspace))
     else:
         reach = {"max_depth_m": config.max_depth_m}
-        plan = extraction.understand(
-            recording, rate_hz=config.rate_hz, max_side_px=config.max_side_px, **reach
+        found, plan = calibration.understand(
+            recording,
+            given.read(inputs.depth),
+            rate_hz=config.rate_hz,
+            max_side_px=config.max_side_px,
+            **reach,
         )
+        if found.estimate is not None:
+            progress.log(f"{recording.where}: {calibration.describe(found.estimate)}")
+        for remark in found.recording.remarks[len(recording.remarks) :]:
+            progress.log(f"{recording.where}: {remark}")
+        recording = found.recording
         frames = extraction.frames(recording, plan, **reach)
         summary = extraction.summary(recording, plan)
         agreement = extraction.picture_agreement_of(recording, plan, **reach)

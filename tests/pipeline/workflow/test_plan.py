@@ -434,20 +434,27 @@ def test_home_that_is_no_other_build_is_refused(small_checkout, name):
     assert refused.returncode == 2 and "REC-002" in refused.stderr and name in refused.stderr
 
 
-def test_prompt_is_an_input_of_the_masks_of_its_recording_only(small_checkout):
+@pytest.mark.parametrize(
+    ("kind", "job", "text"),
+    [
+        ("prompt", "masks.v003", "time_s = 2\nclick = [0.5, 0.5]"),
+        ("depth", "frames.v003", "registered = true"),
+    ],
+)
+def test_sidecar_is_an_input_of_one_job_of_its_recording_only(small_checkout, kind, job, text):
     for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d", "b.r3d"):
         small_checkout.write(f"captures/toy/{name}", name)
     small_checkout.python("pipeline.workflow.plan", "plan", "toy")
     before = key_files(small_checkout)
-    small_checkout.write("captures/toy/b.r3d.prompt.toml", "time_s = 2\nclick = [0.5, 0.5]")
+    small_checkout.write(f"captures/toy/b.r3d.{kind}.toml", text)
     small_checkout.python("pipeline.workflow.plan", "plan", "toy")
     after = key_files(small_checkout)
-    assert {name for name in after if before.get(name) != after[name]} == {"prompt.v003.json"}
+    assert {name for name in after if before.get(name) != after[name]} == {f"{kind}.v003.json"}
     jobs = json.loads((small_checkout.folder / "build/toy/plan/dag.json").read_text())
-    prompted = {job["id"]: job for job in jobs if "--prompt" in job["arguments"]}
-    assert list(prompted) == ["masks.v003"], "b.r3d"
-    assert "captures/toy/b.r3d.prompt.toml" in prompted["masks.v003"]["arguments"]
-    assert any(key.endswith("keys/prompt.v003.json") for key in prompted["masks.v003"]["keys"])
+    given = {each["id"]: each for each in jobs if f"--{kind}" in each["arguments"]}
+    assert list(given) == [job], "b.r3d"
+    assert f"captures/toy/b.r3d.{kind}.toml" in given[job]["arguments"]
+    assert any(key.endswith(f"keys/{kind}.v003.json") for key in given[job]["keys"])
     assert captures.unknown_files(small_checkout.folder / "captures/toy") == []
 
 

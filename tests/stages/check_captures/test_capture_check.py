@@ -7,14 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.calibration.recordings import DepthCalibration, DepthEstimate
 from pipeline.core.videos import Role
 from pipeline.geometry import cameras, rigid
 from pipeline.geometry.meshes import RayCaster, render_view
 from pipeline.mapping import picture_agreement
 from pipeline.recordings.formats import open_recording
-from pipeline.recordings.recording import DepthCamera, reproject
 from stages.check_captures import __main__ as front
-from stages.check_captures import alignment, moving_objects, overlap, parallax, problems, sampling, stage
+from stages.check_captures import moving_objects, overlap, parallax, problems, sampling, stage
 from stages.check_captures.sampling import SampledFrame
 from tests.pipeline.recordings import made_formats
 from tests.stages import textured_room
@@ -156,9 +156,9 @@ def test_damaged_pictures_and_missing_depth_are_reported(tmp_path):
 
 
 def _shots(
-    seed: int, count: int, offset: np.ndarray | None = None, balls=lambda frame: (), painted: bool = False
+    seed: int, count: int, offset: np.ndarray | None = None, balls=lambda frame: ()
 ) -> list[SampledFrame]:
-    """Rendered views of a room with the given colors, with balls of (center, radius) per frame, ``painted`` or
+    """Rendered views of a room with the given colors, with balls of (center, radius) per frame that are
     only in the depth.
     """
     mesh = textured_room.textured_room(seed, edge_m=0.08)
@@ -172,9 +172,7 @@ def _shots(
         depth, hits = render_view(caster, camera, intrinsics, *size)
         color = hits.interpolate(mesh, mesh.color).reshape(*size, 3)
         for center, radius in balls(frame):
-            ball = _ball(camera, intrinsics, size, center, radius)
-            color = np.where((painted & (ball < depth))[..., None], 30, color)
-            depth = np.minimum(depth, ball)
+            depth = np.minimum(depth, _ball(camera, intrinsics, size, center, radius))
         odometry = camera if offset is None else offset @ camera
         gray = color.mean(-1).astype(np.uint8)
         small = depth[1::3, 1::3].astype(np.float32)
@@ -207,24 +205,12 @@ def test_room_is_recognized_and_another_is_not():
         assert problems._of_content(seen, "session").keys() == describe_capture
 
 
-@pytest.mark.parametrize(
-    ("shift_m", "found"),
-    [((0.0, 0.0, 0.0), ""), ((0.025, 0.0, 0.0), "2.5 cm left"), ((0.0, -0.05, 0.0), "5 cm below")],
-)
-def test_depth_of_a_camera_beside_the_color_camera_is_reported(shift_m, found):
-    def balls(frame):
-        return [((0.5 * np.sin(frame + i), 0.2 + 0.2 * i, 0.5 * np.cos(frame + i)), 0.15) for i in range(4)]
-
-    depth_from_color = rigid.make(np.eye(3), np.array(shift_m))
-    shots = []
-    for shot, colored in zip(
-        _shots(0, 20, balls=balls), _shots(0, 20, balls=balls, painted=True), strict=True
-    ):
-        color_from_depth = DepthCamera(shot.depth_intrinsics, rigid.inverse(depth_from_color))
-        moved = reproject(shot.depth, color_from_depth, shot.depth_intrinsics, shot.depth.shape)
-        shots.append(dataclasses.replace(colored, depth=moved))
-    assert found in alignment.misalignment(shots)
-    assert bool(found) == bool(alignment.misalignment(shots))
+def _calibrated(sample, **difference):
+    """Return a sample whose depth camera was found 2.5 cm to the left, clearly, and used unless said otherwise."""
+    estimate = DepthEstimate(0.9, rigid.make(np.eye(3), np.array([0.025, 0, 0])), 0.1, np.full(8, 0.001))
+    clear = ("camera", "delay")
+    found = DepthCalibration(sample.recording, estimate, clear, difference.pop("used", clear))
+    return dataclasses.replace(sample, calibration=found, **difference)
 
 
 @pytest.mark.parametrize(("factor", "codes"), [(1.0, {"CAP-060"}), (10.0, {"CAP-050"})])
@@ -234,7 +220,8 @@ def test_another_unit_of_depth_hides_what_follows_from_it(tmp_path, factor, code
     check = dataclasses.replace(sample.plan.pose_check, depth_factor=factor)
     odometry = sample.plan.odometry_from_camera if factor == 1 else None
     plan = dataclasses.replace(sample.plan, pose_check=check, odometry_from_camera=odometry)
-    seen = problems.CaptureMeasurements(dataclasses.replace(sample, plan=plan), misalignment="is elsewhere")
+    sample = _calibrated(sample)
+    seen = problems.CaptureMeasurements(dataclasses.replace(sample, plan=plan))
     assert {each.code for each in problems.problems(seen, "heldout")} == codes
 
 
@@ -249,14 +236,21 @@ def test_remedy_for_missing_poses_depends_on_why_they_are_missing(tmp_path, pose
     assert remedy in {each.code: each.remedy for each in found}["CAP-050"]
 
 
-@pytest.mark.parametrize(("described", "remedy"), [(False, "describe the"), (True, "is it the inverse")])
-def test_a_described_depth_camera_is_to_be_checked(tmp_path, described, remedy):
+@pytest.mark.parametrize(
+    ("used", "what", "remedy"),
+    [
+        (("camera", "delay"), "the build corrects it", "write a.depth.toml: depth_intrinsics = ["),
+        (("delay",), "what is given is used", "is depth_from_color the inverse"),
+    ],
+)
+def test_another_depth_camera_is_reported_with_what_to_write(tmp_path, used, what, remedy):
     folder = made_formats.video_and_depth(tmp_path / "a", _made(2.0, rate_hz=15.0))
-    if described:
-        (folder / "depth_from_color.txt").write_text("1 0 0 0.03\n0 1 0 0\n0 0 1 0\n0 0 0 1")
     sample = sampling.sample(open_recording(folder), 20, max_depth_m=6.0)
-    found = problems.problems(problems.CaptureMeasurements(sample, misalignment="is elsewhere"), "session")
-    assert remedy in {each.code: each.remedy for each in found}["CAP-060"]
+    assert sample.calibration is not None and sample.calibration.clear == ()
+    seen = problems.CaptureMeasurements(_calibrated(sample, used=used))
+    found = {each.code: each for each in problems.problems(seen, "session")}["CAP-060"]
+    assert what in found.what and "0.900 +- 0.001 times" in found.what
+    assert remedy in found.remedy and "delay_s = 0.1" in found.remedy
 
 
 def test_remedy_for_late_depth_speaks_of_time(tmp_path):
@@ -280,9 +274,7 @@ def test_walk_through_gives_the_unit_of_depth_without_poses(tmp_path, factor):
     folder = made_formats.video_and_depth(tmp_path / "a", _made(2.0, rate_hz=15.0), poses=False)
     sample = dataclasses.replace(sampling.sample(open_recording(folder), 20, max_depth_m=6.0), shots=shots)
     seen = stage._seen(sample, "session", room, np.random.default_rng(0))
-    seen = dataclasses.replace(seen, misalignment="is elsewhere")
     found = {each.code: each.what for each in problems.problems(seen, "session")}
-    assert ("CAP-060" in found) == (factor == 1)
     assert ("times 5 would fit the walk-through" in found["CAP-050"]) == (factor == 5)
 
 
