@@ -1,0 +1,241 @@
+"""A cat whose true reactions are known: an hour of its simulated life for training, and the cat itself for testing.
+
+`simulated_build` simulates cat and person in furnished homes, where the person walks up at all speeds, and trains a
+behavior model: OUT can then be opened like a build. `TrueWorld` opens it with the cat that was simulated in
+place of the model, at the same moments in the same homes, so that a policy that learned with the model is tested on
+the animal. The true cat flees by its rule (`stages.synthesize_capture.policy`).
+"""
+
+import shutil
+from collections import deque
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.behavior.avoidance import clearance_of
+from pipeline.behavior.config import ReplanningConfig
+from pipeline.behavior.trajectories import RATE_HZ, TRAIN, BehaviorData, Context
+from pipeline.core.progress import log
+from pipeline.core.videos import Video
+from pipeline.data import npz
+from pipeline.environments.config import EnvironmentConfig
+from pipeline.environments.residents import Resident
+from pipeline.environments.world import AnimalWorld
+from pipeline.geometry import rigid
+from stages.read_trajectories.motion import CLIP_GAP_S, MeasuredMotion
+from stages.slice_behavior import stage as slicing
+from stages.slice_behavior.config import Config as SlicingConfig
+from stages.synthesize_capture import camera_motion, dwellings, gait, session
+from stages.synthesize_capture.camera_motion import ARM_M
+from stages.synthesize_capture.lives.lives import rest
+from stages.synthesize_capture.navigation import ANIMAL_M, Floor, floor_for
+from stages.synthesize_capture.observer import AT_HOME
+from stages.synthesize_capture.policy import DELAY_S, STEP_S, Policy, SeenWalker
+from stages.synthesize_capture.room import Place, Room
+from stages.synthesize_capture.voxels import volume_of
+from stages.train_behavior import stage as training
+from stages.train_behavior.config import (
+    AugmentationConfig,
+    BehaviorOptimizerConfig,
+    BehaviorTrainingConfig,
+    ObjectiveConfig,
+)
+from stages.train_behavior.config import Config as TrainingConfig
+
+HOMES, TEST_HOMES, TEST_SESSIONS = 24, 3, 4
+"""Homes to learn from, a session each, further homes for testing, and sessions in each of these."""
+TAKES, SESSION_S = 5, 150.0
+"""Takes of a session, each from a random start, and its duration: as in `stages.synthesize_capture.lives`."""
+WINDOW_STRIDE = 5
+"""Frames between windows: adjacent ones are nearly identical."""
+WALKS_UP = replace(AT_HOME, approach_m_s=(0.15, 1.3), approach_s=(4.0, 10.0))
+"""A person who walks up to the cat at all speeds, slow ones for longer; `AT_HOME` knows none below 0.8 m/s."""
+MODEL = TrainingConfig(
+    export=False,
+    ensemble_size=1,
+    training=BehaviorTrainingConfig(
+        BehaviorOptimizerConfig(steps=1400, goal_steps=500, goal_batch=128, rate=4e-3),
+        AugmentationConfig(past=0.05, hide_bones=0.2, approached=0.25, approached_paths=0.5),
+        ObjectiveConfig(weighting="flow", code_dropout=0.0, path_share=1.0, body_share=0.25),
+    ),
+)
+"""As in `agents/benchmark.toml`."""
+STEPS = round(1 / (RATE_HZ * STEP_S))
+"""Steps of the cat per step of the environment."""
+PERCH_M = 0.1
+"""Height of the ground above which the cat is on one of its high places."""
+STANDS_M, STANDS_FRAMES = 0.06, 3
+"""A person stands who has moved less than this in so many frames: less than 0.2 m/s."""
+CALM_S = 0.8
+"""How long the person has stood when an episode begins."""
+
+
+def home_of(number: int, session_number: int) -> tuple[Room, np.random.Generator]:
+    """Return a home with its loose things as in one of its sessions, and what decides the rest of the session."""
+    home = dwellings.furnish_otherwise(np.random.default_rng([0, 10, number]))
+    rng = np.random.default_rng([0, 14, number, session_number])
+    return dwellings.rearranged(home, rng), rng
+
+
+def session_names() -> dict[str, tuple[int, int]]:
+    """Return home and number of each session by name."""
+    counts = [1] * HOMES + [TEST_SESSIONS] * TEST_HOMES
+    return {f"home{home}-{each}": (home, each) for home, count in enumerate(counts) for each in range(count)}
+
+
+def simulated_session(home: Room, rng: np.random.Generator) -> MeasuredMotion:
+    """Simulate cat and person in a home in several takes."""
+    time = np.arange(round(SESSION_S / TAKES * RATE_HZ)) / RATE_HZ
+    sample = np.round(time / session.STEP_S).astype(int)
+    roots, bones, cameras = [], [], []
+    for _ in range(TAKES):
+        take = session.simulate_session(home, rng, SESSION_S / TAKES, WALKS_UP)
+        motion = gait.poses(take.animal, time)
+        roots.append(motion.world_from_agent)
+        bones.append(motion.agent_from_bone.astype(np.float32))
+        cameras.append(camera_motion.filming(take, rng)[sample])
+    clock = np.concatenate([time + number * (time[-1] + CLIP_GAP_S) for number in range(TAKES)])
+    motion = (np.concatenate(each) for each in (roots, bones, cameras))
+    return MeasuredMotion(clock, *motion, rest(), volume_of(home))
+
+
+def without_surprises(data: BehaviorData) -> BehaviorData:
+    """Leave out training windows in which a person who stands now moves noticeably before the window ends.
+
+    The model cannot know that the person will come, learns that standing persons startle, and hardly regards
+    how fast persons come. In closed loop the animal replans when the person moves.
+    """
+    train = data.indices(TRAIN)
+    context, _ = data.windows(train, bones=False)
+    frames = data.start[train][:, None] + data.past + np.arange(data.future)
+    tracks = [data.trajectories[data.videos[video]].world_from_camera for video in data.video[train]]
+    later = np.stack([track[row, :3, 3] for track, row in zip(tracks, frames, strict=True)])[..., [0, 2]]
+    person, animal = context.observer_world[..., [0, 2]], context.world_from_agent[:, -1, [0, 2], 3]
+    now, before = person[:, -1], person[:, -1 - STANDS_FRAMES]
+    stands = np.linalg.norm(now - before, axis=-1) < STANDS_M
+    noticeable = ReplanningConfig.observer_motion_ratio * np.linalg.norm(animal - now, axis=-1)
+    comes = np.linalg.norm(later - now[:, None], axis=-1).max(1) > noticeable
+    left = np.delete(np.arange(len(data.start)), train[stands & comes])
+    return replace(data, video=data.video[left], start=data.start[left], split=data.split[left])
+
+
+def simulated_build(out: Path) -> None:
+    """Simulate sessions, slice them into windows and train the model, unless ``out`` has it."""
+    if (out / "behavior" / "behavior.json").is_file():
+        return
+    videos, tables = [], {}
+    for name, (number, session_number) in session_names().items():
+        tables[name] = out / "lives" / name
+        shutil.rmtree(tables[name], ignore_errors=True)
+        tables[name].mkdir(parents=True)
+        motion = simulated_session(*home_of(number, session_number))
+        npz.save(tables[name] / "motion.npz", compress=False, **motion.arrays())
+        npz.save(tables[name] / "skin.npz", agent_from_bone_rest=motion.agent_from_bone_rest)
+        npz.save(tables[name] / "feature_volume.npz", **vars(motion.volume))
+        videos.append(Video(name, f"{name}.npz", "session", "train" if number < HOMES else "test", None))
+    log(f"{len(videos)} sessions of {SESSION_S:g} s in {HOMES + TEST_HOMES} homes")
+    for part in ("behavior_data", "behavior"):
+        shutil.rmtree(out / part, ignore_errors=True)
+        (out / part).mkdir()
+    windows = SlicingConfig(stride=WINDOW_STRIDE)
+    slicing.run(slicing.Inputs(trajectories=tables), windows, out / "behavior_data", videos=tuple(videos))
+    without_surprises(BehaviorData.load(out / "behavior_data")).save(out / "behavior_data")
+    training.run(training.Inputs(out / "behavior_data"), MODEL, out / "behavior")
+
+
+@dataclass(frozen=True)
+class RootFrames:
+    """One frame of all cats, as much of `PoseFrames` as observations read."""
+
+    root: Float[np.ndarray, "animal 1 4 4"]
+
+
+class TrueCats:
+    """The cats themselves, with the interface of `AnimalBatch` as far as `AnimalWorld` uses it."""
+
+    def __init__(self, data: BehaviorData):
+        self.data, self.clearance_m, self.plans_drawn = data, clearance_of(data.agent_from_bone_rest), 0
+        self.places: dict[int, tuple[Floor, tuple[Place, ...]]] = {}
+
+    def begin(self, context: Context, rng: np.random.Generator, **_: Any) -> None:
+        """Start cats where the windows end, standing, with the person as there."""
+        assert context.video is not None
+        self.video, self.past = context.video, deque(maxlen=2)
+        self.cats = [
+            self._cat(*row, rng) for row in zip(context.video, context.world_from_agent, strict=True)
+        ]
+        self.root_m = context.world_from_agent[:, -1, 1, 3] - [cat.height for cat in self.cats]
+        person = self._bodies(context.observer_world[:, -1])
+        still = np.zeros(2)
+        count = max(1, round(DELAY_S / STEP_S))
+        self.seen = [deque([SeenWalker(place, still)] * count, count) for place in person]
+        self.person = person
+        self.past.extend([self._frame()] * 2)
+
+    def _cat(self, video: int, root: Float[np.ndarray, "past 4 4"], rng: np.random.Generator) -> Policy:
+        """Return the cat at the end of a window, on its perch where it is on one."""
+        if video not in self.places:
+            home, _ = home_of(*session_names()[self.data.videos[video]])
+            self.places[video] = floor_for(home.obstacles(), ANIMAL_M), home.places
+        floor, places = self.places[video]
+        position, ahead = root[-1, [0, 2], 3], root[-1, [0, 2], 2]
+        cat = Policy(floor, places, position, rng.spawn(1)[0])
+        cat.walker.yaw, cat.calm_s = float(np.arctan2(*ahead)), CALM_S
+        high = [place for place in places if place.position[1] > PERCH_M]
+        away = [np.linalg.norm(root[-1, :3, 3] - place.position) for place in high]
+        if away and min(away) < ARM_M:
+            cat.perch = high[int(np.argmin(away))]
+            cat.walker.position, cat.height = position, float(cat.perch.position[1])
+        return cat
+
+    def step(self, eyes: Float[np.ndarray, "animal 3"], companions: None = None) -> None:
+        """Let 0.1 s pass with the persons' phones at these positions."""
+        before, self.person = self.person, self._bodies(eyes)
+        velocity = (self.person - before) * RATE_HZ
+        for step in range(1, STEPS + 1):
+            place = before + (self.person - before) * step / STEPS
+            for cat, seen, *walker in zip(self.cats, self.seen, place, velocity, strict=True):
+                seen.append(SeenWalker(*walker))
+                cat.step(STEP_S, seen[0])
+        self.past.append(self._frame())
+
+    @property
+    def fleeing(self) -> Bool[np.ndarray, "animal"]:
+        """Whether the cat has been startled and runs."""
+        return np.array([cat.reason == "flee" and not cat.walker.arrived() for cat in self.cats])
+
+    @property
+    def past_world(self) -> Float[np.ndarray, "animal past_frame 3"]:
+        """Past positions of the cats, the current ones last; meters."""
+        return np.concatenate([frame.root[..., :3, 3] for frame in self.past], axis=1)
+
+    def _bodies(self, eyes: Float[np.ndarray, "animal 3"]) -> Float[np.ndarray, "animal 2"]:
+        """Return where persons stand who hold their phones towards the cats."""
+        toward = np.array([cat.walker.position for cat in self.cats]) - eyes[:, [0, 2]]
+        return eyes[:, [0, 2]] - ARM_M * toward / np.maximum(
+            np.linalg.norm(toward, axis=1, keepdims=True), ARM_M
+        )
+
+    def _frame(self) -> RootFrames:
+        turn = np.array([[0.0, cat.walker.yaw, 0.0] for cat in self.cats])
+        place = np.array([cat.position for cat in self.cats]) + self.root_m[:, None] * [0.0, 1.0, 0.0]
+        return RootFrames(rigid.make(rigid.rotation_from_vector(turn), place)[:, None])
+
+
+class TrueWorld(AnimalWorld):
+    """A world of persons and the cats themselves; flight is what they decide, not what a model plans."""
+
+    @classmethod
+    def of(cls, out: Path, config: EnvironmentConfig) -> "TrueWorld":
+        """Open what `simulated_build` wrote."""
+        world = cls({"cat": Resident.load(out)}, config)
+        world.batches = {"cat": TrueCats(world.data)}  # pyright: ignore[reportAttributeAccessIssue]
+        return world
+
+    @property
+    def fleeing(self) -> Bool[np.ndarray, "animal"]:
+        """Whether the cats flee."""
+        return self.animals.fleeing  # pyright: ignore[reportAttributeAccessIssue]

@@ -1,0 +1,97 @@
+"""The cat that policies meet in the end, and the windows that its model learns from."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import approach_animal
+from benchmarks.approach_animal import TrueCats
+from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData
+from pipeline.core.videos import Video
+from pipeline.data import npz
+from stages.slice_behavior import stage as slicing
+from stages.slice_behavior.config import Config as SlicingConfig
+
+EYE_M = 1.4
+REACH_M = 0.7
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> BehaviorData:
+    """Windows of half a minute in the first home."""
+    folder: Path = tmp_path_factory.mktemp("life")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(approach_animal, "TAKES", 1)
+        patch.setattr(approach_animal, "SESSION_S", 40.0)
+        motion = approach_animal.simulated_session(*approach_animal.home_of(0, 0))
+    npz.save(folder / "motion.npz", compress=False, **motion.arrays())
+    npz.save(folder / "skin.npz", agent_from_bone_rest=motion.agent_from_bone_rest)
+    npz.save(folder / "feature_volume.npz", **vars(motion.volume))
+    (folder / "sliced").mkdir()
+    video = Video("home0-0", "home0-0.npz", "session", "train", None)
+    inputs = slicing.Inputs(trajectories={"home0-0": folder})
+    slicing.run(inputs, SlicingConfig(), folder / "sliced", videos=(video,))
+    return BehaviorData.load(folder / "sliced")
+
+
+def met(data: BehaviorData, speed_m_s: float, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    """Walk up to cats from 2.2 m; return who fled and who was reached before."""
+    chosen = data.indices(TRAIN)[::20]
+    context, _ = data.windows(chosen)
+    cat = context.world_from_agent[:, -1, :3, 3]
+    angle = np.random.default_rng(0).uniform(0, 2 * np.pi, len(cat))
+    eyes = cat + np.stack([2.2 * np.sin(angle), EYE_M - cat[:, 1], 2.2 * np.cos(angle)], axis=-1)
+    context.observer_world[:] = eyes[:, None]
+    cats = TrueCats(data)
+    cats.begin(context, np.random.default_rng(1))
+    fled, reached = np.zeros((2, len(cat)), bool)
+    for _ in range(round(10 * seconds)):
+        away = (cats.past_world[:, -1] - eyes) * [1.0, 0.0, 1.0]
+        distance = np.linalg.norm(away, axis=1, keepdims=True)
+        eyes = eyes + away / distance * np.minimum(0.1 * speed_m_s, np.maximum(distance - REACH_M + 0.05, 0))
+        cats.step(eyes)
+        fled |= cats.fleeing & ~reached
+        reached |= (distance[:, 0] < REACH_M) & ~fled
+    return fled, reached
+
+
+def test_true_cats_flee_from_fast_persons_only(data):
+    fled, _ = met(data, 1.2, 6.0)
+    assert fled.mean() > 0.8
+    fled, reached = met(data, 0.2, 12.0)
+    assert fled.mean() < 0.1
+    assert reached.mean() > 0.6
+    fled, _ = met(data, 0.0, 6.0)
+    assert not fled.any()
+
+
+def test_true_cats_start_where_the_window_ends(data):
+    context, _ = data.windows(data.indices(TRAIN)[::20])
+    cats = TrueCats(data)
+    cats.begin(context, np.random.default_rng(0))
+    np.testing.assert_allclose(cats.past_world[:, -1], context.world_from_agent[:, -1, :3, 3], atol=1e-6)
+
+
+def test_windows_in_which_a_standing_person_moves_later_are_left_out(data):
+    left = approach_animal.without_surprises(data)
+    assert 0 < len(left.start) < len(data.start)
+    context, _ = left.windows(np.arange(len(left.start)))
+    person, cat = context.observer_world[..., [0, 2]], context.world_from_agent[:, -1, [0, 2], 3]
+    stands = np.linalg.norm(person[:, -1] - person[:, -4], axis=-1) < 0.06
+    assert stands.any()
+    track = left.trajectories["home0-0"].world_from_camera[:, [0, 2], 3]
+    later = track[left.start[:, None] + left.past + np.arange(left.future)]
+    ratio = np.linalg.norm(later - person[:, -1:], axis=-1).max(1) / np.linalg.norm(
+        cat - person[:, -1], axis=-1
+    )
+    assert ratio[stands].max() < 0.25 < ratio[~stands].max()
+
+
+def test_windows_for_testing_are_all_kept(data):
+    split = np.where(np.arange(len(data.split)) % 2, TEST, TRAIN).astype(data.split.dtype)
+    halved = replace(data, split=split)
+    left = approach_animal.without_surprises(halved)
+    assert len(left.indices(TEST)) == len(halved.indices(TEST))
+    assert len(left.indices(TRAIN)) < len(halved.indices(TRAIN))
