@@ -98,7 +98,7 @@ def simulated_session(home: Room, rng: np.random.Generator) -> MeasuredMotion:
         bones.append(motion.agent_from_bone.astype(np.float32))
         cameras.append(camera_motion.filming(take, rng)[sample])
     clock = np.concatenate([time + number * (time[-1] + CLIP_GAP_S) for number in range(TAKES)])
-    motion = (np.concatenate(each) for each in (roots, bones, cameras))
+    motion = np.concatenate(roots), np.concatenate(bones), np.concatenate(cameras)
     return MeasuredMotion(clock, *motion, rest(), volume_of(home))
 
 

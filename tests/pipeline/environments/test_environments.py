@@ -237,6 +237,20 @@ def test_animal_goes_to_a_commanded_goal():
     np.testing.assert_allclose(world.animals.goal[0, [0, 2]], goal[0, [0, 2]], atol=1e-5)
 
 
+@pytest.mark.parametrize(("speed_m_s", "flees"), [(0.4, False), (1.0, True), (-1.0, False)])
+def test_only_who_gets_away_fast_flees(speed_m_s, flees):
+    """At 0.4 m/s, a walk, an animal is 0.8 m further away after 2 s."""
+    world = small_world()
+    world.begin(1, np.random.default_rng(0))
+    world.persons.position = world.animal_position[:, [0, 2]] - [[0.0, 1.6]]
+    plan = world.animals.plan.root[0, :, :3, 3]
+    plan[:] = world.animal_position[0]
+    plan[:, 2] += speed_m_s * 0.1 * np.arange(1, len(plan) + 1)
+    assert world.fleeing.tolist() == [flees]
+    world.persons.position = world.animal_position[:, [0, 2]] - [[0.0, 2.5]]
+    assert not world.fleeing.any(), "nobody is near"
+
+
 def test_rewards_have_their_documented_values():
     near = StepOutcome(
         np.array([1.0, 1.0]), np.array([0.6, 0.9]), np.array([0.0, 0.5]), np.array([False, True])
