@@ -5,6 +5,7 @@
 """
 
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -173,6 +174,19 @@ class BehaviorData:
     def accompanied(self) -> bool:
         """Whether any recording has companions."""
         return any(track.companions is not None for track in self.trajectories.values())
+
+    @cached_property
+    def begin_s(self) -> Float[np.ndarray, "window"]:
+        """Time of each window's first frame in its recording, seconds."""
+        times = [self.trajectories[name].timestamp_s for name in self.videos]
+        return np.array([times[video][start] for video, start in zip(self.video, self.start, strict=True)])
+
+    @cached_property
+    def place_world(self) -> Float[np.ndarray, "window 3"]:
+        """The root's position in each window's current frame, meters."""
+        roots, current = [self.trajectories[name].world_from_agent for name in self.videos], self.past - 1
+        both = zip(self.video, self.start + current, strict=True)
+        return np.array([roots[video][frame, :3, 3] for video, frame in both]).reshape(-1, 3)
 
     def indices(self, split: int) -> Int[np.ndarray, "window"]:
         """Return the windows of one split."""

@@ -97,25 +97,18 @@ def moments_together(
 
     They are of ``split``, of any for an animal that has none in it.
     """
-    windows, (track, start) = {leading: window}, recorded_at(data[leading], window)
-    placed, same = [_place(data[leading], window)], data[leading].videos[int(data[leading].video[window])]
+    windows, begin_s = {leading: window}, data[leading].begin_s[window]
+    placed, video = (
+        data[leading].place_world[[window]],
+        data[leading].videos[int(data[leading].video[window])],
+    )
     for name in (other for other in data if other != leading):
         mine = data[name]
         known = mine.indices(split) if (mine.split == split).any() else np.arange(len(mine.split))
-        names = [mine.videos[video] for video in mine.video[known]]
-        begins = [
-            mine.trajectories[video].timestamp_s[begin] - track.timestamp_s[start]
-            for video, begin in zip(names, mine.start[known], strict=True)
-        ]
-        clearance_m = clearance_of(mine.agent_from_bone_rest)
-        order = known[np.lexsort((np.abs(begins), np.array(names) != same))]
-        away = (np.linalg.norm((np.stack(placed) - _place(mine, each))[:, [0, 2]], axis=-1) for each in order)
-        free = (each for each, apart in zip(order, away, strict=True) if (apart >= clearance_m).all())
-        windows[name] = int(next(free, order[0]))
-        placed.append(_place(mine, windows[name]))
+        elsewhere = np.array(mine.videos)[mine.video[known]] != video
+        order = known[np.lexsort((np.abs(mine.begin_s[known] - begin_s), elsewhere))]
+        off = (placed[:, None] - mine.place_world[order])[..., [0, 2]]
+        free = (np.linalg.norm(off, axis=-1) >= clearance_of(mine.agent_from_bone_rest)).all(0)
+        windows[name] = int(order[free.argmax()])
+        placed = np.concatenate([placed, mine.place_world[[windows[name]]]])
     return windows
-
-
-def _place(data: BehaviorData, window: int) -> Float[np.ndarray, "3"]:
-    track, start = recorded_at(data, window)
-    return track.world_from_agent[start + data.past - 1, :3, 3]
