@@ -138,6 +138,11 @@ class PlanCondition:
         references = tuple(code[some] for code in self.references)
         return PlanCondition(self.full[some], references, self.start[some], self.sampling, constraint)
 
+    def repeated(self, some: Int[np.ndarray, "some"], count: int) -> "PlanCondition":
+        """Return the conditions of some of the observations, for ``count`` plans each."""
+        rows, limit = self[np.repeat(some * self.count, count)], self.constraint
+        return replace(rows, constraint=None if limit is None else limit[some], count=count)
+
     def on_support(self, goal: Float[np.ndarray, "plan 3"]) -> Float[np.ndarray, "plan 3"]:
         """Move goals in meters to where the agent may rest."""
         return goal if self.constraint is None else self.constraint.goals_on_support(goal, self.start)

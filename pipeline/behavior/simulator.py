@@ -255,7 +255,7 @@ class AnimalBatch:
         again = np.flatnonzero(blocked)
         if len(again) and self.chaining.candidates > 1:
             where, rest = None if video is None else video[again], self.chaining.candidates - 1
-            more = self.sampler.codes(observation[again], self.sampling, rest)
+            more = codes.repeated(again, rest)
             others = self._least_blocked(more, frame[again], where, commanded[again], intent[again])
             better = others[2] < blocked[again]
             for mine, other in zip((goal, path, blocked), others, strict=True):
