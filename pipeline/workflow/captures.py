@@ -34,6 +34,8 @@ SHOWN_LETTERS, LONGEST_NAME_BYTES = 40, 200
 """of a recording's name: file systems allow 255 bytes, and sidecars append to it"""
 _ANIMAL = re.compile(r"[a-z][a-z0-9-]{0,30}\Z")
 _NAMED = re.compile(r"turnaround_([^\W_](?:[^\W_]|-)*)")
+PERSON = "person"
+"""Name of the one who films, in simulations and environments, which no animal can have."""
 TABLES = (".csv", ".npz")
 """Suffixes of tables of motion."""
 ICLOUD = ".icloud"
@@ -143,7 +145,7 @@ def assign(
     """Give every recording its id, role, split and clock.
 
     `known_ids`, by file name, are kept and never reused. Raises CAP-040 (a role is missing), CAP-041 (an
-    impossible remark), CAP-043 (two turnarounds that do not name two animals).
+    impossible remark), CAP-043 (turnarounds that do not name several animals).
     """
     roles: dict[str, Role] = {name: role_of(name, remark, where) for name, remark in said.items()}
     if missing := [needed for needed in _NEEDED[flow] if needed[0] not in roles.values()]:
@@ -236,6 +238,8 @@ def _animals(turnarounds: Sequence[str], said: Mapping[str, Remarks], where: str
         animal = said[name].animal or (named and named[1])
         if animal is None or not _ANIMAL.match(animal):
             what = f"{name!r} does not say which animal it shows, and there is another turnaround"
+        elif animal == PERSON:
+            what = f"{name!r} names an animal {PERSON!r}, as the person who films is called"
         elif animal in found.values():
             other = next(file for file, whose in found.items() if whose == animal)
             what = f"{other!r} and {name!r} are both turnarounds of {animal!r}"

@@ -112,9 +112,10 @@ def test_turnarounds_of_several_animals_are_assigned_by_name():
         ("turnaround.r3d", "turnaround_cat.r3d"),
         ("turnaround_m\u00fcsli.r3d", "turnaround_cat.r3d"),
         ("turnaround_mu\u0308sli.r3d", "turnaround_cat.r3d"),
+        ("turnaround_person.r3d", "turnaround_cat.r3d"),
     ],
 )
-def test_two_turnarounds_of_one_animal_are_refused(names):
+def test_turnarounds_that_name_no_animals_of_their_own_are_refused(names):
     with pytest.raises(InputError, match="CAP-043"):
         assigned(["walkthrough.r3d", *names, "a.r3d"])
 
