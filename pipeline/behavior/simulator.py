@@ -17,7 +17,16 @@ from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels, channels
 from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.planning import PlanCondition, Sampler, observe
 from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.trajectories import ABSENT_M, TRAIN, BehaviorData, Context, Trajectory, as_companions
+from pipeline.behavior.trajectories import (
+    ABSENT_M,
+    TRAIN,
+    BehaviorData,
+    Context,
+    PoseFrames,
+    Trajectory,
+    as_companions,
+    blended_frames,
+)
 from pipeline.geometry import rigid
 
 
@@ -32,18 +41,6 @@ class SimulatorState:
     """where the current plan ends"""
     blocked: float
     """share of the current plan in voxels that are not allowed, 0..1"""
-
-
-@dataclass(frozen=True)
-class PoseFrames:
-    """Consecutive poses of animals: root, and bone channels as in `behavior.json`."""
-
-    root: Float[np.ndarray, "*animal frame 4 4"]
-    bones: Float[np.ndarray, "*animal frame channel"]
-
-    def __getitem__(self, part: slice) -> "PoseFrames":
-        """Return some of the frames."""
-        return PoseFrames(self.root[..., part, :, :], self.bones[..., part, :])
 
 
 GOAL_CHANGE_M = 0.3
@@ -206,6 +203,7 @@ class AnimalBatch:
             new = PoseFrames(plan.root[mine], plan.bones[mine])
             new = blended_frames(old, new, self.chaining.blend_frames)
             self.plan.root[animal], self.plan.bones[animal] = new.root, new.bones
+        self.plan.root[some, :, :3, 3] = self._where_allowed(self.plan.root[some, :, :3, 3], some)
         self.played[some], self.planned_others[some] = 0, self._others_now()[some]
 
     def _intent(self, some: Int[np.ndarray, "some"]) -> Float[np.ndarray, "some frame 3"]:
@@ -278,10 +276,9 @@ class AnimalBatch:
         """Deform paths (ego frames) around the bodies of the others, the observer's last, if corrected."""
         if not self.sampler.corrections:
             return path
-        video = None if self.video is None else self.video[some]
 
         def clear(points: Float[np.ndarray, "some 3"]) -> Float[np.ndarray, "some 3"]:
-            return self.scenes.out_of_solid(points[:, None], video)[:, 0]
+            return self._where_allowed(points[:, None], some)[:, 0]
 
         others, clear_world = self._others_now()[some], rigid.apply(frame, path)
         for column in reversed(range(others.shape[1])):
@@ -291,7 +288,15 @@ class AnimalBatch:
                 far = start_world + np.array([ABSENT_M, 0.0, 0.0])
                 there = np.where(near[:, None], being, far)
                 clear_world = around_person(clear_world, start_world, there, self.clearance_m, clear)
-        return rigid.apply(rigid.inverse(frame), clear_world)
+        return rigid.apply(rigid.inverse(frame), self._where_allowed(clear_world, some))
+
+    def _where_allowed(
+        self, path_world: Float[np.ndarray, "some frame 3"], some: Int[np.ndarray, "some"]
+    ) -> Float[np.ndarray, "some frame 3"]:
+        """Move paths to where the animals may be, if plans are corrected: detours and blends cut corners."""
+        if not (self.sampler.corrections and self.sampling.avoid_solid and self.sampling.scene):
+            return path_world
+        return self.scenes.out_of_solid(path_world, None if self.video is None else self.video[some])
 
     def _least_blocked(
         self,
@@ -382,19 +387,3 @@ class Simulator:
         bones = bones_from_channels(now.bones[0, 0], self.rest)
         time_s, goal = self.frame / self.data.rate_hz, self.animals.goal[0].copy()
         return SimulatorState(time_s, now.root[0, 0].copy(), bones, goal, float(self.animals.blocked[0]))
-
-
-def blended_frames(old: PoseFrames, new: PoseFrames, frames: int) -> PoseFrames:
-    """Cross-fade the first frames of a new plan with the remaining ones of the old plan."""
-    count = min(frames, old.root.shape[-3], new.root.shape[-3])
-    if count <= 0:
-        return new
-    old, begin, share = old[:count], new[:count], ((np.arange(count) + 1.0) / (count + 1))[:, None]
-    turn = rigid.vector_from_rotation(np.swapaxes(old.root[..., :3, :3], -1, -2) @ begin.root[..., :3, :3])
-    position = old.root[..., :3, 3] * (1 - share) + begin.root[..., :3, 3] * share
-    root, bones = new.root.copy(), new.bones.copy()
-    root[..., :count, :, :] = rigid.make(
-        old.root[..., :3, :3] @ rigid.rotation_from_vector(turn * share), position
-    )
-    bones[..., :count, :] = old.bones * (1 - share) + begin.bones * share
-    return PoseFrames(root, bones)

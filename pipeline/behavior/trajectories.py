@@ -94,6 +94,18 @@ class Future:
         return self.world_from_agent[:, :, :3, 3]
 
 
+@dataclass(frozen=True)
+class PoseFrames:
+    """Consecutive poses of animals: root, and bone channels as in `behavior.json`."""
+
+    root: Float[np.ndarray, "*animal frame 4 4"]
+    bones: Float[np.ndarray, "*animal frame channel"]
+
+    def __getitem__(self, part: slice) -> "PoseFrames":
+        """Return some of the frames."""
+        return PoseFrames(self.root[..., part, :, :], self.bones[..., part, :])
+
+
 def frames_from_seconds(seconds: float, rate_hz: float = RATE_HZ) -> int:
     """Return the frames of a horizon. Raises InputError BEH-003 unless the UNets can halve it twice."""
     frames = round(seconds * rate_hz)
@@ -289,3 +301,19 @@ def nearest(
     absent = np.asarray(np.isnan(some[:, :, -1]).any(-1))
     far = np.pad(agent + np.array([ABSENT_M, 0.0, 0.0]), ((0, 0), (0, 1)))
     return np.where(absent[..., None, None], far[:, None, None], some)
+
+
+def blended_frames(old: PoseFrames, new: PoseFrames, frames: int) -> PoseFrames:
+    """Cross-fade the first frames of a new plan with the remaining ones of the old plan."""
+    count = min(frames, old.root.shape[-3], new.root.shape[-3])
+    if count <= 0:
+        return new
+    old, begin, share = old[:count], new[:count], ((np.arange(count) + 1.0) / (count + 1))[:, None]
+    turn = rigid.vector_from_rotation(np.swapaxes(old.root[..., :3, :3], -1, -2) @ begin.root[..., :3, :3])
+    position = old.root[..., :3, 3] * (1 - share) + begin.root[..., :3, 3] * share
+    root, bones = new.root.copy(), new.bones.copy()
+    root[..., :count, :, :] = rigid.make(
+        old.root[..., :3, :3] @ rigid.rotation_from_vector(turn * share), position
+    )
+    bones[..., :count, :] = old.bones * (1 - share) + begin.bones * share
+    return PoseFrames(root, bones)

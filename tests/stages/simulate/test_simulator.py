@@ -13,7 +13,9 @@ from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import BehaviorNets
 from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.planning import observe
-from pipeline.behavior.simulator import AnimalBatch, PoseFrames, blended_frames
+from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.simulator import AnimalBatch
+from pipeline.behavior.trajectories import PoseFrames, blended_frames
 from pipeline.core.errors import InputError
 from pipeline.data import glb, npz
 from pipeline.geometry import rigid
@@ -111,6 +113,20 @@ def test_plans_are_followed_until_they_end_or_the_observer_moves(simulator):
     for frame in range(40):
         blind.step(person * frame)
     np.testing.assert_array_equal(blind.goal, first)
+
+
+def test_animals_are_only_where_they_may_be_also_between_plans(simulator):
+    """In a room of pillars, which blends of two plans and detours around a person would cut."""
+    context, _ = simulator.data.windows(np.array([0, 40, 80]))
+    rng, volume = np.random.default_rng(0), simulator.animals.scenes.volumes[0]
+    pillars = rng.random((volume.occupancy.shape[0], 1, volume.occupancy.shape[2])) < 0.2
+    scenes = Scenes((volume,), ((volume.occupancy == 0) & ~pillars,), np.zeros(1, int))
+    settings = {"sampling": simulator.animals.sampling, "chaining": ReplanningConfig()}
+    animals = AnimalBatch(simulator.animals.sampler, scenes, simulator.animals.rest, "yaw", **settings)
+    animals.begin(replace(context, video=None), rng)
+    roots = [animals.step(rng.uniform(-1.5, 1.5, (3, 3))).root[:, :, :3, 3] for _ in range(60)]
+    assert animals.plans_drawn > 12, "plans are blended"
+    assert not scenes.inside_solid(np.concatenate(roots, axis=1), None).any()
 
 
 def test_plans_without_corrections_are_what_the_networks_predict(simulator):
