@@ -4,6 +4,7 @@ If samples are off by a tenth of a meter, an animal floats or sinks. `Support.he
 recorded height range above the nearest top; `smoothed_jumps` turns steps between tops into jumps.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,8 @@ HEIGHT_TAIL_PERCENT = (1.0, 5.0)
 MIN_SUPPORTED_SHARE = 0.5
 """minimum share of frames above something solid"""
 FLOOR_SHARE = 0.25
-"""The floor is the lowest level with this share of the columns of the level that most columns have."""
+"""The floor is the lowest level with this share of the columns of the level that most columns have, or the one
+above, if more columns have it: noise of the map."""
 JUMP_KERNEL = np.array([1.0, 2.0, 3.0, 2.0, 1.0]) / 9
 """smoothing kernel over 0.5 s that turns a step into a jump"""
 
@@ -75,20 +77,34 @@ def mark_supported(
 def floor_level(supported: Bool[np.ndarray, "x y z"]) -> int | None:
     """Return the index along y of the voxels right above the floor; None without supports."""
     count = supported.sum((0, 2))
-    return int(np.flatnonzero(count >= FLOOR_SHARE * count.max())[0]) if count.any() else None
+    if not count.any():
+        return None
+    lowest = int(np.flatnonzero(count >= FLOOR_SHARE * count.max())[0])
+    return lowest + int(count[lowest : lowest + 2].argmax())
 
 
-def height_ranges(
-    scenes: list[tuple[FeatureVolume, Float[np.ndarray, "frame 3"], Bool[np.ndarray, "frame"]]],
-) -> Float[np.ndarray, "2 2"]:
-    """Return `Support.range_m` given root positions and motion flags per scene; NaN if unknown."""
+def level_beneath(
+    volume: FeatureVolume, marks: UInt8[np.ndarray, "x y z"], points_world: Float[np.ndarray, "point 3"]
+) -> Float[np.ndarray, "point"]:
+    """Return the index along y of the highest supported voxel not above each point; -infinity without one."""
+    voxel, inside = volume.voxel(points_world)
+    column, number = marks[voxel[:, 0], :, voxel[:, 2]] >= SUPPORTED, np.arange(marks.shape[1])
+    level = np.where(column & (number <= voxel[:, 1:2]), number, -np.inf).max(1)
+    return np.where(inside, level, -np.inf)
+
+
+Stay = tuple[
+    FeatureVolume, UInt8[np.ndarray, "x y z"], Float[np.ndarray, "frame 3"], Bool[np.ndarray, "frame"]
+]
+"""A scene, its marks, root positions in it, and whether the animal moves there"""
+
+
+def height_ranges(stays: Iterable[Stay]) -> Float[np.ndarray, "2 2"]:
+    """Return `Support.range_m` of some stays; NaN if unknown."""
     above, moved = [np.zeros(0)], [np.zeros(0, bool)]
-    for volume, points, moves in scenes:
-        voxel, inside = volume.voxel(points)
-        solid = (volume.occupancy == 1)[voxel[:, 0], :, voxel[:, 2]]
-        number = np.arange(solid.shape[1])
-        level = np.where(solid & (number < voxel[:, 1:2]), number + 1, -np.inf).max(1)
-        above.append(np.where(inside, points[:, 1] - volume.origin[1] - level * volume.voxel_m, np.inf))
+    for volume, marks, points, moves in stays:
+        level = level_beneath(volume, marks, points)
+        above.append(points[:, 1] - volume.origin[1] - level * volume.voxel_m)
         moved.append(moves)
     height, moves = np.concatenate(above), np.concatenate(moved)
     known = np.isfinite(height)

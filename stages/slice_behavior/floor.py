@@ -3,11 +3,12 @@
 from typing import cast
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import binary_dilation, label
 from scipy.spatial import ConvexHull, Delaunay, QhullError
 
-from pipeline.behavior.support import SUPPORTED, floor_level
+from pipeline.behavior.perception import FeatureVolume
+from pipeline.behavior.support import SUPPORTED, floor_level, level_beneath
 
 FILLED = 3
 """Mark of allowed voxels right above floor that was filled."""
@@ -24,15 +25,15 @@ def with_filled_floor(
 ) -> UInt8[np.ndarray, "x y z"]:
     """Return the marks of allowed voxels with floor beneath all of them, and none outside of the home.
 
-    ``marks`` is 1 where the root may be and 2 right above solid voxels. The home is the convex hull of the
-    largest connected part of the seen floor and of all visited places. Its allowed columns without support
-    get `FILLED` at floor level, unless furniture is there. Unchanged if no floor was seen.
+    ``marks`` is 1 where the root may be and 2 right above solid voxels. The home is the convex hull of all
+    visited places and of the connected part of the seen floor that they are on. Its allowed columns without
+    support get `FILLED` at floor level, unless furniture is there. Unchanged if no floor was seen.
     """
     level = floor_level(marks == SUPPORTED)
     if level is None:
         return marks
     floor = (marks == SUPPORTED)[:, max(level - 1, 0) : level + 2].any(1)
-    home = hull(connected(floor) | visited.any(1))
+    home = hull(connected(floor, visited.any(1)) | visited.any(1))
     masked = np.where(home[:, None], marks, 0)
     supported, solid = masked >= SUPPORTED, occupancy == 1
     unsupported = (masked > 0).any(1) & ~supported[:, : level + 2].any(1) & ~solid[:, : level + 2].any(1)
@@ -44,12 +45,35 @@ def with_filled_floor(
     return masked
 
 
-def connected(floor: Bool[np.ndarray, "x z"]) -> Bool[np.ndarray, "x z"]:
-    """Return the largest connected component of the floor, across gaps of twice `JOINS_VOXELS`."""
-    grown = binary_dilation(floor, iterations=JOINS_VOXELS)
-    part, _ = cast("tuple[np.ndarray, int]", label(grown))
-    largest = np.bincount(part[floor], minlength=1)
-    return floor & (part == largest.argmax())
+def with_level_floor(
+    marks: UInt8[np.ndarray, "x y z"], volume: FeatureVolume, moving_world: Float[np.ndarray, "point 3"]
+) -> UInt8[np.ndarray, "x y z"]:
+    """Return the marks with all floor at one level.
+
+    Near the boundary of two voxels a floor seems a voxel higher or lower in places. These are put on its
+    level unless roots of the moving animal (world, meters) are not as high there, by medians and half a voxel.
+    """
+    level = floor_level(marks >= SUPPORTED)
+    if level is None:
+        return marks
+    marks, beneath, height_m = marks.copy(), level_beneath(volume, marks, moving_world), moving_world[:, 1]
+    for other in (level - 1, level + 1):
+        there, here = height_m[beneath == other], height_m[beneath == level]
+        both = len(there) and len(here)
+        if not both or abs(np.median(there) - np.median(here)) < volume.voxel_m / 2:
+            put = marks[:, other] >= SUPPORTED
+            marks[:, level][put], marks[:, other][put] = marks[:, other][put], 1
+    return marks
+
+
+def connected(floor: Bool[np.ndarray, "x z"], visited: Bool[np.ndarray, "x z"]) -> Bool[np.ndarray, "x z"]:
+    """Return the connected component of the floor, across gaps of twice `JOINS_VOXELS`, with the most visited
+    columns; the largest one if none was visited.
+    """
+    part, _ = cast("tuple[np.ndarray, int]", label(binary_dilation(floor | visited, iterations=JOINS_VOXELS)))
+    count = np.bincount(part[floor], minlength=part.max() + 1)
+    been = np.where(count > 0, np.bincount(part[visited], minlength=part.max() + 1), 0)
+    return floor & (part == (been if been.any() else count).argmax())
 
 
 def hull(columns: Bool[np.ndarray, "x z"]) -> Bool[np.ndarray, "x z"]:

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import binary_dilation
 
 from pipeline.behavior.path_encoding import REST_SPEED_M_S
@@ -21,7 +21,7 @@ from pipeline.behavior.trajectories import (
     window_starts,
 )
 from pipeline.data import npz
-from stages.slice_behavior.floor import with_filled_floor
+from stages.slice_behavior.floor import with_filled_floor, with_level_floor
 
 REACH_VOXELS = 2
 """Radius around visited places that is allowed whatever the map: the error of the root, voxels."""
@@ -55,31 +55,30 @@ def slice_windows(
 
 
 def allowed_voxels(
-    volume: FeatureVolume, trajectories: dict[str, Trajectory], *, reach_voxels: int
+    volume: FeatureVolume, trajectories: Iterable[Trajectory], *, reach_voxels: int, rate_hz: float = RATE_HZ
 ) -> UInt8[np.ndarray, "x y z"]:
     """Return 1 where the animal's root may be: seen as free, or within ``reach_voxels`` of visited voxels; 2
     right above solid voxels, and 3 above filled floor.
     """
-    visited = np.zeros(volume.occupancy.shape, bool)
-    for trajectory in trajectories.values():
-        voxel, inside = volume.voxel(trajectory.world_from_agent[trajectory.valid, :3, 3])
+    visited, moving = np.zeros(volume.occupancy.shape, bool), [np.zeros((0, 3))]
+    for root, moves in (roots_of(trajectory, rate_hz) for trajectory in trajectories):
+        voxel, inside = volume.voxel(root)
         visited[tuple(voxel[inside].T)] = True
+        moving.append(root[moves])
     if reach_voxels > 0 and visited.any():
         visited = binary_dilation(visited, iterations=reach_voxels)
     marks = mark_supported((volume.occupancy == 0) | visited, volume.occupancy)
-    return with_filled_floor(marks, volume.occupancy, visited)
+    marks = with_filled_floor(marks, volume.occupancy, visited)
+    return with_level_floor(marks, volume, np.concatenate(moving))
 
 
-def standing_heights(
-    pairs: Iterable[tuple[FeatureVolume, Trajectory]], rate_hz: float = RATE_HZ
-) -> Float[np.ndarray, "2 2"]:
-    """Return the range of the root's height above its support, see `Support.range_m`."""
-    seen = []
-    for volume, trajectory in pairs:
-        root = trajectory.world_from_agent[:, :3, 3]
-        speed = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0, prepend=root[:1, [0, 2]]), axis=-1) * rate_hz
-        seen.append((volume, root[trajectory.valid], (speed > REST_SPEED_M_S)[trajectory.valid]))
-    return height_ranges(seen)
+def roots_of(
+    trajectory: Trajectory, rate_hz: float
+) -> tuple[Float[np.ndarray, "frame 3"], Bool[np.ndarray, "frame"]]:
+    """Return valid root positions, and whether the animal moves there."""
+    root, valid = trajectory.world_from_agent[:, :3, 3], trajectory.valid
+    speed = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0, prepend=root[:1, [0, 2]]), axis=-1) * rate_hz
+    return root[valid], (speed > REST_SPEED_M_S)[valid]
 
 
 def write_volumes(
@@ -93,15 +92,17 @@ def write_volumes(
 
     ``seen`` are the training recordings, which determine the visited voxels.
     """
-    scene = dict(zip(videos, volumes if len(volumes) > 1 else volumes * len(videos), strict=True))
-    stands_m = standing_heights(((scene[id], trajectory) for id, trajectory in seen.items()), rate_hz)
-    if len(volumes) == 1:
-        allowed = allowed_voxels(volumes[0], dict(seen), reach_voxels=REACH_VOXELS)
-        npz.save(folder / "volume.npz", compress=True, **vars(volumes[0]), allowed=allowed, stands_m=stands_m)
-        return
-    (folder / "volumes").mkdir()
-    for id, volume in zip(videos, volumes, strict=True):
-        visited = {id: seen[id]} if id in seen else {}
-        allowed = allowed_voxels(volume, visited, reach_voxels=REACH_VOXELS)
-        path = folder / "volumes" / f"{id}.npz"
-        npz.save(path, compress=True, **vars(volume), allowed=allowed, stands_m=stands_m)
+    shared = len(volumes) == 1
+    been = [list(seen.values())] if shared else [[seen[id]] if id in seen else [] for id in videos]
+    scenes = list(zip(volumes, been, strict=True))
+    marks = [allowed_voxels(*scene, reach_voxels=REACH_VOXELS, rate_hz=rate_hz) for scene in scenes]
+    stays = zip(scenes, marks, strict=True)
+    stands_m = height_ranges(
+        (volume, allowed, *roots_of(track, rate_hz))
+        for (volume, tracks), allowed in stays
+        for track in tracks
+    )
+    files = [folder / "volume.npz"] if shared else [folder / "volumes" / f"{id}.npz" for id in videos]
+    files[0].parent.mkdir(exist_ok=True)
+    for file, volume, allowed in zip(files, volumes, marks, strict=True):
+        npz.save(file, compress=True, **vars(volume), allowed=allowed, stands_m=stands_m)

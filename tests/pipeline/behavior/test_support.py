@@ -66,11 +66,13 @@ def test_height_range_is_that_of_recordings():
     points = rng.uniform([0.1, 0.15, 0.1], [0.9, 0.25, 1.9], (4000, 3))
     moves = rng.random(4000) < 0.5
     points[moves, 1] = 0.2
-    found = height_ranges([(volume(), points, moves)])
+    scene = volume()
+    here = scene, mark_supported(scene.occupancy == 0, scene.occupancy)
+    found = height_ranges([(*here, points, moves)])
     np.testing.assert_allclose(found, [[0.15, 0.25], [0.2, 0.2]], atol=0.003)
     table = np.add(points, [1.0, 0.5, 0.0])
-    np.testing.assert_allclose(height_ranges([(volume(), table, moves)]), found, atol=1e-9)
-    assert np.isnan(height_ranges([(volume(), points - [5.0, 0.0, 0.0], moves)])).all()
+    np.testing.assert_allclose(height_ranges([(*here, table, moves)]), found, atol=1e-9)
+    assert np.isnan(height_ranges([(*here, points - [5.0, 0.0, 0.0], moves)])).all()
     assert np.isnan(height_ranges([])).all()
 
 

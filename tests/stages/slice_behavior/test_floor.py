@@ -1,9 +1,15 @@
 """Support of the floor at all allowed positions, which are inside the home."""
 
 import numpy as np
+import pytest
 
+from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.support import mark_supported
-from stages.slice_behavior.floor import FILLED, SUPPORTED, with_filled_floor
+from pipeline.behavior.trajectories import Trajectory
+from pipeline.data import npz
+from pipeline.geometry import rigid
+from stages.slice_behavior.floor import FILLED, SUPPORTED, with_filled_floor, with_level_floor
+from stages.slice_behavior.windows import write_volumes
 
 
 def room(seen: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -41,3 +47,45 @@ def test_complete_floor_is_unchanged():
 def test_no_floor_is_filled_without_support():
     marks = np.ones((4, 4, 4), np.uint8)
     np.testing.assert_array_equal(with_filled_floor(marks, np.zeros_like(marks), marks > 0), marks)
+
+
+@pytest.mark.parametrize("seen", [0.8, 0.4, 0.1])
+def test_heights_above_filled_floor_are_those_above_seen_floor(tmp_path, seen):
+    ranges = []
+    for share in (1.0, seen):
+        occupancy, _ = room(share)
+        volume = FeatureVolume(np.zeros((1, *occupancy.shape), np.float16), occupancy, np.zeros(3), 0.1)
+        place = np.stack([np.linspace(1.1, 2.9, 60), np.full(60, 0.25), np.full(60, 2.2)], axis=-1)
+        poses = rigid.make(np.broadcast_to(np.eye(3), (60, 3, 3)), place)
+        track = Trajectory(np.arange(60) / 10, poses, poses[:, None], poses, np.ones(60, bool))
+        folder = tmp_path / f"{share}"
+        folder.mkdir()
+        write_volumes(folder, (volume,), {"v000": track}, ("v000",), 10)
+        ranges.append(npz.load(folder / "volume.npz")["stands_m"])
+    np.testing.assert_allclose(ranges[1], ranges[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("raised", [0.0, 0.1])
+def test_floor_is_level_unless_recordings_show_that_it_is_not(raised):
+    """Half of the floor seems a voxel higher: noise, or something that carries the animal higher."""
+    occupancy, _ = room(1.0)
+    volume = FeatureVolume(np.zeros((1, *occupancy.shape), np.float16), occupancy, np.zeros(3), 0.1)
+    occupancy[20:30, 1, 10:30] = 1
+    marks = mark_supported(occupancy == 0, occupancy)
+    place = np.stack([np.linspace(1.1, 2.9, 60), np.full(60, 0.31), np.full(60, 2.2)], axis=-1)
+    place[place[:, 0] > 2.0, 1] += raised
+    level = with_level_floor(marks, volume, place)
+    assert (level > 0).sum() >= (marks > 0).sum(), "nothing is forbidden"
+    assert len(np.unique((level == SUPPORTED)[10:30, :, 20].argmax(1))) == (1 if raised == 0 else 2)
+
+
+def test_home_is_the_floor_where_the_animal_was():
+    occupancy = np.full((40, 8, 20), 2, np.uint8)
+    occupancy[:, 1:] = 0
+    occupancy[2:22, 0, 2:18] = occupancy[32:38, 0, 2:18] = 1
+    marks, visited = mark_supported(occupancy == 0, occupancy), np.zeros(occupancy.shape, bool)
+    for column, own, other in ((35, 35, 10), (10, 10, 35)):
+        visited[:] = False
+        visited[column, 2, 10] = True
+        home = (with_filled_floor(marks, occupancy, visited) > 0).any(1)
+        assert home[own, 10] and not home[other, 10]

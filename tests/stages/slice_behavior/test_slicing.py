@@ -164,10 +164,10 @@ def test_checks_subsample_many_windows():
 def test_allowed_positions_are_free_or_visited():
     volume, trajectory = room(), wander(np.random.default_rng(0))
     volume.occupancy[22, 4, 22] = 2
-    allowed = allowed_voxels(volume, {}, reach_voxels=2)
+    allowed = allowed_voxels(volume, [], reach_voxels=2)
     assert allowed[20, 4, 20] == 1
     assert allowed[22, 4, 22] == 0
     assert allowed[0, 4, 20] == 0
     voxel, _ = volume.voxel(trajectory.world_from_agent[:, :3, 3])
     volume.occupancy[tuple(voxel.T)] = 1
-    assert allowed_voxels(volume, {"v000": trajectory}, reach_voxels=0)[tuple(voxel.T)].all()
+    assert allowed_voxels(volume, [trajectory], reach_voxels=0)[tuple(voxel.T)].all()
