@@ -135,8 +135,8 @@ def _upright(
         center += BODY_RADIUS_M * away / max(float(np.linalg.norm(away)), BODY_RADIUS_M)
         radius = float(np.quantile(np.linalg.norm(group - center, axis=1), 0.95))
         whole = bool(np.nonzero(own)[0].min() > 1)
-        area_m2, extent_m = float(area[own].sum()), float(top - bottom)
-        found.append(UprightMover(center, area_m2, radius, 1.0, extent_m, float(top), whole))
+        size = {"extent_m": float(top - bottom), "top_m": float(top), "whole": whole}
+        found.append(UprightMover(center, float(area[own].sum()), radius, **size))
     return found, low
 
 
