@@ -46,8 +46,9 @@ class PlanSamplingConfig:
     guidance: float = 1.25
     """Scale s of classifier-free guidance, for bodies at most 1. Of 1, 1.25, 1.5, 2 it has the least energy
     score of goals and the right share of flights in left-out sessions of the built-in cat."""
-    companions_guidance: float = 1.0
-    """Guidance scale of companions, where the reference keeps all other conditions."""
+    companions_guidance: float | tuple[float, ...] = 1.0
+    """Guidance scale of companions, where the reference keeps all other conditions; or one scale of each, in
+    the order in which a context holds them, where the reference lacks only that one."""
     scene: bool = True
     """Condition on the scene."""
     observer: bool = True

@@ -19,7 +19,7 @@ from pipeline.behavior.diffusion import Schedule, guided, sample
 from pipeline.behavior.path_encoding import PATH_CHANNELS_OF, goal_error, snapped_to_goal
 from pipeline.behavior.perception import FeatureVolume, world_from_ego
 from pipeline.behavior.scenes import SceneConstraint, Scenes
-from pipeline.behavior.trajectories import ABSENT_M, Context, nearest
+from pipeline.behavior.trajectories import ABSENT_M, Context, nearest, nearest_first
 from pipeline.geometry import rigid
 
 Array = np.ndarray
@@ -65,11 +65,16 @@ class Observation:
     past: Float[np.ndarray, "batch past"]
     constraint: SceneConstraint | None = None
     """where the agents may be, for samplers with constraints"""
+    companion: Int[np.ndarray, "batch companion"] | None = None
+    """which companion of the context each of the others behind the observer is"""
 
     def __getitem__(self, index: slice | np.ndarray) -> "Observation":
         """Return some of the batch."""
         constraint = None if self.constraint is None else self.constraint[index]
-        return Observation(self.scene_grid[index], self.others[index], self.past[index], constraint)
+        companion = None if self.companion is None else self.companion[index]
+        return Observation(
+            self.scene_grid[index], self.others[index], self.past[index], constraint, companion
+        )
 
     def __len__(self) -> int:
         return len(self.past)
@@ -78,6 +83,13 @@ class Observation:
         """Return a copy without the observer, who is the first of the others."""
         others = self.others.copy()
         others[:, 0, :, 0] = ABSENT_M
+        return replace(self, others=others)
+
+    def without_companion(self, number: int) -> "Observation":
+        """Return a copy without one of the context's companions."""
+        others = self.others.copy()
+        if self.companion is not None:
+            others[:, 1:][self.companion == number, :, 0] = ABSENT_M
         return replace(self, others=others)
 
 
@@ -103,16 +115,16 @@ def observe(
     """Encode contexts as network inputs (Eq. 11, 12, 13)."""
     frame = world_from_ego(context.world_from_agent[:, -1], ego)
     ego_from_world = rigid.inverse(frame)
-    companions = context.companions
+    companions, companion, agent = context.companions, None, context.world_from_agent[:, -1, :3, 3]
     if companions is not None:
-        companions = nearest(companions, context.world_from_agent[:, -1, :3, 3])
+        companion, companions = nearest_first(companions, agent), nearest(companions, agent)
         companions[..., :3] = rigid.apply(ego_from_world[:, None], companions[..., :3])
     others = model.other_channels(ego_from_world[:, None] @ context.world_from_observer, companions)
     bones = model.channels_from_bones(context.agent_from_bone, rest)
     past = model.past_channels(ego_from_world[:, None] @ context.world_from_agent, bones)
     scenes = scenes if isinstance(scenes, Scenes) else Scenes.of(scenes)
     constraint = SceneConstraint(scenes, frame, context.video)
-    return Observation(scenes.around(frame, context.video), others, past, constraint)
+    return Observation(scenes.around(frame, context.video), others, past, constraint, companion)
 
 
 @dataclass(frozen=True)
@@ -122,7 +134,7 @@ class PlanCondition:
     full: Float[np.ndarray, "plan condition"]
     """condition with everything that is kept"""
     references: tuple[Float[np.ndarray, "plan condition"], ...]
-    """conditions without the observer, then without all others if companions are guided; or unconditional"""
+    """conditions without the observer, then without companions, if these are guided; or unconditional"""
     start: Float[np.ndarray, "plan 3"]
     """current position, ego frame"""
     sampling: PlanSamplingConfig
@@ -202,11 +214,15 @@ class Sampler:
             return self.networks.perceive(seen.scene_grid, seen.others, seen.past, keep).repeat(count, axis=0)
 
         full, references, by_observer = code(observation), [], self.guided == "observer"
-        accompanied = by_observer and observation.others.shape[1] > 1 and sampling.companions_guidance != 1
+        scales = sampling.companions_guidance
+        each = len(scales) if isinstance(scales, tuple) else 0
+        apart = scales not in (1, (1,) * each)
+        accompanied = by_observer and observation.others.shape[1] > 1 and apart
         if by_observer and (sampling.guidance != 1 or accompanied):
-            references.append(code(observation.without_observer()))
+            references.append(code(left := observation.without_observer()))
+            references += [code(left.without_companion(number)) for number in range(each) if accompanied]
         keep[:, 1 if by_observer else slice(None)] = 0
-        if accompanied or (not by_observer and sampling.guidance != 1):
+        if (accompanied and not each) or (not by_observer and sampling.guidance != 1):
             references.append(code(observation))
         past = observation.past.reshape(len(observation), observation.others.shape[2], -1)
         start = np.repeat(past[:, -1, :3], count, axis=0)
@@ -320,10 +336,20 @@ class Sampler:
         def draw() -> Array:
             return (noise_std * rng.standard_normal(shape, dtype=np.float32)).astype(np.float32)
 
-        denoise = guided(denoisers, (sampling.guidance, sampling.companions_guidance))
+        denoise = guided(denoisers, guidance_of(sampling))
         method = sampling.method or self.schedule.method
         x = sample(denoise, draw(), self.schedule, method=method, count=count, draw=draw, correct=correct)
         return x.astype(np.float32)
+
+
+def guidance_of(sampling: PlanSamplingConfig) -> tuple[float, ...]:
+    """Return the scales of `guided`: of the observer, and of all companions or of each, that is without the
+    observer e + sum over companions of (scale - 1) (e - e without that one), in any order.
+    """
+    scales = sampling.companions_guidance
+    if not isinstance(scales, tuple):
+        return sampling.guidance, scales
+    return (sampling.guidance, *(1 + sum(scales[k:]) - len(scales[k:]) for k in range(len(scales))))
 
 
 def _filled(shape: int | tuple[int, int], value: float) -> Array:

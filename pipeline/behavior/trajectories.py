@@ -282,6 +282,16 @@ def as_companions(
     return np.concatenate([positions_world, kind], axis=-1)
 
 
+def nearest_first(
+    companions: Float[np.ndarray, "window companion past_frame 4"], agent: Float[np.ndarray, "window 3"]
+) -> Int[np.ndarray, "window some"]:
+    """Return the indices of the companions that `nearest` returns, the nearest one first."""
+    level = [0, 2]
+    distance = np.linalg.norm(companions[:, :, -1, level] - agent[:, None, level], axis=-1)
+    count = min(int(np.isfinite(distance).sum(1).max(initial=0)), MAX_COMPANIONS)
+    return np.argsort(np.nan_to_num(distance, nan=np.inf), axis=1, kind="stable")[:, :count]
+
+
 def nearest(
     companions: Float[np.ndarray, "window companion past_frame 4"], agent: Float[np.ndarray, "window 3"]
 ) -> Float[np.ndarray, "window some past_frame 4"]:
@@ -290,10 +300,7 @@ def nearest(
     Positions are meters in one frame. Companions with NaN in the last frame are absent; earlier frames that
     are unknown take the first known position, so that nothing of the future is needed.
     """
-    level = [0, 2]
-    distance = np.linalg.norm(companions[:, :, -1, level] - agent[:, None, level], axis=-1)
-    count = min(int(np.isfinite(distance).sum(1).max(initial=0)), MAX_COMPANIONS)
-    order = np.argsort(np.nan_to_num(distance, nan=np.inf), axis=1, kind="stable")[:, :count]
+    order = nearest_first(companions, agent)
     some = np.take_along_axis(companions, order[..., None, None], axis=1)
     for frame in range(some.shape[2] - 2, -1, -1):
         unknown = np.isnan(some[:, :, frame]).any(-1)

@@ -178,6 +178,27 @@ def test_guidance_of_companions_changes_plans(sampler):
     assert np.abs(goals[0] - goals[2]).max() > 1e-4
 
 
+def test_guidance_of_one_companion_changes_nothing_of_another(sampler):
+    context, _ = with_companions(wandering()).windows(np.array([3, 50]))
+    here = context.world_from_agent[:, :, :3, 3]
+    beside = here[:, None] + np.array([[[0.4, 0.0, 0.3]], [[-0.9, 0.0, 0.2]]])
+    context = replace(context, companions=as_companions(beside))
+    plain = PlanSamplingConfig(goal_steps=4, sequence_steps=2, avoid_solid=False)
+
+    def goals(scales, seen=context):
+        codes = sampler.codes(observe(seen, room(), REST, "yaw"), replace(plain, companions_guidance=scales))
+        return sampler.goals(codes, np.random.default_rng(0))
+
+    np.testing.assert_allclose(goals((1.0, 1.0)), goals(1.0), atol=1e-6)
+    assert np.abs(goals((1.0, 0.5)) - goals((0.5, 1.0))).max() > 1e-4
+    for scales in ((1.0, 0.3), (0.3, 1.0)):
+        swapped = replace(context, companions=context.companions[:, ::-1])
+        np.testing.assert_allclose(goals(scales), goals(scales[::-1], swapped), atol=1e-4)
+    alone = replace(context, companions=context.companions.copy())
+    alone.companions[:, 1] = np.nan
+    np.testing.assert_allclose(goals((0.3, 0.0), alone), goals((0.3, 1.0), alone), atol=1e-6)
+
+
 def test_simulated_animals_perceive_and_avoid_each_other(sampler):
     volume = room()
     scenes = Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int))
