@@ -42,7 +42,11 @@ MAPPED = "mapped"
 depth is inferred, or confirmed by several views"""
 MASKS = FileSchema.of("masks/masks.npz", "visible [frame] bool", "confidence [frame] f4", "area [frame] f4")
 PEOPLE = FileSchema.of(
-    "masks/people.npz", "timestamp_s [frame] f8", "feet_camera [frame person 3] f4", "height_m [person] f4"
+    "masks/people.npz",
+    "timestamp_s [frame] f8",
+    "feet_camera [frame person 3] f4",
+    "ahead_camera [frame person 3] f4",
+    "height_m [person] f4",
 )
 MIN_CONFIDENCE = 1
 """minimum confidence of usable depth: 0 is what phones report as low"""

@@ -1,10 +1,10 @@
 """Masks and flow against truth."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 
 from pipeline.data.clips import Masks
 from pipeline.geometry import rigid
@@ -68,27 +68,50 @@ PERSON_SEEN = 0.01
 """minimum share of the picture that shows a person, of counted frames"""
 
 
-def people_metrics(sessions: Sequence[tuple[RecordingTruth, Float[np.ndarray, "frame person 3"]]]) -> Metrics:
-    """Compare where people stand (camera frame, meters) with the true visitor, over the floor and the phone.
+def people_metrics(
+    sessions: Sequence[tuple[RecordingTruth, Mapping[str, Shaped[np.ndarray, "..."]]]],
+) -> Metrics:
+    """Compare `people.npz` with the true visitor: where people stand, over the floor and the phone, where
+    they walk to, and how tall they are.
 
-    The nearest of the tracks counts; `people/unseen` is the share of tracked frames that show nobody.
+    The nearest of the tracks counts; `people/unseen` is the share of tracked frames that show nobody,
+    `people/heading_known` the share of found frames in which a direction is given.
     """
-    metrics, errors, unseen, tracked_frames = Metrics(), [], 0, 0
-    for truth, feet_camera in sessions:
+    metrics, unseen, tracked_frames = Metrics(), 0, 0
+    errors, turns, heights = [], [], []
+    for truth, people in sessions:
         if truth.world_from_visitor is None or truth.visitor_seen is None:
             continue
+        seen, tracks = truth.visitor_seen > PERSON_SEEN, people["feet_camera"].shape[1]
         feet_world = truth.world_from_visitor[:, :3, 3] * [1, 0, 1]
-        true = rigid.apply(rigid.inverse(truth.world_from_camera), feet_world[:, None])
-        off = np.linalg.norm(feet_camera - true, axis=-1)
+        camera_from_world = rigid.inverse(truth.world_from_camera)
+        true = rigid.apply(camera_from_world, feet_world[:, None])
+        off = np.linalg.norm(people["feet_camera"] - true, axis=-1)
         error = np.where(np.isfinite(off), off, np.inf).min(1, initial=np.inf)
-        errors.append(error[truth.visitor_seen > PERSON_SEEN])
+        errors.append(error[seen])
         tracked_frames += int(np.isfinite(error).sum())
         unseen += int((np.isfinite(error) & (truth.visitor_seen == 0)).sum())
+        if not tracks:
+            continue
+        nearest = np.where(np.isfinite(off), off, np.inf).argmin(1)
+        ahead = people["ahead_camera"][np.arange(len(off)), nearest]
+        true_ahead = camera_from_world[:, :3, :3] @ truth.world_from_visitor[:, :3, 2:3]
+        cosine = np.clip((ahead[:, None] @ true_ahead)[:, 0, 0], -1, 1)
+        turns.append(np.rad2deg(np.arccos(cosine))[seen & np.isfinite(error)])
+        if truth.visitor_top_m is not None:
+            of = np.bincount(nearest[seen & np.isfinite(error)], minlength=tracks) > 0
+            heights.append(np.abs(people["height_m"][of] - np.median(truth.visitor_top_m)))
     if errors:
-        error = np.concatenate(errors)
-        found = np.isfinite(error)
+        error, turn = np.concatenate(errors), np.concatenate(turns or [np.zeros(0)])
+        found, known = np.isfinite(error), np.isfinite(turn)
+        height = np.concatenate(heights or [np.zeros(0)])
         metrics.put("people/found", mean(found), "nobody is ever in view")
         metrics.put("people/position_median_m", median(error[found]), "nobody was found")
+        metrics.put("people/heading_known", mean(known), "nobody was found")
+        metrics.put("people/heading_median_deg", median(turn[known]), "nobody walks")
+        metrics.put(
+            "people/height_median_m", median(height[np.isfinite(height)]), "no head is ever in the picture"
+        )
         share = unseen / tracked_frames if tracked_frames else np.nan
         metrics.put("people/unseen", share, "nobody was found")
     return metrics

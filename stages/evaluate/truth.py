@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from pipeline.data import npz
 
 AGENT_FIELDS = ("world_from_camera", "intrinsics", "agent_visible", "moving", "world_from_agent")
-FILED_AS = {name: name for name in (*AGENT_FIELDS, "world_from_visitor", "visitor_seen")} | {
+FILED_AS = {name: name for name in (*AGENT_FIELDS, "world_from_visitor", "visitor_seen", "visitor_top_m")} | {
     "vertices": "agent_vertices_world"
 }
 """Names in the file of the fields below; those of agent and visitor only where there is one."""
@@ -35,6 +35,8 @@ class RecordingTruth:
     """pose of another person's body; None where there is none"""
     visitor_seen: Float[np.ndarray, "frame"] | None = None
     """share of the picture that shows the visitor"""
+    visitor_top_m: Float[np.ndarray, "frame"] | None = None
+    """height of the visitor's highest point above the floor"""
 
     @classmethod
     def open(cls, folder: Path, name: str, source_index: Int[np.ndarray, "frame"]) -> "RecordingTruth":

@@ -35,12 +35,18 @@ BODY_RADIUS_M = 0.125
 """distance of the body axis behind the visible surface: half the depth of a chest"""
 REACH_M = 0.45
 """horizontal distance from a person's axis within which points belong to the person"""
+HEAD_REACH_M = 0.2
+"""horizontal distance from a person's axis within which all points count for the height, moving or not"""
 FLOOR_QUANTILE, ABOVE_FLOOR_M = 0.05, 0.06
 """quantile of point heights that is taken as the floor, and least height of a person's points above it"""
 DILATION = np.ones((5, 5), np.uint8)
 """dilation of people, depth pixels"""
 WALKING_M_S = 1.5
 """walking speed of people in a room"""
+HEADING_S, MIN_HEADING_FRAMES = 0.5, 5
+"""time before and after a frame whose positions give the walking direction, and least number of these"""
+WALKS_M_S, MAX_HEADING_RAD = 0.25, 0.35
+"""speed from which a person walks, and so looks ahead; largest standard error of a known heading"""
 WALKER = AnimalConfig(largest_m=4.0, speed_m_s=2.5)
 """size and speed of people, for tracking"""
 
@@ -51,6 +57,8 @@ class People:
 
     axis_world: Float[np.ndarray, "person frame 2"]
     """x and z of the body's middle; NaN where a person is not seen"""
+    ahead_world: Float[np.ndarray, "person frame 2"]
+    """x and z of the walking direction, a unit vector; NaN where a person stands or it is uncertain"""
     height_m: Float[np.ndarray, "person"]
     """above the floor; NaN where the head is never in the picture"""
     floor_m: float
@@ -72,7 +80,7 @@ def find_people(
     lowest = np.concatenate([low for _, low in scanned])
     floor_m = float(np.median(lowest)) if len(lowest) else 0.0
     found = [group for group, _ in scanned]
-    axes, heights = [], []
+    axes, ahead, heights = [], [], []
     for _ in range(MAX_PEOPLE):
         picked = movers.track(found, clip.timestamp_s, WALKER)
         person = _persistent(picked, clip.timestamp_s)
@@ -86,8 +94,10 @@ def find_people(
             tops += [mover.top_m] if mover.whole else []
             found[frame].remove(mover)
         axes.append(_fill_gaps(axis, clip.timestamp_s))
+        ahead.append(walking_direction(axis, clip.timestamp_s))
         heights.append(float(np.quantile(tops, 0.9)) - floor_m if len(tops) >= MIN_UPRIGHT_FRAMES else np.nan)
-    return People(np.array(axes).reshape(-1, len(clip), 2), np.array(heights, float), floor_m)
+    both = (np.array(each).reshape(-1, len(clip), 2) for each in (axes, ahead))
+    return People(*both, np.array(heights, float), floor_m)
 
 
 def gather_without_people(
@@ -134,8 +144,10 @@ def _upright(
         away = (center - world_from_camera[:3, 3]) * [1, 0, 1]
         center += BODY_RADIUS_M * away / max(float(np.linalg.norm(away)), BODY_RADIUS_M)
         radius = float(np.quantile(np.linalg.norm(group - center, axis=1), 0.95))
-        whole = bool(np.nonzero(own)[0].min() > 1)
-        size = {"extent_m": float(top - bottom), "top_m": float(top), "whole": whole}
+        upright = (np.linalg.norm((points - center)[..., ::2], axis=-1) < HEAD_REACH_M) & (area > 0)
+        whole = bool(np.nonzero(own | upright)[0].min() > 1)
+        size = {"extent_m": float(top - bottom), "whole": whole}
+        size["top_m"] = float(points[own | upright, 1].max())
         found.append(UprightMover(center, float(area[own].sum()), radius, **size))
     return found, low
 
@@ -170,6 +182,28 @@ def _fill_gaps(
     filled = np.stack([np.interp(timestamp_s, timestamp_s[seen], axis[seen, k]) for k in range(2)], axis=-1)
     short = subsampling.within_short_gaps(timestamp_s[seen], timestamp_s, movers.ABSENT_S)
     return np.where(short[:, None], filled, axis)
+
+
+def walking_direction(
+    axis: Float[np.ndarray, "frame 2"], timestamp_s: Float[np.ndarray, "frame"]
+) -> Float[np.ndarray, "frame 2"]:
+    """Return the direction in which positions move, by a line fitted to those around each frame.
+
+    NaN where it is slower than a walk, or its standard error, from the scatter about the line, is large.
+    """
+    ahead, seen = np.full_like(axis, np.nan), np.isfinite(axis[:, 0])
+    for frame in np.flatnonzero(seen):
+        near = seen & (np.abs(timestamp_s - timestamp_s[frame]) <= HEADING_S)
+        time, place = timestamp_s[near] - timestamp_s[near].mean(), axis[near] - axis[near].mean(0)
+        spread = float((time**2).sum())
+        if near.sum() < MIN_HEADING_FRAMES or spread == 0:
+            continue
+        velocity = time @ place / spread
+        speed = float(np.linalg.norm(velocity))
+        scatter = ((place - time[:, None] * velocity) ** 2).sum() / (2 * (len(time) - 2))
+        if speed > WALKS_M_S and np.sqrt(scatter / spread) < MAX_HEADING_RAD * speed:
+            ahead[frame] = velocity / speed
+    return ahead
 
 
 def hide(

@@ -67,13 +67,21 @@ def write_masks(folder: Path, masks: Iterable[Mask], count: int) -> Summary:
 
 
 def write_people(folder: Path, clip: Clip, found: Segmentation) -> None:
-    """Write ``people.npz`` of a session with depth: where people stand on the floor, camera frame, meters."""
+    """Write ``people.npz`` of a session with depth: where people stand on the floor (meters), and where they
+    walk to, camera frame.
+    """
     if found.people is not None and found.path is not None:
         feet = np.insert(np.swapaxes(found.people.axis_world, 0, 1), 1, found.people.floor_m, axis=-1)
         camera_from_world = rigid.inverse(found.path.world_from_camera)
         feet_camera = rigid.apply(camera_from_world[:, None], feet[..., None, :])[..., 0, :]
-        time_s, height_m = clip.timestamp_s, found.people.height_m
-        PEOPLE.save(folder / "people.npz", timestamp_s=time_s, feet_camera=feet_camera, height_m=height_m)
+        ahead = np.insert(np.swapaxes(found.people.ahead_world, 0, 1), 1, 0.0, axis=-1)
+        PEOPLE.save(
+            folder / "people.npz",
+            timestamp_s=clip.timestamp_s,
+            feet_camera=feet_camera,
+            ahead_camera=(camera_from_world[:, None, :3, :3] @ ahead[..., None])[..., 0],
+            height_m=found.people.height_m,
+        )
 
 
 def overlay(

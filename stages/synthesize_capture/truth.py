@@ -31,6 +31,7 @@ class TruthWriter:
     masks: list[np.ndarray] = field(default_factory=list)
     others: list[np.ndarray] = field(default_factory=list)
     visitor_seen: list[float] = field(default_factory=list)
+    visitor_top_m: list[float] = field(default_factory=list)
     depth: list[np.ndarray] = field(default_factory=list)
     vertices: list[np.ndarray] = field(default_factory=list)
 
@@ -42,6 +43,8 @@ class TruthWriter:
             others = np.delete(frame.masks, self.number, axis=0)
             self.others.append(cameras.turn_image(np.any(others, axis=0), turns))
         self.visitor_seen.append(float(frame.masks[2].mean()))
+        visitor = frame.vertices_world[2]
+        self.visitor_top_m.append(np.nan if visitor is None else float(visitor[:, 1].max()))
         if self.keep_depth:
             self.depth.append(cameras.turn_image(frame.true_depth, turns).astype(np.float16))
         vertices_world = frame.vertices_world[self.number]
@@ -74,6 +77,7 @@ class TruthWriter:
         if script.motions[2] is not None:
             contents["world_from_visitor"] = script.motions[2].world_from_agent
             contents["visitor_seen"] = np.array(self.visitor_seen, np.float32)
+            contents["visitor_top_m"] = np.array(self.visitor_top_m, np.float32)
         npz.save(path.with_suffix(".npz"), compress=False, **contents)
         if self.keep_depth:
             lens = cameras.scale_intrinsics(stored, size, depth_size)

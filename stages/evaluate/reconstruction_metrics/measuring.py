@@ -164,8 +164,6 @@ def _perception(
     metrics = perception.mask_metrics([seen[each.video.id] for each in sessions], seen[turnaround.video.id])
     metrics.add(perception.flow_metrics(pairs))
     tracks = [(each.truth, folders.masks[each.video.id] / "people.npz") for each in sessions]
-    found = [
-        (truth, PEOPLE.load(path, "feet_camera")["feet_camera"]) for truth, path in tracks if path.exists()
-    ]
+    found = [(truth, PEOPLE.load(path)) for truth, path in tracks if path.exists()]
     metrics.add(perception.people_metrics(found))
     return metrics

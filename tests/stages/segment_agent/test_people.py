@@ -65,6 +65,30 @@ def test_person_is_separated_from_the_animal(visited, tmp_path):
     assert np.nanmedian(off) < 0.1, "meters"
 
 
+def test_person_who_walks_has_a_place_a_height_and_a_heading(visited):
+    folder, truth, person = visited
+    clip = Clip.open(folder)
+    _, found = people.gather_without_people(clip, truth.world_from_camera, 40)
+    assert len(found.axis_world) == 1
+    off = np.linalg.norm(found.axis_world[0] - person[:, ::2, 3][:, :2], axis=-1)
+    assert np.nanmedian(off) < 0.1, "meters"
+    way = person[-1, ::2, 3] - person[0, ::2, 3]
+    cosine = found.ahead_world[0] @ (way / np.linalg.norm(way))
+    known = np.isfinite(cosine)
+    assert known.sum() > 0.5 * np.isfinite(off).sum()
+    assert np.median(cosine[known]) > np.cos(np.radians(15))
+
+
+def test_heading_of_a_person_who_stands_is_unknown():
+    rng, time = np.random.default_rng(0), np.arange(100) / 10
+    place = np.stack([np.clip(time - 5, 0, None), 0 * time], axis=-1)
+    ahead = people.walking_direction(place + 0.03 * rng.standard_normal(place.shape), time)
+    assert np.isnan(ahead[:45]).mean() > 0.9 and np.isfinite(ahead[55:]).all()
+    assert np.degrees(np.abs(np.arctan2(ahead[55:, 1], ahead[55:, 0]))).max() < 15
+    place[70:] = np.nan
+    assert np.isnan(people.walking_direction(place, time)[70:]).all(), "who is not seen"
+
+
 def test_no_people_are_found_without_people(tmp_path):
     poses, agent = scenery.session()
     scenery.record(tmp_path / "frames", poses, agent, poses)
