@@ -19,8 +19,8 @@ HEIGHT_TAIL_PERCENT = (1.0, 5.0)
 MIN_SUPPORTED_SHARE = 0.5
 """minimum share of frames above something solid"""
 FLOOR_SHARE = 0.25
-"""The floor is the lowest level with this share of the columns of the level that most columns have, or the one
-above, if more columns have it: noise of the map."""
+"""The floor is the lowest level with this share of the columns of the level that most columns have, or the
+one above, if more columns have it: noise of the map."""
 JUMP_KERNEL = np.array([1.0, 2.0, 3.0, 2.0, 1.0]) / 9
 """smoothing kernel over 0.5 s that turns a step into a jump"""
 

@@ -51,7 +51,7 @@ def with_level_floor(
     """Return the marks with all floor at one level.
 
     Near the boundary of two voxels a floor seems a voxel higher or lower in places. These are put on its
-    level unless roots of the moving animal (world, meters) are not as high there, by medians and half a voxel.
+    level unless the moving animal's roots (world, meters) are higher or lower there: medians, half a voxel.
     """
     level = floor_level(marks >= SUPPORTED)
     if level is None:
