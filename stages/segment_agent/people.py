@@ -96,8 +96,8 @@ def find_people(
         axes.append(_fill_gaps(axis, clip.timestamp_s))
         ahead.append(walking_direction(axis, clip.timestamp_s))
         heights.append(float(np.quantile(tops, 0.9)) - floor_m if len(tops) >= MIN_UPRIGHT_FRAMES else np.nan)
-    both = (np.array(each).reshape(-1, len(clip), 2) for each in (axes, ahead))
-    return People(*both, np.array(heights, float), floor_m)
+    axis_world, ahead_world = (np.array(each).reshape(-1, len(clip), 2) for each in (axes, ahead))
+    return People(axis_world, ahead_world, np.array(heights, float), floor_m)
 
 
 def gather_without_people(

@@ -33,7 +33,8 @@ def with_filled_floor(
     if level is None:
         return marks
     floor = (marks == SUPPORTED)[:, max(level - 1, 0) : level + 2].any(1)
-    home = hull(connected(floor, visited.any(1)) | visited.any(1))
+    been = np.asarray(visited.any(1))
+    home = hull(connected(floor, been) | been)
     masked = np.where(home[:, None], marks, 0)
     supported, solid = masked >= SUPPORTED, occupancy == 1
     unsupported = (masked > 0).any(1) & ~supported[:, : level + 2].any(1) & ~solid[:, : level + 2].any(1)
