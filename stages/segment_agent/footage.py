@@ -23,6 +23,7 @@ MIN_TYPICAL_PX = 0.5
 """least median residual used for normalization: noise of the flow"""
 SHOWN_GAPS, SHOWN_LOG = (1, 4), 60.0
 """frame gaps of the motion channels; 8-bit levels per log(1 + residual), saturating at a residual of 70"""
+Region = Bool[np.ndarray, "height width"]
 
 
 @dataclass(frozen=True)
@@ -77,9 +78,7 @@ class Footage:
                 parts.append(error / max(float(np.median(error)), MIN_TYPICAL_PX))
         return np.mean(parts, axis=0) if parts else np.zeros(self.size, np.float32)
 
-    def moving(
-        self, frame: int, inside: Bool[np.ndarray, "height width"]
-    ) -> Float[np.ndarray, "height width"]:
+    def moving(self, frame: int, inside: Region) -> Float[np.ndarray, "height width"]:
         """Return 1 near ``inside`` where pixels move against the background like it, -1 where they do not.
 
         0 between, and everywhere if little of ``inside`` moves or much of the rest does, like water. The
@@ -117,7 +116,7 @@ def pixel_indices(size: tuple[int, int]) -> Float[np.ndarray, "height width 2"]:
     return np.stack(np.meshgrid(*(np.arange(side, dtype=np.float32) for side in size[::-1])), -1)
 
 
-def dilated(mask: Bool[np.ndarray, "height width"], by_px: int) -> Bool[np.ndarray, "height width"]:
+def dilated(mask: Region, by_px: int) -> Region:
     """Dilate a mask by a disc."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by_px + 1, 2 * by_px + 1))
     return cv2.dilate(mask.astype(np.uint8), disc) > 0

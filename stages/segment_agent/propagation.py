@@ -13,13 +13,13 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 
 from pipeline.data.flow import GAPS
 from pipeline.geometry import subsampling
 from stages.segment_agent.appearance import Example, learn
 from stages.segment_agent.config import LearningConfig
-from stages.segment_agent.footage import SEARCH_PX, Footage, dilated, pixel_indices
+from stages.segment_agent.footage import SEARCH_PX, Footage, Region, dilated, pixel_indices
 
 MAX_LOG_ODDS, MIN_LOG_ODDS = 4.0, 0.5
 """largest and smallest magnitude of a pixel's log-odds"""
@@ -114,9 +114,7 @@ def message(footage: Footage, frame: int, found: Beliefs) -> LogOdds:
     return total / weight
 
 
-def connected(
-    inside: Bool[np.ndarray, "height width"], propagated: Bool[np.ndarray, "height width"]
-) -> Bool[np.ndarray, "height width"]:
+def connected(inside: Region, propagated: Region) -> Region:
     """Keep the connected components that overlap the propagated mask."""
     count, component = cv2.connectedComponents(inside.astype(np.uint8))
     overlap_px = np.bincount(component[propagated & inside], minlength=count)

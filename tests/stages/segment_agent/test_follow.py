@@ -10,7 +10,7 @@ from pipeline.data.clips import Clip
 from pipeline.data.flow import GAPS
 from stages.segment_agent import propagation
 from stages.segment_agent.config import LearningConfig
-from stages.segment_agent.follow import MOTION_GAPS, follow, segment_prompt
+from stages.segment_agent.follow import MOTION_GAPS, follow, segment_prompt, sharpened
 from stages.segment_agent.footage import Footage
 from stages.segment_agent.prompts import Prompt
 from stages.segment_agent.propagation import MAX_LOG_ODDS, Beliefs, connected, examples, message
@@ -79,6 +79,19 @@ def walk(tmp_path_factory) -> tuple[Footage, list[np.ndarray]]:
         masks.append(animal)
         steps.append(SHIFT_PX * animal[..., None] * np.array([1, 0]))
     return _footage(tmp_path_factory.mktemp("walk"), pictures, steps), masks
+
+
+def test_outlines_are_sharpened_by_color():
+    """A shifted mask moves back; what is far from its outline stays out."""
+    rng = np.random.default_rng(0)
+    animal, distant = np.zeros(SIZE, bool), np.zeros(SIZE, bool)
+    animal[30:70, 40:120], distant[100:110, 10:30] = True, True
+    colors = np.where((animal | distant)[..., None], (150, 90, 50), (40, 110, 40))
+    picture = np.clip(rng.normal(colors, 12), 0, 255).astype(np.uint8)
+    coarse = np.roll(animal, (2, 2), (0, 1))
+    assert (sharpened(picture, coarse, rng) ^ animal).sum() < 0.2 * (coarse ^ animal).sum()
+    for uniform in (np.zeros(SIZE, bool), np.ones(SIZE, bool)):
+        assert (sharpened(picture, uniform, rng) == uniform).all()
 
 
 @pytest.mark.parametrize("prompted", [0, 5])
