@@ -1,4 +1,4 @@
-"""Composite the built-in animal into a real RGB-D sequence, for `semi_real`.
+"""Composite built-in animals into a real RGB-D sequence, for `semi_real`.
 
 `Sequence` reads a recording with depth of any known format; `surfaces` finds walkable surfaces; `course` samples a trajectory on which
 the animal walks, rests, and enters and leaves the scene; `Compositor` renders each frame, with occlusion by the
@@ -337,73 +337,82 @@ class Composite:
 
     color: UInt8[np.ndarray, "height width 3"]
     depth: Float[np.ndarray, "height width"]
-    mask: Bool[np.ndarray, "height width"]
+    masks: Bool[np.ndarray, "animal height width"]
+    """visible parts; disjoint"""
+
+
+@dataclass(frozen=True)
+class Actor:
+    """An animal and what it does in a sequence."""
+
+    creature: animal.Animal
+    motion: gait.AnimalMotion
+    present: Bool[np.ndarray, "frame"]
 
 
 class Compositor:
-    """Renders the animal into frames of a sequence."""
+    """Renders animals into frames of a sequence."""
 
-    def __init__(self, sequence: Sequence, creature: animal.Animal, noise: Noise, rng: np.random.Generator):
-        self.sequence, self.creature, self.noise, self._rng = sequence, creature, noise, rng
+    def __init__(self, sequence: Sequence, actors: list[Actor], noise: Noise, rng: np.random.Generator):
+        self.sequence, self.actors, self.noise, self._rng = sequence, actors, noise, rng
         pictures = [sequence.color(i) for i in np.linspace(0, len(sequence.numbers) - 1, 8).astype(int)]
         self._light = np.mean([((p / 255.0) ** 2.2).mean((0, 1)) for p in pictures], axis=0) / 0.3
         """for an average albedo of 30 %, linear RGB"""
 
-    def frames(
-        self, world_from_camera: np.ndarray, motion: gait.AnimalMotion, present: np.ndarray
-    ) -> Iterator[Composite]:
-        """Render every frame, in order."""
+    def frames(self, world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Iterator[Composite]:
+        """Render every frame, in order; of bodies that overlap in the picture the nearer one is visible."""
         turned = rigid.vector_from_rotation(
             np.swapaxes(world_from_camera[:-1, :3, :3], -1, -2) @ world_from_camera[1:, :3, :3]
         )
         turned = np.concatenate([turned, turned[-1:]])
-        for index, visible in enumerate(present):
+        for index, turn in enumerate(turned):
             color = self.sequence.color(index)
             depth = resampled(self.sequence.depth(index), color.shape[:2])
-            if visible:
-                blur = 0.15 * self.sequence.intrinsics[0, 0] * np.array([-turned[index, 1], turned[index, 0]])
-                yield self._draw(color, depth, world_from_camera[index], motion, index, blur)
-            else:
-                yield Composite(color, depth, np.zeros(depth.shape, bool))
+            masks, front = np.zeros((len(self.actors), *depth.shape), bool), _fill_holes(depth)
+            blur = 0.15 * self.sequence.intrinsics[0, 0] * np.array([-turn[1], turn[0]])
+            for row, actor in enumerate(self.actors):
+                if actor.present[index]:
+                    color, depth, own = self._draw(
+                        color, depth, front, world_from_camera[index], actor, index, blur
+                    )
+                    front, masks[row] = np.where(own > 0, own, front), own > 0
+                    masks[:row] &= own == 0
+            yield Composite(color, depth, masks)
 
-    def _draw(self, color, depth, world_from_camera, motion, index, blur_px) -> Composite:
+    def _draw(self, color, depth, front, world_from_camera, actor: Actor, index: int, blur_px):
+        """Return color, measured depth, and exact depth where the animal is seen, 0 elsewhere; ``front``: what may hide it."""
         height, width = depth.shape
+        creature, motion = actor.creature, actor.motion
         camera_from_world = rigid.inverse(world_from_camera)
         camera_from_bone = camera_from_world @ motion.world_from_agent[index] @ motion.agent_from_bone[index]
-        body = animal.surface(self.creature, camera_from_bone)
+        body = animal.surface(creature, camera_from_bone)
         k = self.sequence.intrinsics
         focal = (k[0, 0], k[1, 1], k[0, 2], k[1, 2])
         if body[:, 2].max() < 0.3:
-            return Composite(color, depth, np.zeros(depth.shape, bool))
-        view = raster.rasterize(body, self.creature.faces, np.diag([2, 2, 1]) @ k, 2 * height, 2 * width)
-        normals = animal.normals_of(body, self.creature.faces) @ world_from_camera[:3, :3].T
+            return color, depth, np.zeros(depth.shape)
+        view = raster.rasterize(body, creature.faces, np.diag([2, 2, 1]) @ k, 2 * height, 2 * width)
+        normals = animal.normals_of(body, creature.faces) @ world_from_camera[:3, :3].T
         irradiance = (
             0.45 + 0.4 * (0.5 + 0.5 * normals[:, 1:2]) + 0.25 * np.clip(normals[:, :1], 0, 1)
         ) * self._light
-        anatomy = self.creature.anatomy
+        anatomy = creature.anatomy
         balls = np.zeros((len(anatomy.balls()), 4))
         for row, (bone, rest, radius) in enumerate(anatomy.balls()):
             local = np.asarray(rest) - anatomy.heads[animal.INDEX[bone]]
             balls[row] = *rigid.apply(camera_from_bone[animal.INDEX[bone]], local[None])[0], radius
         coat = shade.Coat(
-            self.creature.faces,
-            self.creature.vertices,
-            irradiance.astype(np.float32),
-            self.creature.fur,
-            balls,
+            creature.faces, creature.vertices, irradiance.astype(np.float32), creature.fur, balls
         )
         fur = shade.shade(view.face, view.inverse_corners, focal, _EMPTY, coat, camera_from_world)
         own = raster.depth_through(view.face, view.inverse_depth, view.inverse_corners, focal, height, width)
         coverage = cv2.resize(
             (view.face >= 0).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA
         )
-        hidden = (_fill_holes(depth) < own - 0.012 - 0.01 * own) & (own > 0)
+        hidden = (front < own - 0.012 - 0.01 * own) & (own > 0)
         coverage[hidden], fur[hidden] = 0, 0
         if not (coverage >= 0.5).any():
-            return Composite(color, depth, np.zeros(depth.shape, bool))
-        shading = _contact_shadow(
-            _fill_holes(depth), np.asarray(focal), camera_from_world[:3, 1].copy(), balls
-        )
+            return color, depth, np.zeros(depth.shape)
+        shading = _contact_shadow(front, np.asarray(focal), camera_from_world[:3, 1].copy(), balls)
         room = (color / 255.0).astype(np.float32) ** 2.2 * shading[..., None]
         layer = _motion_blurred(
             cv2.GaussianBlur(np.dstack([fur, coverage]).astype(np.float32), (0, 0), 0.7), blur_px
@@ -411,11 +420,8 @@ class Compositor:
         linear = layer[..., :3] + room * (1 - layer[..., 3:])
         shown = 255 * np.clip(linear, 0, 1) ** (1 / 2.2)
         shown += layer[..., 3:] * self._rng.normal(0, self.noise.color, shown.shape)
-        return Composite(
-            np.clip(shown, 0, 255).astype(np.uint8),
-            self._sensor_depth(depth, own * (coverage >= 0.5)),
-            coverage >= 0.5,
-        )
+        own = own * (coverage >= 0.5)
+        return np.clip(shown, 0, 255).astype(np.uint8), self._sensor_depth(depth, own), own
 
     def _sensor_depth(self, room: np.ndarray, own: np.ndarray) -> Float[np.ndarray, "height width"]:
         """Return depth as the sensor measures it: correlated noise, a jittered outline, the projector shadow."""

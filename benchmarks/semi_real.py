@@ -6,7 +6,7 @@ its depth is aligned from frame to frame. Each drawn recording is a 7-Scenes sty
 in a separate folder. The animal enters and leaves the scene; many frames show none.
 
     python -m benchmarks.semi_real draw RECORDING OUT --seeds 1 2 [--first 500 --step 3]
-    python -m benchmarks.semi_real score OUT [--masks masks]
+    python -m benchmarks.semi_real score BUILD OUT/truth
 
 For a whole build, the walk-through is another part of the sequence without the animal, and the turnaround is that of
 the built-in capture with the same coat; sessions have no poses, so that registration has no odometry.
@@ -15,8 +15,14 @@ the built-in capture with the same coat; sessions have no poses, so that registr
     python -m benchmarks.semi_real draw SEQUENCE OUT --seeds 1 2 --coat 8 --first 500 --no-poses
     cp -r OUT/recordings/* build/toy/synthetic_capture/recordings/turnaround.r3d captures/kitchen/
     cp agents/toy.toml agents/kitchen.toml && make kitchen.registration
-    python -m benchmarks.semi_real registration build/kitchen OUT/truth build/toy/synthetic_capture/truth \\
+    python -m benchmarks.semi_real registration build/kitchen OUT/truth \\
+        build/toy/synthetic_capture/truth/turnaround.npz \\
         --structure SEQUENCE
+
+Several species make a home of several animals, with a turnaround of each, `turnaround_<species>`:
+
+    python -m benchmarks.semi_real draw SEQUENCE OUT --seeds 1 2 --species cat dog rabbit --coat 8 --first 500
+    python -m benchmarks.semi_real registration BUILD OUT/truth TURNAROUND.npz --animal dog
 
 With `--structure` cameras are also compared with structure from motion on the color pictures of the sequence
 (`benchmarks.structure`), aligned to the world of the build by a similarity on the cameras of the walk-through; the
@@ -27,18 +33,20 @@ import argparse
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 
 from benchmarks import structure
-from benchmarks.composited import Compositor, Sequence, course, measure_noise, resampled, surfaces
+from benchmarks.composited import Actor, Compositor, Sequence, course, measure_noise, resampled, surfaces
 from pipeline.core.errors import InputError, exit_code
 from pipeline.core.progress import log
 from pipeline.core.videos import Video
 from pipeline.core.videos import read as read_videos
-from pipeline.data import images, npz
+from pipeline.data import npz
+from pipeline.data.clips import Masks, read_source_index
 from pipeline.data.poses import RegisteredPoses
 from pipeline.data.templates import AgentCameras, SceneCameras
 from pipeline.geometry import rigid
@@ -47,7 +55,13 @@ from pipeline.recordings.seven_scenes import KINECT_DEPTH, RATE_HZ, SAME_LENS_PX
 from stages.evaluate.registration import FLIPPED_DEG, is_right
 from stages.evaluate.reliability import BINS, reliability_curve, reliability_metrics
 from stages.synthesize_capture import animal, gait
+from stages.synthesize_capture.animal import BODIES
+from stages.synthesize_capture.config import Species
 
+TRIALS = 20
+"""trajectories among which that of a further animal is chosen"""
+APART_M = 0.5
+"""between the roots of two animals whose bodies do not touch"""
 MIN_VISIBLE = 0.001
 """Fraction of a picture above which the animal counts as visible."""
 RIGHT_CAMERA, RIGHT_ROOT = (5.0, 0.05), (20.0, 0.1)
@@ -58,10 +72,10 @@ RIGHT_CAMERA, RIGHT_ROOT = (5.0, 0.05), (20.0, 0.1)
 class RenderConfig:
     """What is rendered into a sequence, and how it is written."""
 
+    species: tuple[Species, ...] = ("cat",)
+    """The animals; none: a walk-through."""
     coat: int | None = None
-    """Seed of the animal's appearance; None: that of its trajectory."""
-    empty: bool = False
-    """Without the animal: a walk-through."""
+    """Seed of their appearance; None: that of their trajectories."""
     poses: bool = True
     """Whether the recording has the poses of the sequence."""
 
@@ -76,26 +90,17 @@ def draw(sequence: Sequence, out: Path, name: str, seed: int, render: RenderConf
         raise InputError("CAP-007", what, sequence.recording.where, "take every second one, with --step 2")
     timestamp_s = ticks / RATE_HZ
     noise = measure_noise(sequence)
-    walkable = surfaces(sequence, poses)
-    log(f"{name}: noise {noise}, surfaces {[(round(s.height_m, 2), int(s.free.sum())) for s in walkable]}")
-    trajectory, present = course(sequence, poses, timestamp_s, walkable, rng)
-    if not (render.empty or present.any()):
-        what = "the animal is in no frame: it needs level ground in view, 0.7 to 3.5 m away, for some seconds"
-        remedy = "choose other --seeds or frames (--first, --last), or a recording that shows the floor"
-        raise InputError("CAP-007", what, sequence.recording.where, remedy)
-    present = present & (not render.empty)
-    motion = gait.poses(trajectory, timestamp_s)
-    creature = animal.grow(np.random.default_rng([seed if render.coat is None else render.coat, 2]))
+    log(f"{name}: noise {noise}")
+    actors = _cast(sequence, poses, timestamp_s, rng, seed, render)
     folder = out / "recordings" / name
     folder.mkdir(parents=True)
-    (out / "truth").mkdir(exist_ok=True)
     np.savetxt(folder / "camera-intrinsics.txt", sequence.intrinsics)
     given = sequence.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]]
     if np.abs(given - KINECT_DEPTH).max() < SAME_LENS_PX:
         np.savetxt(folder / "depth_from_color.txt", np.eye(4))  # else its reader may take depth for raw
     depth_size = sequence.depth_size if max(sequence.depth_size) < max(sequence.size) else sequence.size
     masks = []
-    for index, frame in enumerate(Compositor(sequence, creature, noise, rng).frames(poses, motion, present)):
+    for index, frame in enumerate(Compositor(sequence, actors, noise, rng).frames(poses)):
         base = folder / f"frame-{ticks[index]:06d}"
         cv2.imwrite(f"{base}.color.jpg", frame.color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
         cv2.imwrite(
@@ -103,14 +108,60 @@ def draw(sequence: Sequence, out: Path, name: str, seed: int, render: RenderConf
         )
         if render.poses:
             np.savetxt(f"{base}.pose.txt", poses[index])
-        masks.append(frame.mask)
+        masks.append(frame.masks)
     packed = np.packbits(np.stack(masks), axis=-1)
-    npz.save(
-        out / "truth" / f"{name}.npz", compress=True, timestamp_s=timestamp_s, packed=packed,
-        source_index=ticks,
-        shape=np.array([len(masks), *masks[0].shape]), world_from_camera=poses, number=sequence.numbers,
-        world_from_agent=motion.world_from_agent, there=present,
+    truth = dict(
+        timestamp_s=timestamp_s, source_index=ticks, shape=np.array([len(masks), *sequence.size]),
+        world_from_camera=poses, number=sequence.numbers,
     )  # fmt: skip
+    several = len(render.species) > 1
+    for row, (species, actor) in enumerate(zip(render.species, actors, strict=True)):
+        path = out / "truth" / (species if several else "") / f"{name}.npz"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        own = dict(world_from_agent=actor.motion.world_from_agent, there=actor.present, packed=packed[:, row])
+        npz.save(path, compress=True, **truth, **own)
+    if not actors:
+        (out / "truth").mkdir(exist_ok=True)
+        npz.save(out / "truth" / f"{name}.npz", compress=True, **truth)
+
+
+def _cast(
+    sequence: Sequence,
+    poses: np.ndarray,
+    timestamp_s: np.ndarray,
+    rng: np.random.Generator,
+    seed: int,
+    render: RenderConfig,
+) -> list[Actor]:
+    """Sample what each animal does. Of several trajectories of a further animal the longest is chosen that keeps clear
+    of the others' bodies.
+    """
+    walkable = surfaces(sequence, poses)
+    log(f"surfaces {[(round(s.height_m, 2), int(s.free.sum())) for s in walkable]}")
+    actors: list[Actor] = []
+    for row, species in enumerate(render.species):
+        stream = np.random.default_rng([seed, 41, row]) if row else rng
+        coat = seed if render.coat is None else render.coat
+        creature = animal.grow(
+            np.random.default_rng([coat, 2]), species=species
+        )  # as in the built-in capture
+        trials = [course(sequence, poses, timestamp_s, walkable, stream) for _ in range(TRIALS if row else 1)]
+        made = [Actor(creature, gait.poses(trajectory, timestamp_s, BODIES[species]), present)
+                for trajectory, present in trials if present.any()]  # fmt: skip
+        if not made:
+            what = f"the {species} is in no frame: it needs level ground in view, 0.7 to 3.5 m away, for some seconds"
+            remedy = "choose other --seeds or frames (--first, --last), or a recording that shows the floor"
+            raise InputError("CAP-007", what, sequence.recording.where, remedy)
+        clear_m = [min([APART_M, *(_apart_m(actor, other) for other in actors)]) for actor in made]
+        actors.append(max(zip(clear_m, made, strict=True), key=lambda row: (row[0], row[1].present.sum()))[1])
+    return actors
+
+
+def _apart_m(first: Actor, second: Actor) -> float:
+    """Return the least distance of both animals while both are there, meters."""
+    there = first.present & second.present
+    way = first.motion.world_from_agent[there, :3, 3] - second.motion.world_from_agent[there, :3, 3]
+    return float(np.linalg.norm(way, axis=1).min(initial=np.inf))
 
 
 def mask_metrics(labels: np.ndarray, truth: np.ndarray, min_visible: float = MIN_VISIBLE) -> dict[str, float]:
@@ -140,8 +191,37 @@ def read_truth(path: Path, index: np.ndarray) -> np.ndarray:
     return np.unpackbits(table["packed"][row], axis=-1, count=int(table["shape"][2])).astype(bool)
 
 
+def scores(build: Path, truth: Path) -> dict[str, dict[str, float]]:
+    """Return `mask_metrics` of every session of a build, by its name, in a home of several animals also by theirs.
+
+    There, `swaps` is the share of frames whose mask covers more of the other animals than of its own.
+    """
+    animals = sorted(
+        path.name for path in truth.iterdir() if path.is_dir() and any(path.glob("session*.npz"))
+    )
+    found = {}
+    for video in read_videos(build / "plan" / "videos.json"):
+        if video.role != "session":
+            continue
+        session, index = Path(video.file).stem, read_source_index(build / "frames" / video.id)
+        true = np.stack([read_truth(truth / name / f"{session}.npz", index) for name in animals or ("",)])
+        for row, name in enumerate(animals or ("",)):
+            own = build / "home_masks" / video.id / name if animals else build / "masks" / video.id
+            masks = Masks.open(own)
+            labels = np.stack([masks[frame] for frame in range(len(masks))])
+            metrics = mask_metrics(labels, true[row])
+            if animals:
+                others, mine = (
+                    (np.delete(true, row, axis=0).any(0) & (labels == 255)),
+                    true[row] & (labels == 255),
+                )
+                metrics["swaps"] = float((others.sum((1, 2)) > mine.sum((1, 2))).mean())
+            found[f"{session} {name}".strip()] = metrics
+    return found
+
+
 def registration_metrics(
-    build: Path, truth: Path, turnaround: Path, sequence: Path | None = None
+    build: Path, truth: Path, turnaround: Path, sequence: Path | None = None, name: str | None = None
 ) -> dict[str, float]:
     """Return medians and percentiles of camera and root errors over all frames of all sessions.
 
@@ -150,29 +230,33 @@ def registration_metrics(
     differ from that of the sensor by several percent), but its pose relative to the camera is exact. `root_placed`
     is the fraction of these frames with a root, `root_where_empty` that of frames without the animal. With
     ``sequence`` cameras are also compared with structure from motion on its pictures. Meters and degrees. `calibration`
-    of cameras is measured against structure from motion if given, of roots where there are any.
+    of cameras is measured against structure from motion if given, of roots where there are any. In a home of several
+    animals ``name`` is the one that is measured.
     """
     videos = {Path(v.file).stem: v for v in read_videos(build / "plan" / "videos.json")}
+    own, sessions = (build, truth) if name is None else (build / "animals" / name, truth / name)
     walk = _rows(build, videos["walkthrough"], npz.load(truth / "walkthrough.npz"))
     ours = SceneCameras.open(build / "scene_template").world_from_registered
     world_from_true = constant_between(ours, walk["world_from_camera"])
-    index = npz.load(build / "frames" / videos["turnaround"].id / "frames.npz")["source_index"]
-    around = {key: value[index] for key, value in npz.load(turnaround / "turnaround.npz").items()
+    index = npz.load(
+        build / "frames" / videos["turnaround" if name is None else f"turnaround_{name}"].id / "frames.npz"
+    )["source_index"]
+    around = {key: value[index] for key, value in npz.load(turnaround).items()
               if key in ("world_from_agent", "world_from_camera")}  # fmt: skip
     true_agent_from_camera = rigid.inverse(around["world_from_agent"]) @ around["world_from_camera"]
     agent_from_true = constant_between(
-        AgentCameras.open(build / "agent_template").agent_from_registered, true_agent_from_camera
+        AgentCameras.open(own / "agent_template").agent_from_registered, true_agent_from_camera
     )
     cameras, roots, empty, cameras_by_session = [], [], [], {}
     camera_sure, root_sure = [], []
-    for name, video in videos.items():
+    for session, video in videos.items():
         if video.role != "session":
             continue
-        table = _rows(build, video, npz.load(truth / f"{name}.npz"))
-        poses = RegisteredPoses.open(build / "registration" / video.id) or RegisteredPoses.unknown(
+        table = _rows(build, video, npz.load(sessions / f"{session}.npz"))
+        poses = RegisteredPoses.open(own / "registration" / video.id) or RegisteredPoses.unknown(
             table["timestamp_s"]
         )
-        cameras_by_session[name] = NumberedCameras(poses.world_from_camera, table["number"])
+        cameras_by_session[session] = NumberedCameras(poses.world_from_camera, table["number"])
         cameras.append(pose_errors(poses.world_from_camera, world_from_true @ table["world_from_camera"]))
         true_roots = rigid.inverse(table["world_from_camera"]) @ table["world_from_agent"]
         true_roots = true_roots @ rigid.inverse(agent_from_true)
@@ -284,18 +368,20 @@ def main() -> int:
     draw_parser.add_argument(
         "--step", type=int, default=3, help="stride of frames; negative: in reverse order"
     )
+    draw_parser.add_argument("--species", nargs="+", default=["cat"], choices=get_args(Species))
     draw_parser.add_argument(
         "--coat", type=int, help="seed of the animal's appearance; default: the seed of the recording"
     )
     draw_parser.add_argument("--empty", action="store_true", help="render no animal: a walk-through")
     draw_parser.add_argument("--no-poses", action="store_true", help="omit the poses of the sequence")
-    score_parser = commands.add_parser("score", help="evaluate masks/<name> against truth/<name>")
-    score_parser.add_argument("out", type=Path)
-    score_parser.add_argument("--masks", default="masks")
+    score_parser = commands.add_parser("score", help="evaluate the masks of a build")
+    score_parser.add_argument("build", type=Path)
+    score_parser.add_argument("truth", type=Path, help="OUT/truth")
     registration_parser = commands.add_parser("registration", help="evaluate cameras and roots of a build")
     registration_parser.add_argument("build", type=Path)
     registration_parser.add_argument("truth", type=Path, help="OUT/truth")
-    registration_parser.add_argument("turnaround", type=Path, help="truth folder of the turnaround")
+    registration_parser.add_argument("turnaround", type=Path, help="truth of the turnaround, an NPZ file")
+    registration_parser.add_argument("--animal", help="which one, in a home of several")
     registration_parser.add_argument(
         "--structure",
         type=Path,
@@ -304,7 +390,8 @@ def main() -> int:
     )
     arguments = parser.parse_args()
     if arguments.command == "draw":
-        render = RenderConfig(arguments.coat, arguments.empty, not arguments.no_poses)
+        species = () if arguments.empty else tuple(arguments.species)
+        render = RenderConfig(species, arguments.coat, not arguments.no_poses)
         sequence = Sequence.open(
             arguments.sequence, first=arguments.first, last=arguments.last, step=arguments.step
         )
@@ -313,16 +400,13 @@ def main() -> int:
                 sequence, arguments.out, "walkthrough" if arguments.empty else f"session-{seed}", seed, render
             )
     elif arguments.command == "registration":
-        for name, value in registration_metrics(
-            arguments.build, arguments.truth, arguments.turnaround, arguments.structure
-        ).items():
-            print(f"{name:50s} {value:.4g}")
+        found = registration_metrics(
+            arguments.build, arguments.truth, arguments.turnaround, arguments.structure, arguments.animal
+        )
+        print("\n".join(f"{name:50s} {value:.4g}" for name, value in found.items()))
     else:
-        for folder in sorted((arguments.out / arguments.masks).iterdir()):
-            index = npz.load(arguments.out / "frames" / folder.name / "frames.npz")["source_index"]
-            truth = read_truth(arguments.out / "truth" / f"{folder.name}.npz", index)
-            labels = np.stack([images.read_gray(p) for p in sorted(folder.glob("*.png"))])
-            print(folder.name, json.dumps({k: round(v, 4) for k, v in mask_metrics(labels, truth).items()}))
+        for name, found in scores(arguments.build, arguments.truth).items():
+            print(name, json.dumps({key: round(value, 4) for key, value in found.items()}))
     return 0
 
 

@@ -1,11 +1,17 @@
 """The built-in animal rendered into fifty frames of a real kitchen: ground truth, occlusion, and extraction."""
 
+import dataclasses
+import json
+import shutil
+
+import cv2
 import numpy as np
 import pytest
 
 from benchmarks import semi_real
 from benchmarks.composited import Sequence
 from pipeline.core.errors import InputError
+from pipeline.core.videos import Video
 from pipeline.data import npz
 from pipeline.data.clips import Masks, read_source_index
 from pipeline.recordings.formats import open_recording
@@ -52,6 +58,55 @@ def test_animal_changes_color_and_depth_only_in_its_mask(drawn):
         np.testing.assert_allclose(
             recording.read_depth(int(recording.index[row])), sequence.depth(row), atol=6e-4
         )
+
+
+@pytest.fixture(scope="module")
+def two_drawn(drawn, tmp_path_factory):
+    out = tmp_path_factory.mktemp("two_animals")
+    semi_real.draw(drawn[0], out, "session-1", 1, semi_real.RenderConfig(("cat", "rabbit")))
+    return out
+
+
+def test_animals_hide_each_other(drawn, two_drawn):
+    _, alone = drawn
+    index = open_recording(two_drawn / "recordings" / "session-1").index
+    cat, rabbit = (
+        semi_real.read_truth(two_drawn / "truth" / name / "session-1.npz", index)
+        for name in ("cat", "rabbit")
+    )
+    before = semi_real.read_truth(alone / "truth" / "session-1.npz", index)
+    assert cat.any() and rabbit.any()
+    assert not (cat & rabbit).any()
+    np.testing.assert_array_equal(before & ~rabbit, cat)
+    first, second = (npz.load(two_drawn / "truth" / name / "session-1.npz") for name in ("cat", "rabbit"))
+    together = first["there"] & second["there"]
+    way = (first["world_from_agent"] - second["world_from_agent"])[together, :3, 3]
+    assert (np.linalg.norm(way, axis=1) > 0.3).all()
+
+
+def test_scores_of_several_animals_tell_swaps(two_drawn, tmp_path):
+    build, truth = tmp_path / "build", two_drawn / "truth"
+    index = open_recording(two_drawn / "recordings" / "session-1").index
+    (build / "plan").mkdir(parents=True)
+    video = Video("v001", "session-1", role="session", split="train", sha256=None)
+    (build / "plan" / "videos.json").write_text(json.dumps([dataclasses.asdict(video)]))
+    (build / "frames" / "v001").mkdir(parents=True)
+    npz.save(build / "frames" / "v001" / "frames.npz", source_index=index)
+    found = {}
+    for names in (("cat", "rabbit"), ("rabbit", "cat")):
+        for name, shown in zip(("cat", "rabbit"), names, strict=True):
+            folder = build / "home_masks" / "v001" / name
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+            masks = semi_real.read_truth(truth / shown / "session-1.npz", index)
+            for row, mask in enumerate(masks):
+                cv2.imwrite(str(folder / f"{row:06d}.png"), mask * np.uint8(255))
+            npz.save(
+                folder / "masks.npz", visible=masks.any((1, 2)), confidence=np.ones(len(masks), np.float32)
+            )
+        found[names] = semi_real.scores(build, truth)
+    assert all(row["iou_mean"] == 1 and row["swaps"] == 0 for row in found["cat", "rabbit"].values())
+    assert all(row["swaps"] > 0.1 for row in found["rabbit", "cat"].values())
 
 
 @pytest.mark.slow
