@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.calibration import recordings as calibration
 from pipeline.core.errors import InputError
 from pipeline.geometry import cameras, rigid
 from pipeline.recordings import conventions, extraction, stray_scanner, upright
 from pipeline.recordings.formats import format_of, open_recording
 from pipeline.recordings.recording import pose_from_matrix
-from stages.check_captures import alignment, sampling
 
 REAL = Path(os.environ.get("ATS_REALDATA", Path(__file__).parents[3] / "shared" / "realdata"))
 LIMIT_M = 0.015
@@ -74,9 +74,12 @@ def test_kinect_pictures_brought_to_the_depth_cameras_lens_are_recognized(tmp_pa
         cv2.imwrite(str(path), cv2.warpAffine(cv2.imread(str(path)), matrix, (640, 480)))
     copy = open_recording(tmp_path / "copy")
     assert copy.depth_camera is None and copy.intrinsics[0, 0, 0] == 585
-    beside = sampling.sample(copy, 40, max_depth_m=6.0)
-    assert "2.5 cm left" in alignment.misalignment(beside.shots), "depth was not registered"
-    assert alignment.misalignment(sampling.sample(raw, 40, max_depth_m=6.0).shots) == ""
+    found = calibration.calibrate(copy)
+    assert found.used == ("camera",), "depth was not registered"
+    assert found.estimate.focal == pytest.approx(1, abs=0.005)
+    x, y = rigid.inverse(found.estimate.depth_from_color)[:2, 3]
+    assert x == pytest.approx(-0.025, abs=0.006) and abs(y) < 0.006
+    assert calibration.calibrate(raw).clear == ()
 
 
 def test_stray_odometry_is_read():
