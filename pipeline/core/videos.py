@@ -17,6 +17,8 @@ ROLES: tuple[Role, ...] = get_args(Role)
 SPLITS: tuple[Split, ...] = get_args(Split)
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".3gp", ".webm")
 """suffixes of video files, lower case"""
+PERSON = "person"
+"""Name of the one who films, in simulations and environments, which no animal can have."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from pettingzoo import ParallelEnv
 
 from pipeline.behavior.simulator import AnimalBatch
 from pipeline.behavior.trajectories import RATE_HZ
+from pipeline.core.videos import PERSON
 from pipeline.environments.floor import to_local, to_world
 from pipeline.environments.rendering import bird_view, known_mode
 from pipeline.environments.spaces import (
@@ -21,7 +22,6 @@ from pipeline.environments.spaces import (
 )
 from pipeline.environments.world import ANIMAL_NUMBERS, AnimalWorld, checked, others_seen
 
-PERSON = "person"
 GOAL_M = 3.0
 """Distance of the goal along each axis that an action of 1 stands for, meters."""
 

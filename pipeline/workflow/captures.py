@@ -14,7 +14,7 @@ from typing import Any
 
 from pipeline.core import config
 from pipeline.core.errors import InputError
-from pipeline.core.videos import ROLES, SPLITS, Role, Split, Video
+from pipeline.core.videos import PERSON, ROLES, SPLITS, Role, Split, Video
 from pipeline.recordings.formats import UNDERSTOOD, format_of, has_depth
 from pipeline.workflow import dag
 from pipeline.workflow.artifact import MANIFEST
@@ -34,8 +34,6 @@ SHOWN_LETTERS, LONGEST_NAME_BYTES = 40, 200
 """of a recording's name: file systems allow 255 bytes, and sidecars append to it"""
 _ANIMAL = re.compile(r"[a-z][a-z0-9-]{0,30}\Z")
 _NAMED = re.compile(r"turnaround_([^\W_](?:[^\W_]|-)*)")
-PERSON = "person"
-"""Name of the one who films, in simulations and environments, which no animal can have."""
 TABLES = (".csv", ".npz")
 """Suffixes of tables of motion."""
 ICLOUD = ".icloud"
