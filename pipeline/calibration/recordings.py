@@ -127,9 +127,11 @@ def calibrate(recording: Recording, given: GivenCalibration = NOTHING) -> DepthC
         return DepthCalibration(recording, None)
     differs = {"camera": found.camera_is_clear(), "delay": found.delay_is_clear(step_s)}
     clear = tuple(name for name, differing in differs.items() if differing)
+    if not clear:
+        return DepthCalibration(recording, found)
     better = _changed(recording, found, clear)
     contrasts = extraction.edge_contrasts((recording, better), others, FARTHEST_M)
-    if not clear or not beats(contrasts[:, 1], contrasts[:, 0], tests=1):
+    if not beats(contrasts[:, 1], contrasts[:, 0], tests=1):
         return DepthCalibration(recording, found)
     given_camera = given.describes_camera or recording.depth_camera is not None
     fixed = {"camera": given_camera, "delay": given.delay_s is not None}

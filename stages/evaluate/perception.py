@@ -87,13 +87,14 @@ def people_metrics(
         camera_from_world = rigid.inverse(truth.world_from_camera)
         true = rigid.apply(camera_from_world, feet_world[:, None])
         off = np.linalg.norm(people["feet_camera"] - true, axis=-1)
-        error = np.where(np.isfinite(off), off, np.inf).min(1, initial=np.inf)
+        off = np.where(np.isfinite(off), off, np.inf)
+        error = off.min(1, initial=np.inf)
         errors.append(error[seen])
         tracked_frames += int(np.isfinite(error).sum())
         unseen += int((np.isfinite(error) & (truth.visitor_seen == 0)).sum())
         if not tracks:
             continue
-        nearest = np.where(np.isfinite(off), off, np.inf).argmin(1)
+        nearest = off.argmin(1)
         ahead = people["ahead_camera"][np.arange(len(off)), nearest]
         true_ahead = camera_from_world[:, :3, :3] @ truth.world_from_visitor[:, :3, 2:3]
         cosine = np.clip((ahead[:, None] @ true_ahead)[:, 0, 0], -1, 1)
