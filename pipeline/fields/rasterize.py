@@ -1,21 +1,42 @@
-"""Draw 3D Gaussians (Kerbl et al. 2023): `project` them into a camera, then blend them front to back.
+"""Draw 3D Gaussians (Kerbl et al. 2023): project them into a camera, then blend them front to back.
 
-`blend_dense` is the readable reference in torch, for few Gaussians. `draw` uses the tile rasterizer
-for a CPU or gsplat on CUDA; the tile rasterizer is tested against the reference, values and gradients.
+`draw` uses the tile rasterizer for a CPU or gsplat 1.5.3, an optional dependency, on CUDA; the tests compare
+both with a readable one in torch, values and gradients.
 """
 
-from typing import Literal, assert_never
+import importlib
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from pipeline.fields.footprints import ALPHA_MAX, ALPHA_MIN, BLUR_PX2, CUTOFF, NEAREST_M, Footprints
+from pipeline.core.errors import InputError
 from pipeline.geometry import rigid_torch
 
-Backend = Literal["tiles", "dense", "gsplat"]
+Backend = Literal["tiles", "gsplat"]
+BLUR_PX2 = 0.3
+"""added to the variance of every footprint, so that none falls between pixels"""
+NEAREST_M = 0.1
+"""Gaussians nearer than this to the camera are not drawn"""
+ALPHA_MIN, ALPHA_MAX = 1 / 255, 0.99
+"""opacities below the first are not drawn, those above the second are held there (Kerbl et al. 2023)"""
+CUTOFF = 3.33
+"""standard deviations at which footprints are cut off: there an opacity of 0.99 has fallen to 1/255"""
 VIEW_MARGIN = 0.15
 """footprints are linearized at most this share of the picture outside its edges, as in 3DGS"""
+
+
+@dataclass(frozen=True)
+class Footprints:
+    """Gaussians projected into one camera."""
+
+    pixel: Float[Tensor, "point 2"]
+    conic: Float[Tensor, "point 3"]
+    """inverse covariance (a, b, c) of a x^2 + 2 b x y + c y^2, 1/pixel^2"""
+    radius_px: Float[Tensor, "point"]
+    depth: Float[Tensor, "point"]
 
 
 def project(
@@ -69,29 +90,6 @@ def in_view(
     return torch.nonzero(inside & (camera[:, 2] > NEAREST_M))[:, 0]
 
 
-def blend_dense(
-    footprints: Footprints,
-    opacity: Float[Tensor, "point"],
-    values: Float[Tensor, "point channel"],
-    height: int,
-    width: int,
-) -> tuple[Float[Tensor, "height width channel"], Float[Tensor, "height width"]]:
-    """Blend every Gaussian over every pixel, near to far: return blended values and coverage."""
-    order = footprints.depth.argsort(stable=True)
-    order = order[footprints.depth[order] > NEAREST_M]
-    down, right = (torch.arange(side, device=opacity.device) + 0.5 for side in (height, width))
-    y, x = torch.meshgrid(down, right, indexing="ij")
-    offset = torch.stack([x, y], dim=-1)[None] - footprints.pixel[order][:, None, None]
-    dx, dy = offset.unbind(-1)
-    a, b, c = (part[:, None, None] for part in footprints.conic[order].unbind(-1))
-    power = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-    alpha = (opacity[order][:, None, None] * torch.exp(-power)).clamp_max(ALPHA_MAX)
-    alpha = torch.where((alpha < ALPHA_MIN) | (power > 0.5 * CUTOFF**2), torch.zeros_like(alpha), alpha)
-    transmittance = torch.cumprod(1 - alpha, dim=0)
-    weight = alpha * torch.cat([torch.ones_like(transmittance[:1]), transmittance[:-1]])
-    return torch.einsum("phw,pc->hwc", weight, values[order]), weight.sum(0)
-
-
 def draw(
     means_world: Float[Tensor, "point 3"], rotation: Float[Tensor, "point 4"],
     log_scale: Float[Tensor, "point 3"],
@@ -99,19 +97,28 @@ def draw(
     camera_from_world: Float[Tensor, "4 4"], intrinsics: Float[Tensor, "3 3"],
     height: int, width: int, backend: Backend = "tiles",
 ) -> tuple[Float[Tensor, "height width channel"], Float[Tensor, "height width"]]:  # fmt: skip
-    """Draw Gaussians with any values (color, depth, masks ...): returns blended values and coverage 0..1."""
-    camera = camera_from_world, intrinsics, height, width
-    match backend:
-        case "tiles" | "dense":
-            footprints = project(means_world, rotation, log_scale, *camera)
-            if backend == "dense":
-                return blend_dense(footprints, opacity, values, height, width)
-            from pipeline.fields.rasterize_tiles import blend_tiles  # numba compiles on import
+    """Draw Gaussians with any values (color, depth, masks ...): returns blended values and coverage 0..1.
 
-            return blend_tiles(footprints, opacity, values, height, width)
-        case "gsplat":
-            from pipeline.fields import rasterize_cuda
+    Raises `InputError` DEP-001 when gsplat is not installed or compiled, or there is no CUDA device for it.
+    """
+    if backend == "tiles":
+        from pipeline.fields.rasterize_tiles import blend_tiles  # numba compiles on import
 
-            return rasterize_cuda.draw(means_world, rotation, log_scale, opacity, values, *camera)
-        case _:
-            assert_never(backend)
+        camera = camera_from_world, intrinsics, height, width
+        footprints = project(means_world, rotation, log_scale, *camera)
+        return blend_tiles(footprints, opacity, values, height, width)
+    where, tiles = "rasterizer gsplat", 'set backend = "tiles"'
+    try:
+        gsplat = importlib.import_module("gsplat")
+    except ImportError as error:
+        remedy = f"pip install gsplat==1.5.3, or {tiles}"
+        raise InputError("DEP-001", "gsplat is not installed", where, remedy) from error
+    if not torch.cuda.is_available():
+        raise InputError("DEP-001", "gsplat needs a CUDA device", where, tiles)
+    if importlib.import_module("gsplat.cuda._backend")._C is None:
+        raise InputError("DEP-001", "gsplat found no compiler (nvcc) for its kernels", where, tiles)
+    image, coverage, _ = gsplat.rasterization(
+        means_world, torch.nn.functional.normalize(rotation, dim=-1), log_scale.exp(), opacity, values,
+        camera_from_world[None], intrinsics[None], width, height, near_plane=NEAREST_M, eps2d=BLUR_PX2,
+    )  # fmt: skip
+    return image[0], coverage[0, ..., 0]

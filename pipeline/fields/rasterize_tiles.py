@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.fields.footprints import ALPHA_MAX, ALPHA_MIN, CUTOFF, NEAREST_M, Footprints
+from pipeline.fields.rasterize import ALPHA_MAX, ALPHA_MIN, CUTOFF, NEAREST_M, Footprints
 
 TILE = 8
 BUFFERS = 4
@@ -175,6 +175,6 @@ def blend_tiles(
     height: int,
     width: int,
 ) -> tuple[Float[Tensor, "height width channel"], Float[Tensor, "height width"]]:
-    """Blend Gaussians near to far, as `pipeline.fields.rasterize.blend_dense` does, in tiles of pixels."""
+    """Blend Gaussians near to far, in tiles of pixels: return blended values and coverage."""
     f = footprints
     return _Blend.apply(f.pixel, f.conic, opacity, values, f.radius_px, f.depth, height, width)

@@ -7,8 +7,8 @@ from types import ModuleType, SimpleNamespace
 import pytest
 import torch
 
-from pipeline.fields import rasterize
-from pipeline.fields.footprints import BLUR_PX2, NEAREST_M
+from pipeline.fields.rasterize import BLUR_PX2, NEAREST_M
+from tests.pipeline.fields import dense_rasterizer
 
 VERSION = "1.5.3"
 REQUIRED = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height")
@@ -37,15 +37,15 @@ def rasterization(*positional, **named) -> tuple[torch.Tensor, torch.Tensor, dic
     assert given.colors.shape[0] == points and given.colors.ndim == 2
     assert (type(given.width), type(given.height)) == (int, int)
     assert (given.near_plane, given.eps2d) == (NEAREST_M, BLUR_PX2), "those of the other rasterizers"
-    image, coverage = rasterize.draw(
+    image, coverage = dense_rasterizer.draw(
         given.means, given.quats, given.scales.log(), given.opacities, given.colors, given.viewmats[0], given.Ks[0],
-        given.height, given.width, "dense",
+        given.height, given.width,
     )  # fmt: skip
     return image[None], coverage[None, ..., None], {}
 
 
 def install(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let `pipeline.fields.rasterize_cuda` find the stand-in and a CUDA device."""
+    """Let `pipeline.fields.rasterize` find the stand-in and a CUDA device."""
     package, backend = ModuleType("gsplat"), ModuleType("gsplat.cuda._backend")
     package.rasterization, backend._C = rasterization, object()
     monkeypatch.setitem(sys.modules, "gsplat", package)

@@ -1,11 +1,13 @@
 """The tile rasterizer agrees with the dense reference in values and gradients, and is deterministic."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
 
 from pipeline.fields import rasterize
+from tests.pipeline.fields import dense_rasterizer
 
 HEIGHT, WIDTH = 20, 27
 INTRINSICS = torch.tensor([[25.0, 0, 13], [0, 25.0, 10], [0, 0, 1]])
@@ -23,10 +25,10 @@ def cloud(points: int = 60):
     return [tensor.requires_grad_() for tensor in (means, rotation, log_scale, opacity, values)]
 
 
-def rendered(backend: str, device: str = "cpu"):
+def rendered(draw=rasterize.draw, device: str = "cpu"):
     parameters = cloud()
     moved = [part.to(device) for part in (*parameters, torch.eye(4), INTRINSICS)]
-    image, coverage = (part.cpu() for part in rasterize.draw(*moved, HEIGHT, WIDTH, backend))
+    image, coverage = (part.cpu() for part in draw(*moved, HEIGHT, WIDTH))
     generator = torch.Generator().manual_seed(2)
     weight = torch.rand(image.shape, generator=generator)
     ((image - weight).square().mean() + (coverage * weight[..., 0]).mean()).backward()
@@ -37,8 +39,10 @@ def rendered(backend: str, device: str = "cpu"):
 def test_rasterizers_agree_with_the_reference(backend):
     if backend == "gsplat":
         pytest.importorskip("gsplat")
-    image, coverage, grads = rendered(backend, "cuda" if backend == "gsplat" else "cpu")
-    reference_image, reference_coverage, reference_grads = rendered("dense")
+    image, coverage, grads = rendered(
+        partial(rasterize.draw, backend=backend), "cuda" if backend == "gsplat" else "cpu"
+    )
+    reference_image, reference_coverage, reference_grads = rendered(dense_rasterizer.draw)
     assert 0.3 < reference_coverage.mean() < 0.99, "the scene must neither be empty nor closed"
     torch.testing.assert_close(image, reference_image, rtol=1e-4, atol=2e-4)
     torch.testing.assert_close(coverage, reference_coverage, rtol=1e-4, atol=2e-4)
@@ -50,7 +54,7 @@ def test_rasterizers_agree_with_the_reference(backend):
 
 
 def test_rendering_is_deterministic():
-    first, second = rendered("tiles"), rendered("tiles")
+    first, second = rendered(), rendered()
     assert torch.equal(first[0], second[0]) and all(
         torch.equal(a, b) for a, b in zip(first[2], second[2], strict=True)
     )

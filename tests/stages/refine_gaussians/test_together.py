@@ -26,7 +26,7 @@ def refined(steps: int) -> tuple[FitRecord, torch.Tensor]:
     torch.manual_seed(0)
     splats = Splats(ball(0.5, 60), ball(0.2, 60), torch.ones(60, 1), torch.eye(4)[None], videos=1)
     deltas, sequence = MotionDeltas(4, 1), session()
-    loss = FrameLoss(splats, deltas, [replace(sequence)], GaussianWeights(), 32, "dense")
+    loss = FrameLoss(splats, deltas, [replace(sequence)], GaussianWeights(), 32, "tiles")
     record = refine.refine(loss, steps, 0, None, 2)
     return record, torch.cat([v.detach().flatten() for m in (splats, deltas) for v in m.parameters()])
 
