@@ -17,7 +17,7 @@ from pipeline.calibration.depth_steps import PARAMETERS, StepFrame, StepProfiles
 from pipeline.calibration.estimation import ParameterFit
 from pipeline.calibration.given import NOTHING, GivenCalibration, described
 from pipeline.geometry import cameras, rigid
-from pipeline.geometry.subsampling import evenly
+from pipeline.geometry.subsampling import evenly, nearest
 from pipeline.mapping.edge_agreement import relative_slopes
 from pipeline.mapping.picture_agreement import beats
 from pipeline.recordings import extraction
@@ -146,7 +146,7 @@ def _changed(recording: Recording, found: DepthEstimate, parts: Sequence[str]) -
 
 def _delayed(recording: Recording, delay_s: float) -> Recording:
     """Take the depth of the frame that was stored ``delay_s`` later; nothing is known where there is none."""
-    rows = _nearest(recording.timestamp_s, recording.timestamp_s + delay_s)
+    rows = nearest(recording.timestamp_s, recording.timestamp_s + delay_s)
     missing = np.abs(recording.timestamp_s[rows] - recording.timestamp_s - delay_s)
     step_s = float(np.median(np.diff(recording.timestamp_s)))
     other = dict(zip(recording.index.tolist(), recording.index[rows].tolist(), strict=True))
@@ -231,13 +231,6 @@ def _scaled(intrinsics: Float[np.ndarray, "3 3"], focal: float) -> Float[np.ndar
     return intrinsics * np.array([[focal, 1, 1], [1, focal, 1], [1, 1, 1]])
 
 
-def _nearest(
-    times: Float[np.ndarray, "frame"], wanted: Float[np.ndarray, "other"]
-) -> Int[np.ndarray, "other"]:
-    """Return the index of the nearest of increasing times."""
-    return np.searchsorted((times[1:] + times[:-1]) / 2, wanted)
-
-
 @dataclass(frozen=True)
 class _Sampled:
     """One frame of a recording, still without depth."""
@@ -274,7 +267,7 @@ def _profiles(recording: Recording, frames: Sequence[_Sampled], camera: DepthEst
     """Return profiles for the depth that belongs to the frames if the camera is right."""
     times, steps = recording.timestamp_s, []
     for frame in frames:
-        other = int(_nearest(times, times[[frame.row]] + camera.delay_s)[0])
+        other = int(nearest(times, times[[frame.row]] + camera.delay_s)[0])
         depth = extraction.known_depth(recording.read_depth(int(recording.index[other])), FARTHEST_M)
         lens = _scaled(frame.steps.depth_intrinsics, camera.focal)
         later_s = float(times[other] - times[frame.row])

@@ -15,6 +15,13 @@ def evenly(count: int, most: int, *, rounded: bool = False) -> Int[np.ndarray, "
     return np.unique((np.round(places) if rounded else places).astype(int))
 
 
+def nearest(
+    times: Float[np.ndarray, "frame"], wanted: Float[np.ndarray, "sample"]
+) -> Int[np.ndarray, "sample"]:
+    """Return the index of the nearest of increasing times."""
+    return np.searchsorted((times[1:] + times[:-1]) / 2, wanted)
+
+
 def sharpest_of_steps(
     step: Int[np.ndarray, "frame"], sharpness: Float[np.ndarray, "frame"]
 ) -> Int[np.ndarray, "chosen"]:

@@ -69,7 +69,14 @@ def bootstrapped(
     *,
     median: bool = False,
 ) -> Interval:
-    """Resample episodes with replacement; return the mean or median with percentiles 2.5 and 97.5."""
+    """Resample episodes with replacement; return the mean or median with percentiles 2.5 and 97.5.
+
+    Values that are not finite are left out; NaN where there are no others.
+    """
+    known = np.isfinite(values)
+    if not known.any():
+        return Interval(np.nan, np.nan, np.nan)
+    values, episode = values[known], np.unique(episode[known], return_inverse=True)[1]
     middle = float(np.median(values) if median else values.mean())
     count = episode.max() + 1
     if count < 2:

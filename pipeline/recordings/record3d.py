@@ -127,8 +127,7 @@ class _Metadata:
 
     def depth_size(self) -> tuple[int, int] | None:
         """Return (height, width) of the depth pictures, if the app wrote it."""
-        written = "dh" in self._table and "dw" in self._table
-        return (self._pixels("dh"), self._pixels("dw")) if written else None
+        return (self._pixels("dh"), self._pixels("dw")) if {"dh", "dw"} <= self._table.keys() else None
 
     def timestamp_s(self, index: Int[np.ndarray, "frame"]) -> Float[np.ndarray, "frame"]:
         """Return seconds since the first frame, NaN where not increasing; old apps wrote only the rate."""
@@ -259,21 +258,17 @@ def _decompress(container: Container, name: str, max_bytes: int) -> bytes:
         if unpacked_bytes(packed) > max_bytes:
             raise errors.wrong_depth(where, f"more than {max_bytes} bytes")
         return lzfse.decompress(packed)
-    except (BrokenBlockError, lzfse.error, MemoryError, ValueError) as error:
+    except (lzfse.error, MemoryError, ValueError) as error:
         raise errors.damaged(where, f"LZFSE: {error}") from error
 
 
-class BrokenBlockError(ValueError):
-    """The stream is truncated or not LZFSE."""
-
-
 def unpacked_bytes(data: bytes) -> int:
-    """Sum the uncompressed sizes in the block headers. Raises BrokenBlockError."""
+    """Sum the uncompressed sizes in the block headers. Raises ValueError for a cut or other stream."""
     at, total = 0, 0
     while data[at : at + 4] != LZFSE_END:
         raw, length = _block(data, at)
         if length < 8:
-            raise BrokenBlockError("empty block")
+            raise ValueError("empty block")
         at, total = at + length, total + raw
     return total
 
@@ -294,5 +289,5 @@ def _block(data: bytes, at: int) -> tuple[int, int]:
                 matches = second >> 2 * LZFSE_FIELD_BITS & 0xFFFFF
                 return raw, (third & 0xFFFFFFFF) + literals + matches
     except struct.error as error:
-        raise BrokenBlockError("cut short") from error
-    raise BrokenBlockError("unknown block" if data[at : at + 4] else "cut short")
+        raise ValueError("cut short") from error
+    raise ValueError("unknown block" if data[at : at + 4] else "cut short")

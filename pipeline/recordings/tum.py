@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.geometry import cameras
+from pipeline.geometry import cameras, subsampling
 from pipeline.recordings import errors, text_files
 from pipeline.recordings.containers import FolderContainer
 from pipeline.recordings.conventions import OPENCV, DepthPicture, check_poses
@@ -45,7 +45,7 @@ def open_recording(path: Path) -> Recording:
     step = float(np.median(np.diff(ticks, prepend=ticks[0])))
     per_second = next((each for each in TIME_UNITS if step <= LONGEST_STEP_S * each), max(TIME_UNITS))
     times = ticks / per_second
-    partner = nearest(times, depth_ticks / per_second, NEAREST_S)
+    partner = partners(times, depth_ticks / per_second)
     paired = np.flatnonzero(partner >= 0)
     pairs = [(color[i][1], depth_files[partner[i]][1]) for i in paired]
     present = np.array([set(pair) <= container.names for pair in pairs], bool)
@@ -86,15 +86,12 @@ def open_recording(path: Path) -> Recording:
     )
 
 
-def nearest(
-    times: Float[np.ndarray, "frame"], others: Float[np.ndarray, "other"], within_s: float
+def partners(
+    times: Float[np.ndarray, "frame"], others: Float[np.ndarray, "other"]
 ) -> Int[np.ndarray, "frame"]:
-    """Return the index of the nearest of `others` (increasing) to each time, -1 beyond ``within_s``."""
-    right = np.clip(np.searchsorted(others, times), 1, max(len(others) - 1, 1))
-    left = np.clip(right - 1, 0, len(others) - 1)
-    right = np.clip(right, 0, len(others) - 1)
-    best = np.where(np.abs(others[left] - times) <= np.abs(others[right] - times), left, right)
-    return np.where(np.abs(others[best] - times) <= within_s, best, -1)
+    """Return the index of the nearest of `others` (increasing) to each time, -1 beyond `NEAREST_S`."""
+    best = subsampling.nearest(others, times)
+    return np.where(np.abs(others[best] - times) <= NEAREST_S, best, -1)
 
 
 def _listed(container: FolderContainer, name: str) -> list[tuple[float, str]]:
@@ -124,7 +121,7 @@ def _poses(
     if len(table) == 0:
         return None
     table = table[np.argsort(table[:, 0], kind="stable")]
-    partner = nearest(times, table[:, 0] / per_second, NEAREST_S)
+    partner = partners(times, table[:, 0] / per_second)
     pose = table[partner][:, [4, 5, 6, 7, 1, 2, 3]]
     pose[partner < 0] = np.nan
     return pose

@@ -125,8 +125,7 @@ def _report(
     config: Config,
 ) -> None:
     def interval(name: str, values: Float[np.ndarray, "window"]) -> Interval:
-        drawn = np.unique(episode[name], return_inverse=True)[1]
-        return bootstrapped(values, drawn, np.random.default_rng(config.seed))
+        return bootstrapped(values, episode[name], np.random.default_rng(config.seed))
 
     for method, of_method in scores.items():
         for name in SCORES:

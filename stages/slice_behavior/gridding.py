@@ -3,22 +3,17 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from pipeline.behavior.trajectories import RATE_HZ, Trajectory
+from pipeline.data.motion import Motion
 from pipeline.geometry import rigid, subsampling
 
 
 @dataclass(frozen=True)
-class ReconstructedMotion:
-    """The reconstructed motion of one recording, as in `reconstruction/<id>/motion.npz`."""
+class ReconstructedMotion(Motion):
+    """The reconstructed motion of one recording, and of those beside its animal."""
 
-    timestamp_s: Float[np.ndarray, "frame"]
-    world_from_camera: Float[np.ndarray, "frame 4 4"]
-    world_from_agent: Float[np.ndarray, "frame 4 4"]
-    agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
-    confidence: Float[np.ndarray, "frame"]
-    agent_visible: Bool[np.ndarray, "frame"]
     companions: Float[np.ndarray, "frame companion 4"] | None = None
     """others beside the observer, as in a `Trajectory`"""
 

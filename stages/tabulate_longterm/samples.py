@@ -15,7 +15,7 @@ from pipeline.core import progress
 from pipeline.geometry import subsampling
 from pipeline.longterm.journeys import LongTermWorld, refine_at_rate
 from pipeline.longterm.short_motions import BodyMotion
-from pipeline.metrics.intervals import bootstrapped, episodes, names_of
+from pipeline.metrics.intervals import bootstrapped, episodes
 from stages.tabulate_longterm.config import Config
 from stages.tabulate_longterm.reading import MotionSource
 
@@ -43,13 +43,8 @@ def figures(
     for column, (name, unit) in enumerate(zip(NAMES, UNITS, strict=True)):
         before, after = both[..., column].T
         for ending, values in (("_before", before), ("", after), ("_more", after - before)):
-            key, known = f"longterm_samples/{name}{ending}_{unit}", np.isfinite(values)
-            groups = np.unique(episode[known], return_inverse=True)[1]
-            if known.any():
-                rng = np.random.default_rng(config.seed)
-                found |= bootstrapped(values[known], groups, rng).as_figures(key)
-            else:
-                found |= dict.fromkeys(names_of(key))
+            interval = bootstrapped(values, episode, np.random.default_rng(config.seed))
+            found |= interval.as_figures(f"longterm_samples/{name}{ending}_{unit}")
     return found
 
 

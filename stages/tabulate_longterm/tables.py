@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.metrics.intervals import aligned, bootstrapped, formatted_interval, names_of
+from pipeline.metrics.intervals import aligned, bootstrapped, formatted_interval
 from stages.tabulate_longterm.scores import MEDIANS, METRICS
 
 TABLE_1 = ("translation", "orientation", "pose", "mpjpe_mm", "mpvpe_mm")
@@ -29,13 +29,9 @@ def figures(
     found: dict[str, float | None] = {}
     for method, values in rows.items():
         for metric, column in zip(METRICS, values.T, strict=True):
-            known, name = np.isfinite(column), f"{prefix}/{method}/{metric}"
-            if not known.any():
-                found |= dict.fromkeys(names_of(name))
-                continue
-            groups = np.unique(episode[: len(column)][known], return_inverse=True)[1]
             rng, middle = np.random.default_rng(seed), metric in MEDIANS
-            found |= bootstrapped(column[known], groups, rng, median=middle).as_figures(name)
+            interval = bootstrapped(column, episode[: len(column)], rng, median=middle)
+            found |= interval.as_figures(f"{prefix}/{method}/{metric}")
     return found
 
 

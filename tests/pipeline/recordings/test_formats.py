@@ -352,7 +352,7 @@ def test_listed_files_that_are_absent_are_named(tmp_path):
 
 def test_streams_are_associated_by_time():
     times = np.array([0.0, 0.1, 0.2, 5.0])
-    assert tum.nearest(times, np.array([0.015, 0.19]), 0.02).tolist() == [0, -1, 1, -1]
+    assert tum.partners(times, np.array([0.015, 0.19])).tolist() == [0, -1, 1, -1]
 
 
 def test_damaged_frames_of_a_video_are_reported(tmp_path):

@@ -143,5 +143,5 @@ def test_lzfse_headers_give_the_decoded_size(size):
 
 
 def test_empty_lzfse_blocks_are_refused():
-    with pytest.raises(record3d.BrokenBlockError):
+    with pytest.raises(ValueError, match="empty block"):
         record3d.unpacked_bytes(b"bvx2" + struct.pack("<I3Q", 0, 0, 0, 0) + bytes(100))
