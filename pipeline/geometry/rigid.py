@@ -7,14 +7,16 @@ Quaternions are wxyz with w >= 0; this file owns that order. Angles are radians,
 import itertools
 
 import numpy as np
-from jaxtyping import Float
-from scipy.ndimage import gaussian_filter1d
+from jaxtyping import Bool, Float
+from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 PARALLEL = 1e-4
 """columns of a 6D rotation with a smaller perpendicular component are parallel"""
 ANY_OTHER = np.array([0.3, 0.2, 0.1])
 """offset added to a permuted direction, so that it is never parallel to the original"""
+CALM_SHARE = 0.2
+"""of a sequence of poses, the calmest frames, whose variance is noise: animals rest, people stand"""
 
 
 def make(
@@ -168,6 +170,38 @@ def smoothed(a_from_b: Float[np.ndarray, "frame 4 4"], sigma_frames: float) -> F
         return a_from_b
     mean = gaussian_filter1d(a_from_b[:, :3], sigma_frames, axis=0, mode="nearest")
     return make(nearest_rotation(mean[:, :, :3]), mean[:, :, 3])
+
+
+def wiener_filter(
+    poses: Float[np.ndarray, "frame *pose 4 4"], known: Bool[np.ndarray, "frame"], window: int
+) -> Float[np.ndarray, "frame *pose 4 4"]:
+    """Filter each sequence of poses, rotation and translation by themselves (Lee 1980).
+
+    A pose is moved to the mean over ``window`` frames, by as much of its deviation as noise explains: all of
+    it where the local variance is that of noise, hardly any in fast motion. Noise is the `CALM_SHARE`
+    quantile of the local variance of ``known`` frames. With fewer of them than the window, poses are returned
+    unchanged.
+    """
+    if known.sum() < window:
+        return poses
+    mean = uniform_filter1d(poses, window, axis=0, mode="nearest")
+    mean[..., :3, :3] = nearest_rotation(mean[..., :3, :3])
+    turned = np.swapaxes(mean[..., :3, :3], -1, -2) @ poses[..., :3, :3]
+    shift = poses[..., :3, 3] - mean[..., :3, 3]
+    turn = _signal(log(make(turned, shift))[..., :3], known, window)
+    moved = exp(np.concatenate([turn, _signal(shift, known, window)], axis=-1))
+    rotation = mean[..., :3, :3] @ moved[..., :3, :3]
+    return make(rotation, mean[..., :3, 3] + moved[..., :3, 3])
+
+
+def _signal(
+    deviation: Float[np.ndarray, "frame *pose 3"], known: Bool[np.ndarray, "frame"], window: int
+) -> Float[np.ndarray, "frame *pose 3"]:
+    """Return the part of deviations that is not noise."""
+    variance = uniform_filter1d(np.square(deviation).sum(-1), window, axis=0, mode="nearest")
+    noise = np.quantile(variance[known], CALM_SHARE, axis=0)
+    share = 1 - noise / np.maximum(variance, np.maximum(noise, np.finfo(float).tiny))
+    return share[..., None] * deviation
 
 
 def nearest_rotation(matrix: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3 3"]:

@@ -1,9 +1,10 @@
 """Multi-view stereo: plane-sweep depth with semi-global matching and a geometric consistency check.
 
 Lengths are in units of the poses. `source_views` picks the pictures to match each one with, `sweep` estimates
-a depth map, `agreement` counts the other views that confirm it.
+a depth map, `agreement` counts the other views that confirm it; `depths` does both for all views.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -11,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numba import njit
 
+from pipeline.core.progress import track
 from pipeline.geometry import cameras, rigid
 from pipeline.mapping.colmap import SparseModel
 
@@ -41,6 +43,20 @@ class SweepView:
     """0..255"""
     intrinsics: Float[np.ndarray, "3 3"]
     world_from_camera: Float[np.ndarray, "4 4"]
+
+    @classmethod
+    def resized(
+        cls,
+        gray: UInt8[np.ndarray, "_ _"],
+        intrinsics: Float[np.ndarray, "3 3"],
+        world_from_camera: Float[np.ndarray, "4 4"],
+        side_px: int,
+    ) -> "SweepView":
+        """Return the view of a picture resized to a longer side of ``side_px``; intrinsics of the picture."""
+        share = side_px / max(gray.shape)
+        size = round(gray.shape[0] * share), round(gray.shape[1] * share)
+        small = cv2.resize(gray, size[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
+        return cls(small, cameras.scale_intrinsics(intrinsics, gray.shape, size), world_from_camera)
 
 
 def source_views(sparse: SparseModel, max_views: int) -> list[Int[np.ndarray, "source"]]:
@@ -73,6 +89,21 @@ def depth_range(sparse: SparseModel, key: int) -> tuple[float, float]:
     z = rigid.apply(rigid.inverse(sparse.model_from_camera[key]), points)[:, 2]
     near, far = np.quantile(z[z > 0], DEPTH_QUANTILES)
     return DEPTH_MARGINS[0] * float(near), DEPTH_MARGINS[1] * float(far)
+
+
+def depths(
+    views: Sequence[SweepView],
+    others: Sequence[Sequence[int] | Int[np.ndarray, "source"]],
+    bounds: Sequence[tuple[float, float]],
+    planes: int,
+) -> list[tuple[Float[np.ndarray, "height width"], UInt8[np.ndarray, "height width"]]]:
+    """Return the depth of every view (0 = unknown) and its `agreement` with the views numbered by others."""
+    swept = []
+    for view, sources, (near, far) in zip(track(views, "plane sweep"), others, bounds, strict=True):
+        seen = [views[other] for other in sources]
+        swept.append(sweep(view, seen, (near, far), planes) if seen else np.zeros_like(view.gray))
+    near = [[(swept[other], views[other]) for other in sources] for sources in others]
+    return [(each, agreement(each, *pair)) for each, *pair in zip(swept, views, near, strict=True)]
 
 
 def sweep(

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipeline.core.progress import track
-from pipeline.geometry import cameras, contact, subsampling
+from pipeline.geometry import contact, subsampling
 from pipeline.mapping import plane_sweep
 from pipeline.mapping.plane_sweep import SweepView
 from stages.estimate_depth import foreground, tracking
@@ -134,18 +134,12 @@ def of_turnaround(shown: Sequence[ColorView], room: MapViews, walk: Sequence[Col
     """Return the depth of frames that circle a resting animal: by multi-view stereo, else from the map."""
     views = [_sweep_view(each) for each in shown]
     others = [_source_frames(number, shown) for number in range(len(shown))]
-    swept = []
-    for number, each in enumerate(track(views, "plane sweep")):
-        near = [views[other] for other in others[number]]
-        reach = NEAREST_M, FARTHEST_SHARE * float(shown[number].view.depth.max(initial=1.0))
-        swept.append(plane_sweep.sweep(each, near, reach, PLANES) if near else np.zeros_like(each.gray))
+    farthest = [FARTHEST_SHARE * float(each.view.depth.max(initial=1.0)) for each in shown]
+    swept = plane_sweep.depths(views, others, [(NEAREST_M, far) for far in farthest], PLANES)
     by_view, found = {id(each.view): each for each in walk}, []
-    for number, target in enumerate(track(shown, "multi-view consistency")):
-        near = [(swept[other], views[other]) for other in others[number]]
-        agree = plane_sweep.agreement(swept[number], views[number], near)
+    for target, both in zip(track(shown, "multi-view consistency"), swept, strict=True):
         size = target.view.gray.shape[::-1]
-        agree = cv2.resize(agree, size, interpolation=cv2.INTER_NEAREST)
-        several = cv2.resize(swept[number], size, interpolation=cv2.INTER_NEAREST)
+        several, agree = (cv2.resize(each, size, interpolation=cv2.INTER_NEAREST) for each in both)
         known = agree >= MIN_AGREEING
         seen = [by_view[id(view)] for view in tracking.walk_views(target.view, room)]
         in_front = cv2.dilate(foreground.foreground(target, seen, []).astype(np.uint8), DILATION) > 0
@@ -158,12 +152,8 @@ def of_turnaround(shown: Sequence[ColorView], room: MapViews, walk: Sequence[Col
 
 
 def _sweep_view(shown: ColorView) -> SweepView:
-    view = shown.view
-    share = min(1.0, SWEPT_PX / max(view.gray.shape))
-    size = round(view.gray.shape[0] * share), round(view.gray.shape[1] * share)
-    gray = cv2.resize(view.gray, size[::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
-    intrinsics = cameras.scale_intrinsics(view.intrinsics, view.gray.shape, size)
-    return SweepView(gray, intrinsics, view.world_from_camera)
+    view, side_px = shown.view, min(SWEPT_PX, max(shown.view.gray.shape))
+    return SweepView.resized(view.gray, view.intrinsics, view.world_from_camera, side_px)
 
 
 def _source_frames(number: int, shown: Sequence[ColorView]) -> list[int]:

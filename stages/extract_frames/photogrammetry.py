@@ -53,9 +53,13 @@ def map_pictures(
     solved = _solved(recording, rows, size, config, workspace)
     sparse = solved.sparse
     pictures = [_undistorted(workspace / "pictures" / f"{row:06d}.jpg", solved) for row in sparse.frame]
-    views = [_view(picture, solved, key, config) for key, picture in enumerate(pictures)]
+    grays = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]
+    views = [
+        SweepView.resized(gray, solved.intrinsics, pose, config.depth_side_px)
+        for gray, pose in zip(grays, sparse.model_from_camera, strict=True)
+    ]
     depth, confidence = _depths(views, sparse, config)
-    unit_m, scale = _unit_m(solved, pictures, views, depth, measured)
+    unit_m, scale = _unit_m(solved, grays, views, depth, measured)
     depth = [np.where(each * unit_m < max_depth_m, each * unit_m, 0).astype(np.float32) for each in depth]
     world_from_camera = sparse.model_from_camera.copy()
     world_from_camera[:, :3, 3] *= unit_m
@@ -137,47 +141,30 @@ def _undistorted(path: Path, solved: Structure) -> UInt8[np.ndarray, "height wid
     return cv2.undistort(images.read_color(path), centered, np.array([solved.radial, 0, 0, 0]))
 
 
-def _view(
-    picture: UInt8[np.ndarray, "height width 3"], solved: Structure, key: int, config: PhotogrammetryConfig
-) -> SweepView:
-    height, width = picture.shape[:2]
-    share = config.depth_side_px / max(height, width)
-    size = (round(height * share), round(width * share))
-    gray = cv2.resize(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), size[::-1], interpolation=cv2.INTER_AREA)
-    intrinsics = cameras.scale_intrinsics(solved.intrinsics, (height, width), size)
-    return SweepView(gray.astype(np.float32), intrinsics, solved.sparse.model_from_camera[key])
-
-
 def _depths(
     views: list[SweepView], sparse: SparseModel, config: PhotogrammetryConfig
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return depth (model units, 0 = unknown) and confidence (0..2) of every view."""
     others = plane_sweep.source_views(sparse, config.depth_sources)
-    swept, depth, confidence = [], [], []
-    for key, view in enumerate(track(views, "depth from pictures")):
-        near, reach = [views[other] for other in others[key]], plane_sweep.depth_range(sparse, key)
-        empty = np.zeros_like(view.gray)
-        swept.append(plane_sweep.sweep(view, near, reach, config.depth_planes) if near else empty)
-    for key, view in enumerate(views):
-        near = [(swept[other], views[other]) for other in others[key]]
-        agree = plane_sweep.agreement(swept[key], view, near)
-        depth.append(np.where(agree >= MIN_AGREEING, swept[key], 0))
+    bounds = [plane_sweep.depth_range(sparse, key) for key in range(len(views))]
+    depth, confidence = [], []
+    for swept, agree in plane_sweep.depths(views, others, bounds, config.depth_planes):
+        depth.append(np.where(agree >= MIN_AGREEING, swept, 0))
         confidence.append(np.clip(agree.astype(int) - MIN_AGREEING + 1, 0, 2).astype(np.uint8))
     return depth, confidence
 
 
 def _unit_m(
     solved: Structure,
-    pictures: list[np.ndarray],
+    grays: list[np.ndarray],
     views: list[SweepView],
     depth: list[np.ndarray],
     measured: Mapping[str, Recording],
 ) -> tuple[float, str]:
     """Return meters per unit of the model, and the id of the recording that gave them, or `relative`."""
-    gray = [cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures]
     mapped = [
         sift.lift(sift.describe(picture, scaling.POINTS), solved.intrinsics, each, view.intrinsics)
-        for picture, view, each in zip(gray, views, depth, strict=True)
+        for picture, view, each in zip(grays, views, depth, strict=True)
         if measured
     ]
     for name, recording in measured.items():

@@ -58,24 +58,19 @@ def fuse_depth(
 
 
 def _fused(volume: Volume, video: RegisteredVideo) -> Volume:
-    """Integrate the frames of one video."""
-    for frame in np.flatnonzero(video.certain_cameras)[::FRAME_STEP].tolist():
-        _integrate(volume, video, frame)
-    return volume
-
-
-def _integrate(volume: Volume, video: RegisteredVideo, frame: int) -> None:
-    """Integrate the depth of one frame, without the agent."""
+    """Integrate the depth of one video's frames, without the agent."""
     clip, masks = video.clip, video.masks
     assert clip is not None, f"{video.id} was read without its pictures"
-    depth = trusted_depth(clip, frame)[0]
-    if masks is not None:
-        mask = masks[frame]
-        agent = near_agent(mask, MASK_MARGIN_PX) if masks.visible[frame] else mask == AGENT
-        ignored = ((mask == UNKNOWN) | agent).astype(np.uint8)
-        depth[cv2.resize(ignored, depth.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0] = 0
-    depth_camera, color_camera = clip.depth_intrinsics[frame], clip.intrinsics[frame]
-    volume.integrate(depth, depth_camera, clip.color(frame), color_camera, video.world_from_camera[frame])
+    for frame in np.flatnonzero(video.certain_cameras)[::FRAME_STEP].tolist():
+        depth = trusted_depth(clip, frame)[0]
+        if masks is not None:
+            mask = masks[frame]
+            agent = near_agent(mask, MASK_MARGIN_PX) if masks.visible[frame] else mask == AGENT
+            ignored = ((mask == UNKNOWN) | agent).astype(np.uint8)
+            depth[cv2.resize(ignored, depth.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0] = 0
+        lenses = clip.depth_intrinsics[frame], clip.intrinsics[frame]
+        volume.integrate(depth, lenses[0], clip.color(frame), lenses[1], video.world_from_camera[frame])
+    return volume
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from pipeline.fields import fields, marching_cubes
 from pipeline.fields.fields import Reconstruction
 from pipeline.geometry import cameras, rigid
 from pipeline.geometry.meshes import Mesh
-from pipeline.geometry.pose_filter import wiener_filter
 from stages.reconstruct.assemble import RegisteredVideo, scene_first
 from stages.reconstruct.body import NEAREST_M
 from stages.reconstruct.problem import Problem
@@ -70,7 +69,7 @@ def motions(
         root, bones = interpolate_gaps(video.timestamp_s, root, bones, observed)
         if video.camera_free and smoothing_s and observed.sum() > 1:
             window = max(1, round(smoothing_s / np.median(np.diff(video.timestamp_s))))
-            root, bones = (wiener_filter(poses, observed, window) for poses in (root, bones))
+            root, bones = (rigid.wiener_filter(poses, observed, window) for poses in (root, bones))
         camera = table.world_from_camera(frame).double().cpu().numpy()
         camera[~np.isfinite(video.world_from_camera).all((1, 2))] = np.nan
         visible, confidence = video.agent_visible & observed, video.confidence

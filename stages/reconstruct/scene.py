@@ -56,10 +56,13 @@ def swap_codes(
     )
 
 
-def world_rays(motion: MotionTable, rays: Rays) -> tuple[Float[Tensor, "ray 3"], Float[Tensor, "ray 3"]]:
-    """Return origins and directions (one meter of depth long) in the world."""
+def world_samples(
+    motion: MotionTable, rays: Rays, depth: Float[Tensor, "ray sample"]
+) -> tuple[Float[Tensor, "ray sample 3"], Float[Tensor, "ray"]]:
+    """Return the points of rays at ``depth`` in the world, and the lengths of rays per meter of depth."""
     pose = motion.world_from_camera(rays.frame)
-    return pose[:, :3, 3], (pose[:, :3, :3] @ rays.direction[..., None])[..., 0]
+    direction = (pose[:, :3, :3] @ rays.direction[..., None])[..., 0]
+    return pose[:, None, :3, 3] + direction[:, None] * depth[..., None], direction.norm(dim=-1)
 
 
 def sample_depths(rays: Rays, reach_m: float, generator: Generator) -> Float[Tensor, "ray sample"]:
@@ -84,9 +87,8 @@ def measured_terms(
     """Return the scene's losses at and before measured depth."""
     field, limit = problem.scene, problem.scene.shape.truncation_m
     assert limit is not None, "untruncated scenes are learned by rendering"
-    origin, direction = world_rays(problem.motion, rays)
     depth = sample_depths(rays, limit, generator)
-    points = origin[:, None] + direction[:, None] * depth[..., None]
+    points, _ = world_samples(problem.motion, rays, depth)
     video, samples = problem.video[rays.frame], depth.shape[1]
     distance = field.distance_at(
         points.view(-1, 3), video.repeat_interleave(samples), code_of.repeat_interleave(samples)
@@ -126,10 +128,9 @@ def rendered_terms(
     depth: Float[Tensor, "ray sample"],
 ) -> Terms:
     """Return the volume rendering losses of rays with samples at ``depth``, meters."""
-    origin, direction = world_rays(problem.motion, rays)
-    points = origin[:, None] + direction[:, None] * depth[..., None]
+    points, length = world_samples(problem.motion, rays, depth)
     scene = scene_layer(problem, points, problem.video[rays.frame], code_of)
-    rendered = composite(depth, direction.norm(dim=-1), scene)
+    rendered = composite(depth, length, scene)
     known = rays.depth > 0
     return {
         "rendered color": (weights.rendered_color, losses.color(rendered.color, rays.color / 255)),
@@ -252,8 +253,7 @@ class SceneLoss:
         terms = measured_terms(problem, rays, code_of, self.weights, generator)
 
         def density_of(index: Tensor, depth: Tensor) -> Tensor:
-            origin, direction = world_rays(problem.motion, others.at(index))
-            points = origin[:, None] + direction[:, None] * depth[..., None]
+            points, _ = world_samples(problem.motion, others.at(index), depth)
             return scene_density(problem, points, problem.video[others.frame[index]], other_code[index])
 
         surface = surface_depths(others, store.farthest_m, density_of, generator)
@@ -268,15 +268,14 @@ class SceneLoss:
         half = self.batches.rendered_samples // 2
         coarse = uniform_depths(rays, problem.store.farthest_m, half, generator)
         spacing_m = problem.store.farthest_m / half
-        origin, direction = world_rays(problem.motion, rays)
         with torch.no_grad():
-            points = origin[:, None] + direction[:, None] * coarse[..., None]
+            points, length = world_samples(problem.motion, rays, coarse)
             density_ = scene_density(problem, points, video, code_of, spacing_m / 2)
-            fine = importance_depths(coarse, direction.norm(dim=-1), density_, generator)
+            fine = importance_depths(coarse, length, density_, generator)
         depth = torch.cat([coarse, fine], dim=1).sort(dim=1).values
         terms = rendered_terms(problem, rays, code_of, self.weights, depth)
         if not field.fused:
             chosen = torch.randint(depth.shape[1], (len(rays), 1), generator=generator).to(depth.device)
-            place = (origin + direction * depth.gather(1, chosen)).detach()
+            place = world_samples(problem.motion, rays, depth.gather(1, chosen))[0][:, 0].detach()
             terms["eikonal"] = self.weights.eikonal, eikonal(field, place, video, code_of)
         return terms

@@ -1,7 +1,6 @@
 import numpy as np
 
 from pipeline.geometry import rigid
-from pipeline.geometry.pose_filter import wiener_filter
 
 FRAMES, WINDOW = 400, 7
 REST = slice(200, FRAMES)
@@ -25,7 +24,7 @@ def error(poses: np.ndarray, truth: np.ndarray, frames: slice) -> tuple[float, f
 
 def test_noise_is_reduced_at_rest_and_gait_is_preserved():
     truth, noisy = gait_and_rest()
-    filtered = wiener_filter(noisy, np.ones(FRAMES, bool), WINDOW)
+    filtered = rigid.wiener_filter(noisy, np.ones(FRAMES, bool), WINDOW)
     before, after = error(noisy, truth, REST), error(filtered, truth, REST)
     assert after[0] < 0.7 * before[0] and after[1] < 0.7 * before[1]
     walking = slice(10, 190)
@@ -36,6 +35,6 @@ def test_noise_is_reduced_at_rest_and_gait_is_preserved():
 
 def test_constant_poses_and_short_sequences_are_unchanged():
     still = np.repeat(rigid.exp(np.array([[0.1, 0.2, 0.3, 1.0, 2.0, 3.0]])), 20, axis=0)
-    np.testing.assert_allclose(wiener_filter(still, np.ones(20, bool), WINDOW), still, atol=1e-9)
+    np.testing.assert_allclose(rigid.wiener_filter(still, np.ones(20, bool), WINDOW), still, atol=1e-9)
     noisy = gait_and_rest()[1][:5]
-    assert wiener_filter(noisy, np.ones(5, bool), WINDOW) is noisy
+    assert rigid.wiener_filter(noisy, np.ones(5, bool), WINDOW) is noisy
