@@ -98,12 +98,14 @@ def depths(
     planes: int,
 ) -> list[tuple[Float[np.ndarray, "height width"], UInt8[np.ndarray, "height width"]]]:
     """Return the depth of every view (0 = unknown) and its `agreement` with the views numbered by others."""
-    swept = []
-    for view, sources, (near, far) in zip(track(views, "plane sweep"), others, bounds, strict=True):
-        seen = [views[other] for other in sources]
-        swept.append(sweep(view, seen, (near, far), planes) if seen else np.zeros_like(view.gray))
-    near = [[(swept[other], views[other]) for other in sources] for sources in others]
-    return [(each, agreement(each, *pair)) for each, *pair in zip(swept, views, near, strict=True)]
+    swept, found = [], []
+    for view, sources, reach in zip(track(views, "plane sweep"), others, bounds, strict=True):
+        near = [views[other] for other in sources]
+        swept.append(sweep(view, near, reach, planes) if near else np.zeros_like(view.gray))
+    for depth, view, sources in zip(swept, views, others, strict=True):
+        near = [(swept[other], views[other]) for other in sources]
+        found.append((depth, agreement(depth, view, near)))
+    return found
 
 
 def sweep(
