@@ -5,7 +5,6 @@ both with a readable one in torch, values and gradients.
 """
 
 import importlib
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -13,30 +12,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.core.errors import InputError
+from pipeline.fields.footprints import BLUR_PX2, CUTOFF, NEAREST_M, Footprints
 from pipeline.geometry import rigid_torch
 
 Backend = Literal["tiles", "gsplat"]
-BLUR_PX2 = 0.3
-"""added to the variance of every footprint, so that none falls between pixels"""
-NEAREST_M = 0.1
-"""Gaussians nearer than this to the camera are not drawn"""
-ALPHA_MIN, ALPHA_MAX = 1 / 255, 0.99
-"""opacities below the first are not drawn, those above the second are held there (Kerbl et al. 2023)"""
-CUTOFF = 3.33
-"""standard deviations at which footprints are cut off: there an opacity of 0.99 has fallen to 1/255"""
 VIEW_MARGIN = 0.15
 """footprints are linearized at most this share of the picture outside its edges, as in 3DGS"""
-
-
-@dataclass(frozen=True)
-class Footprints:
-    """Gaussians projected into one camera."""
-
-    pixel: Float[Tensor, "point 2"]
-    conic: Float[Tensor, "point 3"]
-    """inverse covariance (a, b, c) of a x^2 + 2 b x y + c y^2, 1/pixel^2"""
-    radius_px: Float[Tensor, "point"]
-    depth: Float[Tensor, "point"]
 
 
 def project(

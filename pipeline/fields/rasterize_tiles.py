@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.fields.rasterize import ALPHA_MAX, ALPHA_MIN, CUTOFF, NEAREST_M, Footprints
+from pipeline.fields.footprints import ALPHA_MAX, ALPHA_MIN, CUTOFF, NEAREST_M, Footprints
 
 TILE = 8
 BUFFERS = 4

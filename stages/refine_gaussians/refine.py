@@ -17,8 +17,9 @@ from torch.nn import functional
 from pipeline.core import distributed
 from pipeline.core.training import FitRecord, fit
 from pipeline.data.motion import Motion
+from pipeline.fields.footprints import CUTOFF
 from pipeline.fields.gaussians import Cloud, Splats, concatenate, render
-from pipeline.fields.rasterize import CUTOFF, Backend, in_view
+from pipeline.fields.rasterize import Backend, in_view
 from pipeline.geometry import cameras, rigid_torch
 from stages.refine_gaussians.config import GaussianWeights
 from stages.refine_gaussians.views import DrawnVideo, Target, flow_lattice, read

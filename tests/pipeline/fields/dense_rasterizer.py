@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.fields import rasterize
-from pipeline.fields.rasterize import ALPHA_MAX, ALPHA_MIN, CUTOFF, NEAREST_M, Footprints
+from pipeline.fields.footprints import ALPHA_MAX, ALPHA_MIN, CUTOFF, NEAREST_M, Footprints
 
 
 def draw(means_world, rotation, log_scale, opacity, values, *camera) -> tuple[Tensor, Tensor]:

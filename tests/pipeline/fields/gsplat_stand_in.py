@@ -7,7 +7,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 import torch
 
-from pipeline.fields.rasterize import BLUR_PX2, NEAREST_M
+from pipeline.fields.footprints import BLUR_PX2, NEAREST_M
 from tests.pipeline.fields import dense_rasterizer
 
 VERSION = "1.5.3"
