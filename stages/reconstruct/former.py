@@ -54,12 +54,11 @@ def begin(problem: Problem, videos: Sequence[RegisteredVideo], folder: Path) -> 
     """
     with other_versions_refused("reconstruction", str(folder)):
         loaded = fields.load(folder, str(problem.device))
+    if differences := _differences(problem, loaded):
+        what = f"its fields have other sizes than this recipe's: {differences[0]}"
+        raise InputError("RCN-003", what, str(folder), "take it away to start from nothing")
     former = {video.id: found for video in videos if (found := _former_motion(folder, video)) is not None}
-    try:
-        _load_fields(problem, loaded, scene_ids(videos))
-    except (RuntimeError, AssertionError) as error:
-        what = "its fields have other sizes than this recipe's"
-        raise InputError("RCN-003", what, str(folder), "take it away to start from nothing") from error
+    _load_fields(problem, loaded, scene_ids(videos))
     frames, roots, bones = [], [], []
     for index, video in enumerate(scene_first(videos)):
         if video.id in former:
@@ -90,6 +89,23 @@ def _former_motion(folder: Path, video: RegisteredVideo) -> Motion | None:
     return None
 
 
+def _differences(problem: Problem, loaded: Reconstruction) -> list[str]:
+    """Return what differs in kind or size between the former fields and the problem's."""
+    grids = [isinstance(field.grid, DenseGrid) for field in (loaded.scene, problem.scene)]
+    voxels_m = [field.shape.voxel_m for field in (loaded.scene, problem.scene)]
+    found = [] if all(grids) else ["a scene without a grid is tied to its box"]
+    found += [f"scene voxels of {voxels_m[0]} m, not {voxels_m[1]} m"] if voxels_m[0] != voxels_m[1] else []
+    for name in ("agent", "body", "scene"):
+        before, now = (
+            {key: tuple(value.shape) for key, value in getattr(whole, name).state_dict().items()}
+            for whole in (loaded, problem)
+        )
+        for key in sorted(before.keys() | now.keys()):
+            if before.get(key) != now.get(key) and not (name == "scene" and key.startswith(REBUILT)):
+                found.append(f"{name}.{key} {before.get(key, 'missing')}, not {now.get(key, 'missing')}")
+    return found
+
+
 @torch.no_grad()
 def _load_fields(problem: Problem, loaded: Reconstruction, ids: Sequence[str]) -> None:
     problem.agent.load_state_dict(loaded.agent.state_dict())
@@ -111,9 +127,7 @@ def _load_fields(problem: Problem, loaded: Reconstruction, ids: Sequence[str]) -
 def _resample_grid(scene: Field, former: Field) -> None:
     """Resample the former grids at the nodes of the current ones, whose bounding box may differ."""
     grid, before = scene.grid, former.grid
-    if not (isinstance(grid, DenseGrid) and isinstance(before, DenseGrid)):
-        raise AssertionError("an MLP is tied to its box")
-    assert scene.shape.voxel_m == former.shape.voxel_m, (scene.shape, former.shape)
+    assert isinstance(grid, DenseGrid) and isinstance(before, DenseGrid), (grid, before)
     for level, extent, source, source_extent in zip(
         grid.levels, grid.extents, before.levels, before.extents, strict=True
     ):

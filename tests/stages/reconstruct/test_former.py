@@ -91,7 +91,21 @@ def test_recording_with_other_timestamps_is_added(made):
 def test_fields_of_other_sizes_are_refused(made, tmp_path):
     folder, *_ = made
     found, videos = problem(replace(SHAPES, width=48), films(added()))
-    with pytest.raises(InputError, match="RCN-003"):
+    with pytest.raises(InputError, match=r"RCN-003.*: agent\.\S+ \((\d+, )*32.*, not \((\d+, )*48"):
+        former.begin(found, videos, folder)
+    found, videos = problem(replace(SHAPES, encoding="mlp"), films(added()))
+    with pytest.raises(InputError, match=r"RCN-003.*a scene without a grid"):
         former.begin(found, videos, folder)
     with pytest.raises(InputError, match="ART-007"):
         former.begin(found, videos, tmp_path)
+
+
+def test_other_failures_are_not_taken_for_other_sizes(made, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("out of memory")
+
+    folder, *_ = made
+    found, videos = problem(videos=films(added()))
+    monkeypatch.setattr(former, "_resample_grid", fail)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        former.begin(found, videos, folder)
