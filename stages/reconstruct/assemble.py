@@ -15,10 +15,10 @@ from pipeline.data.clips import Clip, Masks
 from pipeline.data.motion import MotionTable, gaps_s
 from pipeline.fields.fields import ArticulatedBody, Field, FieldShape
 from pipeline.fields.fused_depth import FusedGeometry
+from pipeline.fields.limbs import KinematicTree
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
 from stages.reconstruct.config import FieldSizes
-from stages.reconstruct.limbs import KinematicTree
 from stages.reconstruct.problem import (
     Joints,
     Problem,

@@ -7,11 +7,11 @@ from jaxtyping import Float, Int
 from torch import Generator, Tensor, nn
 from torch.nn import functional
 
+from pipeline.fields.limbs import MultiscaleRotations
 from pipeline.geometry import rigid, rigid_torch
 from stages.reconstruct import losses
 from stages.reconstruct.body import Pose, measured_terms, prior_terms, surface_terms
 from stages.reconstruct.config import LossWeights
-from stages.reconstruct.limbs import MultiscaleRotations
 from stages.reconstruct.problem import Problem, RaysByFrame
 from stages.reconstruct.rays import AGENT
 

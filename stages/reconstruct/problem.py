@@ -12,8 +12,8 @@ from torch import Generator, Tensor, nn
 from pipeline.core.errors import InputError
 from pipeline.data.motion import MotionTable
 from pipeline.fields.fields import ArticulatedBody, Field
+from pipeline.fields.limbs import KinematicTree, joined, shared_skin
 from pipeline.geometry.meshes import Mesh
-from stages.reconstruct.limbs import KinematicTree, joined, shared_skin
 from stages.reconstruct.rays import RayStore
 
 TRUSTED = 0.1

@@ -2,8 +2,8 @@
 
 import torch
 
+from pipeline.fields.limbs import KinematicTree, MultiscaleRotations
 from pipeline.geometry import rigid_torch
-from stages.reconstruct.limbs import KinematicTree, MultiscaleRotations
 
 LENGTH_M = 0.1
 """between bones"""
