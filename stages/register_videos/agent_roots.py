@@ -1,9 +1,11 @@
 """The animal's root pose in every frame: hypotheses by shape and localizer, Viterbi decoding, smoothing.
 
-Depth alone does not distinguish front from back; over time only one of the two walks head first.
+Depth alone does not distinguish front from back; over time only one of the two walks head first. In the
+paper's form the localizer's pose of every frame is its root.
 """
 
 from dataclasses import dataclass
+from typing import assert_never
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -72,10 +74,20 @@ def find_roots(
     def observe(frame: int) -> AgentObservation | None:
         return agent_fit.observe(clip, masks[frame], frame, world_from_camera[frame], model, standing)
 
-    hypotheses = []
-    for frame in track(np.flatnonzero(masks.visible).tolist(), "placing the animal"):
-        if (observation := observe(frame)) is not None:
-            hypotheses.append(_hypotheses(clip, observation, model, localizer, len(hypotheses), config))
+    frames, hypotheses = track(np.flatnonzero(masks.visible).tolist(), "placing the animal"), []
+    observations = (seen for frame in frames if (seen := observe(frame)) is not None)
+    match config.initialization:
+        case "headings":
+            for each in observations:
+                hypotheses.append(_hypotheses(clip, each, model, localizer, len(hypotheses), config))
+        case "localizer":
+            for each in observations:
+                for pose, _ in _localized(clip, each, localizer)[:1]:
+                    poses[each.frame], share[each.frame] = pose, each.share
+                    cost[each.frame] = agent_fit.cost(each, model, pose[None])[0]
+            return Roots(poses, np.isfinite(cost), cost, share)
+        case _:
+            assert_never(config.initialization)
     if not hypotheses:
         return roots
     path = headings.choose_hypotheses(clip.timestamp_s, hypotheses)
@@ -100,16 +112,10 @@ def _hypotheses(
     config: RootConfig,
 ) -> RootHypotheses:
     """Fit from all headings and localizer poses; keep the best with distinct headings."""
-    start, estimates = agent_fit.initial_poses(observation, model, config.headings), []
+    start, localized = agent_fit.initial_poses(observation, model, config.headings), []
     if index % LOCALIZER_EVERY_FRAMES == 0:
-        frame, depth = observation.frame, observation.depth
-        lenses = clip.depth_intrinsics[frame], clip.intrinsics[frame]
-        estimates = localizer.localize(clip.color(frame), depth, *lenses, observation.mask)
-    localized = [
-        upright(observation.world_from_camera @ rigid.inverse(estimate.map_from_camera))
-        for estimate in estimates[:MAX_LOCALIZED]
-    ]
-    start = np.concatenate([start, localized]) if localized else start
+        localized = _localized(clip, observation, localizer)
+    start = np.concatenate([start, *(upright(pose)[None] for pose, _ in localized[:MAX_LOCALIZED])])
     poses = agent_fit.fit_coarse(observation, model, start)
     distinct: list[int] = []
     for candidate in np.argsort(agent_fit.cost(observation, model, poses), kind="stable"):
@@ -121,10 +127,9 @@ def _hypotheses(
     )
     cost = agent_fit.cost(observation, model, poses) / COST_SCALE_M
     bonus = np.zeros(len(poses))
-    for estimate in estimates:
-        world_from_agent = observation.world_from_camera @ rigid.inverse(estimate.map_from_camera)
+    for world_from_agent, probability in localized:
         turn = rigid.wrap(rigid.yaw(poses) - rigid.yaw(world_from_agent))
-        bonus = np.maximum(bonus, estimate.probability * np.exp(-((turn / LOCALIZER_SIGMA_RAD) ** 2)))
+        bonus = np.maximum(bonus, probability * np.exp(-((turn / LOCALIZER_SIGMA_RAD) ** 2)))
     return RootHypotheses(
         frame=observation.frame,
         world_from_agent=poses,
@@ -134,6 +139,16 @@ def _hypotheses(
         center_world=np.median(observation.points_world, axis=0),
         eye_world=observation.world_from_camera[:3, 3],
     )
+
+
+def _localized(
+    clip: Clip, observation: AgentObservation, localizer: Localizer
+) -> list[tuple[Float[np.ndarray, "4 4"], float]]:
+    """Return the localizer's poses ``world_from_agent`` and their probabilities, best first."""
+    frame, camera = observation.frame, observation.world_from_camera
+    lenses = clip.depth_intrinsics[frame], clip.intrinsics[frame]
+    estimates = localizer.localize(clip.color(frame), observation.depth, *lenses, observation.mask)
+    return [(camera @ rigid.inverse(each.map_from_camera), each.probability) for each in estimates]
 
 
 def upright(world_from_agent: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:

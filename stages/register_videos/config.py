@@ -60,6 +60,9 @@ class ConfidenceConfig:
 class RootConfig:
     """How the animal is placed."""
 
+    initialization: Literal["headings", "localizer"] = "headings"
+    """headings: fits from all headings and the localizer's poses, chosen by a Viterbi path, tracked and
+    smoothed; localizer: each frame's best pose by the localizer as it is, as in the paper."""
     headings: int = 12
     """Initial headings in every frame."""
     smooth_s: float = 0.15

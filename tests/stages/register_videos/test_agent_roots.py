@@ -1,16 +1,21 @@
 """Agent roots: fitting from wrong initial headings, NaN gaps, smoothing."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
 
+from pipeline.data.clips import Clip
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
+from pipeline.localization.localizer import PoseHypothesis
 from stages.register_videos import agent_fit
 from stages.register_videos import agent_roots as roots
 from stages.register_videos.agent_tracking import Tracker
+from stages.register_videos.config import RootConfig
+from tests.stages import room_with_animal
 
 UP = np.array([0.0, 1.0, 0.0])
 K = np.array([[236.0, 0, 120], [0, 236.0, 160], [0, 0, 1]])
@@ -133,3 +138,25 @@ def test_partial_views_are_tracked_or_left_without_root():
     off = np.linalg.norm(world_from_agent[:10, :3, 3] - truth[:10, :3, 3], axis=1)
     turn = np.rad2deg(rigid.rotation_angle(world_from_agent[:10, :3, :3], truth[:10, :3, :3]))
     assert off.max() < 0.08 and turn.max() < 30
+
+
+def test_localizer_poses_are_the_roots_as_they_are(tmp_path):
+    """Turned and shifted poses, which fitting would correct; one frame without a pose."""
+    cameras, agents = (poses[:4] for poses in room_with_animal.session())
+    seen = room_with_animal.record(tmp_path / "frames", cameras, agents, cameras).masks
+    masks = type("Masks", (list,), {"visible": seen.any((1, 2))})(255 * seen.astype(np.uint8))
+    predicted = agents @ rigid.exp(np.array([0.2, 0.8, 0.0, 0.1, 0.05, 0.0]))
+    answers = [
+        [PoseHypothesis(rigid.inverse(root) @ camera, 0.5, 0.5, UP[None], UP[None]) for root in roots]
+        for camera, *roots in zip(cameras, predicted, agents, strict=True)
+    ]
+    answers[2] = []
+    localizer = SimpleNamespace(localize=lambda *_: answers.pop(0))
+    standing = agent_fit.StandingSurface(RayCaster(animal()), 0.0)
+    config, rng = RootConfig(initialization="localizer"), np.random.default_rng(0)
+    clip = Clip.open(tmp_path / "frames")
+    found = roots.find_roots(clip, masks, animal(), standing, localizer, cameras, config, rng)
+    assert found.visible.tolist() == [True, True, False, True] and not answers
+    placed = found.world_from_agent[found.visible]
+    np.testing.assert_allclose(placed, predicted[found.visible], atol=1e-9)
+    assert (found.share[found.visible] > 0).all() and np.isfinite(found.cost_m[found.visible]).all()
