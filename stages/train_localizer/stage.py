@@ -13,7 +13,7 @@ from pipeline.core.devices import Device
 from pipeline.core.errors import InputError
 from pipeline.data import ply, qa
 from pipeline.data.clips import Clip
-from pipeline.data.templates import SceneCameras, read_floor
+from pipeline.data.templates import SceneCameras, SkinTable, read_floor
 from pipeline.localization import localizer as localizers
 from stages.train_localizer import pictures, training
 from stages.train_localizer.config import Config
@@ -50,8 +50,9 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") ->
         case "scene":
             views = _scene_views(inputs, config, rng)
         case "agent":
-            mesh = ply.read_ply(_required(inputs.agent_template, "agent_template") / "agent.ply")
-            views = training.agent_views(mesh, config.agent, rng)
+            template = _required(inputs.agent_template, "agent_template")
+            skin = SkinTable.open(template) if config.agent.posture_deg else None
+            views = training.agent_views(ply.read_ply(template / "agent.ply"), config.agent, rng, skin)
     localizer, held_out = training.train(views, config, describer, device, rng)
     if not distributed.leave():
         return None

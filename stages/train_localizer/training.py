@@ -12,6 +12,7 @@ from pipeline.backends.descriptors import Describer
 from pipeline.core.errors import InputError
 from pipeline.core.progress import track
 from pipeline.data.clips import Clip
+from pipeline.data.templates import SkinTable
 from pipeline.geometry import cameras, subsampling
 from pipeline.geometry.meshes import Mesh, RayCaster
 from pipeline.localization import localizer as localizers
@@ -99,15 +100,19 @@ def scene_views(
     return TrainingViews("scene", sampling, pictures, draw, draw_query, config.held_out)
 
 
-def agent_views(mesh: Mesh, config: AgentConfig, rng: np.random.Generator) -> TrainingViews:
-    """Render random views of the canonical agent from all sides."""
-    caster = RayCaster(mesh)
+def agent_views(
+    mesh: Mesh, config: AgentConfig, rng: np.random.Generator, skin: SkinTable | None = None
+) -> TrainingViews:
+    """Render random views of the agent from all sides: at rest, or in random postures if skinned."""
+    at_rest = RayCaster(mesh)
+    pose = None if skin is None else views.postures(mesh, skin, config.posture_deg)
     center = (mesh.vertices.min(0) + mesh.vertices.max(0)).astype(float) / 2
     radius = float(np.linalg.norm(mesh.vertices - center, axis=1).max())
     focal = RENDER_SCALE * AGENT_SAMPLING.focal_px
 
     def draw(rng: np.random.Generator) -> RenderedView:
         camera = views.agent_camera(center, config.distance_m, rng)
+        caster = at_rest if pose is None else RayCaster(pose(rng))
         distance = float(np.linalg.norm(camera[:3, 3] - center))
         size = int(np.clip(VIEW_MARGIN * radius / max(distance - radius, MIN_DISTANCE_M) * focal, *VIEW_PX))
         intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])

@@ -3,6 +3,7 @@
 `scene_camera` and `agent_camera` sample poses, `render` renders an augmented view; all use one generator.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -12,8 +13,11 @@ from jaxtyping import Bool, Float, UInt8
 from kornia.enhance import adjust_gamma
 from kornia.filters import gaussian_blur2d
 
+from pipeline.data.templates import SkinTable
+from pipeline.fields.limbs import KinematicTree
+from pipeline.fields.skinning import SkinnedShape
 from pipeline.geometry import cameras, rigid
-from pipeline.geometry.meshes import RayCaster, area_normals, render_view
+from pipeline.geometry.meshes import Mesh, RayCaster, area_normals, render_view
 from pipeline.mapping.depth_scans import depth_noise
 
 UP = np.array([0.0, 1.0, 0.0])
@@ -86,6 +90,24 @@ def agent_camera(
     return rigid.look_at(eye, center + rng.normal(0, TARGET_SIGMA_M, 3), UP) @ rigid.exp(
         np.array([0, 0, roll, 0, 0, 0])
     )
+
+
+def postures(mesh: Mesh, skin: SkinTable, posture_deg: float) -> Callable[[np.random.Generator], Mesh]:
+    """Return a function that draws the agent's mesh in random postures, its root bone at rest.
+
+    Each bone turns about its joint by a normally distributed rotation vector (degrees per axis), and what
+    hangs on it follows.
+    """
+    rest = torch.from_numpy(skin.agent_from_bone_rest)
+    shape = SkinnedShape(mesh.vertices, skin.weights, skin.agent_from_bone_rest)
+    tree = KinematicTree.of(torch.from_numpy(mesh.vertices), torch.from_numpy(skin.weights), rest)
+
+    def draw(rng: np.random.Generator) -> Mesh:
+        turn = torch.from_numpy(rng.normal(0, np.deg2rad(posture_deg), (1, len(rest), 3))).float()
+        posed = shape.posed((tree.motion(turn)[0] @ rest).numpy())
+        return replace(mesh, vertices=posed.astype(np.float32))
+
+    return draw
 
 
 def render(

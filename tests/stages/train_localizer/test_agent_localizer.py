@@ -6,9 +6,11 @@ import trimesh
 
 from pipeline.backends.descriptors import Describer
 from pipeline.core.errors import InputError
+from pipeline.data.templates import SkinTable
 from pipeline.geometry.meshes import Mesh, RayCaster
-from stages.train_localizer import training
+from stages.train_localizer import training, views
 from stages.train_localizer.config import AgentConfig, Config, SceneConfig
+from tests.pipeline.fields.test_limbs import chain
 from tests.stages.textured_room import MemoryClip, noise_color, textured_room, walk
 
 
@@ -38,3 +40,30 @@ def test_map_that_fills_no_view_is_refused(tmp_path, monkeypatch):
     crumb = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), np.full((3, 3), 9, np.uint8))
     with pytest.raises(InputError, match="MAP-006"):
         training.scene_views(crumb, truth, 0.0, clip, SceneConfig(), np.random.default_rng(0))
+
+
+def test_views_show_postures_with_the_root_bone_at_rest():
+    points, weights, bones = (part.numpy() for part in chain())
+    side = np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]]) * 0.02
+    vertices = (points[:, None] + side).reshape(-1, 3).astype(np.float32)
+    first = np.arange(0, len(vertices) - 3, 3)
+    faces = np.concatenate([first[:, None] + corner for corner in ((0, 1, 3), (1, 2, 4), (2, 0, 5))])
+    mesh = Mesh(vertices, faces.astype(np.int32), noise_color(vertices, 0))
+    skin = SkinTable(np.repeat(weights, 3, axis=0), bones, np.full((5, 3), 0.04, np.float32))
+    still, moved = (
+        np.stack([draw(np.random.default_rng(seed)).vertices for seed in range(60)])
+        for draw in (views.postures(mesh, skin, degrees) for degrees in (0.0, 10.0))
+    )
+    np.testing.assert_allclose(still, np.broadcast_to(vertices, still.shape), atol=1e-6)
+    off = np.linalg.norm(moved - vertices, axis=-1).mean(0)
+    assert off[np.abs(vertices[:, 2]) < 0.03].max() < 0.002, "the root bone carries the agent's frame"
+    lever = np.array([0.27, 0.17, 0.07])  # from the tail's joints to its tip, meters
+    rayleigh_mean = np.deg2rad(10) * np.linalg.norm(lever) * np.sqrt(np.pi / 2)
+    assert abs(off[:3].mean() / rayleigh_mean - 1) < 0.25, "four standard errors of 60 postures"
+    config = AgentConfig(views=3, posture_deg=10.0)
+    at_rest, posed = (
+        training.agent_views(mesh, config, np.random.default_rng(0), each).pictures[0]
+        for each in (None, skin)
+    )
+    np.testing.assert_array_equal(at_rest.map_from_camera, posed.map_from_camera)
+    assert (at_rest.seen != posed.seen).any(), "the same camera shows another posture"
