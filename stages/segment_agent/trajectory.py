@@ -1,9 +1,11 @@
 """Camera trajectory: drift-corrected odometry, or motion from depth and flow without odometry."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 
@@ -13,10 +15,18 @@ from pipeline.geometry import cameras
 from pipeline.geometry.align import ransac_rigid
 from pipeline.mapping.icp import depth_views
 from pipeline.mapping.odometry import align_gravity, chain_alignments, correct_drift
+from stages.segment_agent import free_space, movers
 
 DEPTH_STRIDE = 3
 INLIER_M, ITERATIONS = 0.03, 200
 """RANSAC over flow correspondences: inlier threshold and iterations"""
+MOVING_STRIDE = 4
+"""stride of depth samples that are tested for motion, pixels"""
+OPENING, DILATION = np.ones((2, 2), np.uint8), np.ones((5, 5), np.uint8)
+"""opening and dilation of what moves, samples"""
+
+DepthOf = Callable[[int], Float[np.ndarray, "height width"]]
+"""depth of one frame, meters, 0 where unknown"""
 
 
 @dataclass(frozen=True)
@@ -28,14 +38,20 @@ class CameraPath:
     residual_m: float
 
 
-def estimate_trajectory(clip: Clip, flow: Path, rng: np.random.Generator) -> CameraPath:
-    """Return drift-corrected poses; without odometry, frame-to-frame motion is chained first."""
-    view = depth_views(partial(usable_depth, clip, keep_steps=False), clip.depth_intrinsics, DEPTH_STRIDE)
+def estimate_trajectory(
+    clip: Clip, flow: Path, rng: np.random.Generator, depth_of: DepthOf | None = None
+) -> CameraPath:
+    """Return drift-corrected poses; without odometry, frame-to-frame motion is chained first.
+
+    ``depth_of`` is the depth that is aligned; by default all that is usable.
+    """
+    depth_of = depth_of or partial(usable_depth, clip, keep_steps=False)
+    view = depth_views(depth_of, clip.depth_intrinsics, DEPTH_STRIDE)
     poses = clip.odometry_from_camera
     if poses is None:
         forward = open_flow(flow, 1)
         poses = chain_alignments(
-            view, lambda frame, _: motion_from_flow(clip, frame, forward[frame], rng), len(clip)
+            view, lambda frame, _: motion_from_flow(clip, frame, forward[frame], rng, depth_of), len(clip)
         )
     found = correct_drift(view, clip.timestamp_s, poses)
     level_known = clip.odometry_from_camera is not None and clip.gravity_known
@@ -43,14 +59,41 @@ def estimate_trajectory(clip: Clip, flow: Path, rng: np.random.Generator) -> Cam
     return CameraPath(poses, found.edges, found.residual_m)
 
 
+def estimate_without_movers(clip: Clip, flow: Path, references: int, seed: int) -> CameraPath:
+    """Estimate poses, and again without what moves by the first ones: several animals cover much.
+
+    Once where the device has odometry, which does not depend on what is in view. ``references`` depth
+    pictures vote on what moves.
+    """
+    path = estimate_trajectory(clip, flow, np.random.default_rng(seed))
+    if clip.odometry_from_camera is not None:
+        return path
+    poses = path.world_from_camera
+    voting = free_space.gather(clip, poses, references)
+
+    @lru_cache(maxsize=2)
+    def static_depth(frame: int) -> Float[np.ndarray, "height width"]:
+        depth = usable_depth(clip, frame, keep_steps=False)
+        points = free_space.world_points(clip, frame, poses[frame], depth, MOVING_STRIDE)
+        moving = movers.moving(free_space.vote(voting, points, frame)).astype(np.uint8)
+        near = cv2.dilate(cv2.erode(moving, OPENING), DILATION)
+        return np.where(cv2.resize(near, depth.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0, 0, depth)
+
+    return estimate_trajectory(clip, flow, np.random.default_rng(seed), static_depth)
+
+
 def motion_from_flow(
-    clip: Clip, frame: int, flow: Float[np.ndarray, "height width 2"], rng: np.random.Generator
+    clip: Clip,
+    frame: int,
+    flow: Float[np.ndarray, "height width 2"],
+    rng: np.random.Generator,
+    depth_of: DepthOf,
 ) -> Float[np.ndarray, "4 4"]:
     """Return ``first_from_second`` of a frame and the next, by RANSAC on flow and depth."""
     height, width = flow.shape[:2]
     pixel = cameras.pixel_grid(height, width) * STRIDE_PX
     first, second = (
-        back_project_pixels(clip, row, at.reshape(-1, 2), usable_depth(clip, row, keep_steps=False))
+        back_project_pixels(clip, row, at.reshape(-1, 2), depth_of(row))
         for row, at in ((frame, pixel), (frame + 1, pixel + flow))
     )
     known = np.isfinite(first[:, 0]) & np.isfinite(second[:, 0])
