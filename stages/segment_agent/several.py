@@ -22,7 +22,7 @@ from stages.segment_agent.config import Config
 from stages.segment_agent.evidence import ROOM, Evidence, EvidenceOf, motion_evidence
 from stages.segment_agent.free_space import References
 from stages.segment_agent.identity import Identities, Portrait
-from stages.segment_agent.locate import AppearanceOf, find_mover
+from stages.segment_agent.locate import AppearanceOf, find_mover, recognized_bodies
 from stages.segment_agent.masks import Segmentation
 from stages.segment_agent.segmenter import Mask, Segmenter, with_color_histogram
 from stages.segment_agent.trajectory import estimate_without_movers
@@ -30,8 +30,8 @@ from stages.segment_agent.windows import Sphere, Window, tracked, working_pictur
 
 QUANTIZATION = 127 / identity.MAX_LOG_ODDS
 """8-bit levels per unit of stored log-odds"""
-MIN_FRAMES, MIN_PROBABILITY = 5, 0.75
-"""tracked frames, and mean probability of its pixels, required for an animal to be present"""
+MIN_FRAMES = 5
+"""frames in which a whole body must clearly show an animal for it to be present"""
 OTHER_LOG_ODDS = -1.0
 """log-odds below which a pixel without evidence of an animal belongs to another one"""
 PORTRAITS_SHARE = 0.25
@@ -122,14 +122,14 @@ def find_all(
     evidence_of = motion_evidence(references)
     segmenters, known = [], []
     portrait_count = round(PORTRAITS_SHARE * config.learning.examples)
+    margins = [scores.of(animal) for animal in animals]
+    present = recognized_bodies(clip, poses, references, config.animal, margins) >= MIN_FRAMES
     for animal in animals:
-        margin_of = scores.of(animal)
-        spheres = find_mover(clip, poses, references, config.animal, None, margin_of=margin_of)
+        spheres: list[Sphere | None] = [None] * len(clip)
+        if present[animal]:
+            spheres = find_mover(clip, poses, references, config.animal, None, margin_of=margins[animal])
         own = identity_evidence(evidence_of, scores.against_others(animal))
-        segmenter = with_color_histogram(Segmenter(clip, poses, spheres, own, config.height_px))
-        if not _is_present(segmenter, margin_of):
-            segmenter = replace(segmenter, spheres=[None] * len(clip))
-        segmenters.append(segmenter)
+        segmenters.append(with_color_histogram(Segmenter(clip, poses, spheres, own, config.height_px)))
         examples = examples_of(portraits, animal, portrait_count)
         known.append(masks.KnownAppearance(examples, scores.recognized(animal)))
     found, networks = segmenters.copy(), [None for _ in animals]
@@ -200,16 +200,3 @@ def resolve_overlaps(segmenters: list[Segmenter], scores: IdentityScores, own: i
         labels[lost | ((other.labels > 0) & (labels != 255))] = 128
     visible = own_mask.visible and bool((labels == 255).any())
     return replace(own_mask, labels=labels, visible=visible)
-
-
-def _is_present(segmenter: Segmenter, margin_of: AppearanceOf) -> bool:
-    """Return whether the track shows this animal, by the mean probability of its pixels."""
-    seen = np.flatnonzero(tracked(segmenter.spheres)).tolist()
-    if len(seen) < MIN_FRAMES:
-        return False
-    shares = []
-    for frame in seen[:: max(1, len(seen) // masks.PROBES)]:
-        inside = segmenter.working_mask(frame).labels == 255
-        if inside.any():
-            shares.append(float((1 / (1 + np.exp(-margin_of(frame)[inside]))).mean()))
-    return bool(shares) and float(np.mean(shares)) > MIN_PROBABILITY

@@ -12,9 +12,9 @@ import pytest
 from pipeline.core.errors import InputError
 from pipeline.core.videos import Video
 from pipeline.data.clips import Clip, Masks, usable_depth
-from stages.segment_agent import identity, masks, several, stage, trajectory
+from stages.segment_agent import free_space, identity, locate, masks, several, stage, trajectory
 from stages.segment_agent.appearance import Example
-from stages.segment_agent.config import Config, LearningConfig
+from stages.segment_agent.config import AnimalConfig, Config, LearningConfig
 from stages.segment_agent.identities import config as identities_config
 from stages.segment_agent.identities import stage as identities
 from stages.segment_agent.windows import Sphere
@@ -130,6 +130,39 @@ def test_touching_bodies_are_separated_and_a_patch_does_not_split_one():
     own, probability = identity.select_animal(moving, patch)
     assert own[moving].all()
     assert (probability[moving] > 0.9).all()
+
+
+def test_bodies_that_touch_in_the_picture_are_split_at_depth_steps():
+    moving = np.zeros((40, 60), bool)
+    moving[10:30, 10:50] = True
+    slope = np.linspace(1.0, 1.4, 60, dtype=np.float32) * np.ones((40, 1), np.float32)
+    (whole,) = locate.split_bodies(moving, slope)
+    assert whole.sum() == moving.sum()
+    first, second = locate.split_bodies(moving, np.where(np.arange(60) < 30, slope, slope + 0.2))
+    assert (
+        first[:, :28].any() and not first[:, 30:].any() and second[:, 32:].any() and not second[:, :30].any()
+    )
+
+
+def test_animal_is_present_where_whole_bodies_show_it_not_where_parts_do(monkeypatch):
+    moving = np.zeros((40, 60), bool)
+    moving[10:30, 10:50] = True
+    grid = np.stack([*np.mgrid[0:40, 0:60] / 100, np.ones((40, 60))], axis=-1)
+    monkeypatch.setattr(free_space, "interior_depth", lambda *_: np.ones((40, 60), np.float32))
+    monkeypatch.setattr(
+        free_space, "sample", lambda *_: (grid, np.full((40, 60), 1e-4), (slice(None), slice(None)))
+    )
+    monkeypatch.setattr(free_space, "vote", lambda *_: None)
+    monkeypatch.setattr(locate, "opened_motion", lambda *_: moving)
+    part = np.where(np.arange(60) < 20, 6.0, -6.0) * np.ones((40, 1))
+    scores = (np.where(np.arange(60) < 20, -6.0, 6.0) * np.ones((40, 1)), part)
+    clip, poses = SimpleNamespace(depth_size=(40, 60)), np.repeat(np.eye(4)[None], 7, axis=0)
+    margins = [lambda _, score=score: score for score in scores]
+    assert locate.recognized_bodies(clip, poses, None, AnimalConfig(), margins).tolist() == [7, 0]
+    assert locate.recognized_bodies(clip, poses, None, AnimalConfig(largest_m=0.3), margins).tolist() == [
+        0,
+        0,
+    ]
 
 
 @pytest.fixture(scope="module")
