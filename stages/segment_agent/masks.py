@@ -7,7 +7,7 @@ from typing import Literal, assert_never
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip, usable_depth
@@ -40,6 +40,8 @@ STATIC_STRIDE = 3
 """stride of depth samples that test a frame without a track for motion, pixels"""
 PROBES = 12
 """number of frames for checks for which a few suffice"""
+ROOM_QUANTILE = 0.95
+"""quantile of the room's log-odds that an animal near its track has to exceed to be recognized"""
 DILATION = np.ones((5, 5), np.uint8)
 """dilation of what looks like the animal or moves, pixels or samples"""
 
@@ -179,12 +181,12 @@ def learn_appearance(
     if not len(seen):
         return None
     chosen = seen[subsampling.evenly(len(seen), config.learning.examples, rounded=True)]
-    shown = []
+    shown, credible = [], 0.0 if known is None else _credible_log_odds(segmenter, chosen, known.recognized)
     for frame in chosen.tolist():
         labels = segmenter.working_mask(frame).labels
         if known is not None:
             sought = _window(segmenter, frame, labels.shape)
-            unsure = (labels == 0) & sought & (known.recognized(frame) > 0)
+            unsure = (labels == 0) & sought & (known.recognized(frame) > credible)
             labels = np.where(unsure, np.uint8(128), labels)
         shown.append(Example(segmenter.working_picture(frame), labels))
     room = [
@@ -198,6 +200,17 @@ def learn_appearance(
     probes = [each for each in shown[:: max(1, len(shown) // PROBES)] if (each.labels == 255).any()]
     recall = [(network.log_odds(each.color)[each.labels == 255] > 0).mean() for each in probes]
     return network if recall and float(np.mean(recall)) > MIN_RECALL else None
+
+
+def _credible_log_odds(
+    segmenter: Segmenter, seen: Int[np.ndarray, "frame"], recognized: AppearanceOf
+) -> float:
+    """Return the log-odds, at least 0, that the room rarely exceeds far from the animal's track."""
+    far = [np.zeros(1, np.float32)]
+    for frame in seen[subsampling.evenly(len(seen), PROBES)].tolist():
+        log_odds = recognized(frame)
+        far.append(log_odds[~_window(segmenter, frame, log_odds.shape)])
+    return max(0.0, float(np.quantile(np.concatenate(far), ROOM_QUANTILE)))
 
 
 def _label_room(

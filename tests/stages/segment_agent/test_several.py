@@ -91,7 +91,7 @@ def test_other_animals_in_a_turnaround_are_not_learned_as_background(monkeypatch
     given = []
     monkeypatch.setattr(masks, "learn", lambda examples, *_, **__: given.extend(examples))
     recognized = np.full((60, 80), -1.0)
-    recognized[25:60, 20:60] = 1.0
+    recognized[25:52, 20:52] = 1.0
     elsewhere = Example(np.zeros((9, 9, 3), np.uint8), np.full((9, 9), 255, np.uint8))
     known = masks.KnownAppearance([elsewhere], lambda frame: recognized)
     masks.learn_appearance(segmenter, None, OPTIONS, np.random.default_rng(0), known)
@@ -99,7 +99,10 @@ def test_other_animals_in_a_turnaround_are_not_learned_as_background(monkeypatch
     found = given[0].labels
     assert (found[20:30, 20:30] == 255).all(), "the animal"
     assert (found[30:50, 20:50] == 128).all(), "it may have rested there"
-    assert (found[50:, 20:60] == 0).all() and (found[25:50, 50:60] == 0).all(), "too far from its track"
+    assert (found[50:, 20:52] == 0).all() and (found[25:50, 50:52] == 0).all(), "too far from its track"
+    recognized[:, 50:] = 1.0
+    masks.learn_appearance(segmenter, None, OPTIONS, np.random.default_rng(0), known)
+    assert (given[-2].labels[labels == 0] == 0).all(), "the rest of the room is recognized, too"
 
 
 def test_appearances_are_distinguished_and_saved(network, turnarounds):
