@@ -33,6 +33,7 @@ PACKAGES = (
     "calibration",
     "workflow",
     "backends",
+    "segmentation",
     "localization",
     "fields",
     "behavior",

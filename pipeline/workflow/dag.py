@@ -54,6 +54,10 @@ class Need:
     """In a home of several animals `part` has a subfolder per animal, of which the animal's own is read."""
     others: bool = False
     """That of every other animal (all animals if the node is shared), given as the folder of all animals."""
+    readers: tuple[Role, ...] | None = None
+    """Roles of the recordings whose jobs read it; None: all."""
+    alone: bool = False
+    """Read only in homes of one animal."""
     homes: Literal["any", "own", "other"] = "any"
     """If the table names `homes`, other builds of the animal: its own artifact, or theirs in `build/`."""
 
@@ -143,9 +147,6 @@ FLOW: tuple[Node, ...] = (
     Node("scene_localizer", "train_localizer",
          ("feature_basis", "scene_template", *merging("frames", roles=("walkthrough",))),
          fixed={"target": "scene"}, gpu=1, distributed=True),
-    Node("estimated_frames", "estimate_depth",
-         ("pictures", Need("frames", roles=("walkthrough",)), "scene_template"),
-         roles=AGENT, mapped=True, stands_in_for="frames", seconds_per_frame=0.5),
     Node("flow", "estimate_flow", ("frames",), roles=AGENT, seconds_per_frame=0.06),
     Node("identities", "segment_agent.identities", merging("frames", "flow", roles=("turnaround",)),
          of_several=True, seconds_per_frame=0.1),
@@ -154,6 +155,11 @@ FLOW: tuple[Node, ...] = (
          seconds_per_frame=0.3),
     Node("masks", "segment_agent", ("frames", "flow", "home_masks"),
          roles=AGENT, sidecars=("prompt",), begins_animal=True, seconds_per_frame=0.11),
+    Node("estimated_frames", "estimate_depth",
+         ("pictures", Need("frames", roles=("walkthrough",)), "scene_template",
+          *(Need(name, roles=("turnaround",), option=option, readers=("session",), alone=True)
+            for name, option in (("frames", "turnaround"), ("masks", "portraits")))),
+         roles=AGENT, mapped=True, stands_in_for="frames", seconds_per_frame=0.5),
     Node("agent_template", "build_agent_template",
          merging("frames", "masks", "features", roles=("turnaround",))),
     Node("agent_localizer", "train_localizer", ("feature_basis", "agent_template"),

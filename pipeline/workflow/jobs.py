@@ -139,7 +139,7 @@ def of_animal() -> frozenset[str]:
     """Return the artifacts made per animal in a home of several: the first such node and all downstream."""
     found: set[str] = set()
     for node in dag.FLOW:
-        needs = [need.artifact for need in dag.needs_of(node) if not need.others]
+        needs = [need.artifact for need in dag.needs_of(node) if not (need.others or need.alone)]
         if node.begins_animal or not found.isdisjoint(needs):
             found.add(node.artifact)
     return frozenset(found)
@@ -302,6 +302,8 @@ def _read_by(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[I
     deciding = [video.id] if video else []
     for need in dag.needs_of(node, plan.flow):
         if (dag.NODES[need.artifact].of_several or need.others) and not plan.others:
+            continue
+        if (need.alone and plan.others) or (video and need.readers and video.role not in need.readers):
             continue
         if need.homes != "any" and not plan.tables[node.artifact].get(HOMES):
             continue

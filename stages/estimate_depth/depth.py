@@ -39,6 +39,8 @@ ROUNDS, MIN_PIXELS, DEPTH_RANGE_M = 8, 50, (0.1, 20.0)
 """Alignment of a network's depth: iterations of reweighted least squares, least map pixels, range of depth in
 meters."""
 
+AnimalOf = Callable[[ColorView, Bool[np.ndarray, "height width"]], Bool[np.ndarray, "height width"]]
+"""The animal in a frame, given its foreground."""
 DepthNet = Callable[[int, Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]], np.ndarray]
 """Depth of one frame by a network, meters, given the map's depth and where it is valid."""
 
@@ -71,10 +73,12 @@ def of_session(
     walk: Sequence[ColorView],
     length_m: float,
     depth_net: DepthNet | None,
+    animal_of: AnimalOf | None = None,
 ) -> list[FrameDepth | None]:
     """Return the depth of a session's frames: from the map for the room, inferred for the animal.
 
-    None for frames that differ too much from the map.
+    The animal is what ``animal_of`` finds, by default all foreground. None for frames that differ too much
+    from the map.
     """
     by_view = {id(each.view): each for each in walk}
     times = subsampling.evenly(len(shown), foreground.OTHER_TIMES)
@@ -83,7 +87,9 @@ def of_session(
         distant = times[np.abs(timestamp_s[times] - timestamp_s[frame]) > foreground.MIN_GAP_S]
         seen = [by_view[id(view)] for view in tracking.walk_views(target.view, room)]
         in_front = foreground.foreground(target, seen, [shown[other] for other in distant])
-        blobs = None if in_front.mean() > MAX_FOREGROUND else _blobs(in_front)
+        blobs = None
+        if in_front.mean() <= MAX_FOREGROUND:
+            blobs = _blobs(in_front if animal_of is None else animal_of(target, in_front))
         camera = target.view.intrinsics, target.view.world_from_camera
         masks.append(blobs)
         contacts.append([contact.find(blob, *camera, room.caster) for blob in blobs or ()])

@@ -33,17 +33,19 @@ OPENING, CLOSING = np.ones((3, 3), np.uint8), np.ones((7, 7), np.uint8)
 
 @dataclass(frozen=True)
 class ColorView:
-    """A view with its colors (CIE Lab), blurred against misalignment."""
+    """A view with its colors."""
 
     view: View
+    color: UInt8[np.ndarray, "height width 3"]
     lab: Float[np.ndarray, "height width 3"]
+    """CIE Lab, blurred against misalignment."""
 
 
 def color_view(color: UInt8[np.ndarray, "height width 3"], view: View) -> ColorView:
     """Add colors to a view."""
     small = cv2.resize(color, view.gray.shape[::-1], interpolation=cv2.INTER_AREA)
     lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32)
-    return ColorView(view, cv2.GaussianBlur(lab, (3, 3), SOFTNESS_PX))
+    return ColorView(view, small, cv2.GaussianBlur(lab, (3, 3), SOFTNESS_PX))
 
 
 def difference(

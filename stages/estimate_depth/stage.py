@@ -14,12 +14,12 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import log, track
 from pipeline.core.videos import Video, role_of_animal
 from pipeline.data import ply
-from pipeline.data.clips import Clip, Pictures
+from pipeline.data.clips import Clip, Masks, Pictures
 from pipeline.data.templates import SceneCameras
 from pipeline.geometry import cameras
 from pipeline.geometry.meshes import RayCaster
 from pipeline.mapping.sift import Keypoints
-from stages.estimate_depth import depth, foreground, landmarks, lens, tracking, views, writing
+from stages.estimate_depth import depth, foreground, landmarks, lens, recognition, tracking, views, writing
 from stages.estimate_depth.config import Config
 from stages.estimate_depth.foreground import ColorView
 from stages.estimate_depth.lens import Lens
@@ -39,6 +39,10 @@ class Inputs:
     """The walk-through of the map, by recording id."""
     scene_template: Path
     """The map."""
+    turnaround: Mapping[str, Path] | None = None
+    """For a session, the frames of the animal's turnaround."""
+    portraits: Mapping[str, Path] | None = None
+    """Their masks; with both, the animal is recognized instead of any foreground."""
 
 
 def run(
@@ -72,7 +76,8 @@ def run(
         case "session":
             time_s = pictures.timestamp_s[placed]
             depth_net = None if network is None else _depth_net(network, pictures, placed, found)
-            depths = depth.of_session(shown, time_s, room, walk_views, config.length_m, depth_net)
+            nets = depth_net, _animal_of(inputs, walk, config.seed)
+            depths = depth.of_session(shown, time_s, room, walk_views, config.length_m, *nets)
         case role:
             assert_never(role)
     chosen = [number for number, each in enumerate(depths) if each is not None]
@@ -111,6 +116,19 @@ def _placed(
     footage = TrackingInput(pictures.timestamp_s, gray, small, found.resized(gray[0].shape))
     tracked = tracking.place(footage, located, room, config.seed)
     return Lens(tracked.lens.focal_px / scale, found.radial, pictures.color_size), tracked
+
+
+def _animal_of(inputs: Inputs, walk: Clip, seed: int) -> depth.AnimalOf | None:
+    """Learn the turnaround's animal against the room of the walk-through; None without a turnaround."""
+    portraits = []
+    for id, folder in (inputs.turnaround or {}).items():
+        masks = Masks.open((inputs.portraits or {})[id])
+        portraits += recognition.portraits_of(Clip.open(folder), masks)
+    if not portraits:
+        return None
+    rng = np.random.default_rng(seed)
+    network = recognition.learn(portraits, recognition.rooms_of(walk), rng)
+    return lambda target, in_front: recognition.recognize(network, target, in_front, rng)
 
 
 def _depth_net(

@@ -40,10 +40,15 @@ class View:
     """Of the surface, meters; 0 where there is none."""
 
 
+def small_size(size: tuple[int, ...]) -> tuple[int, int]:
+    """Return the (height, width) of small pictures of a recording."""
+    scale = min(1.0, SHORTER_PX / min(size[:2]))
+    return round(size[0] * scale), round(size[1] * scale)
+
+
 def small_gray(color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "small_height small_width"]:
     """Reduce a picture and equalise its contrast."""
-    scale = min(1.0, SHORTER_PX / min(color.shape[:2]))
-    size = round(color.shape[0] * scale), round(color.shape[1] * scale)
+    size = small_size(color.shape)
     gray = cv2.resize(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), size[::-1], interpolation=cv2.INTER_AREA)
     return cv2.createCLAHE(CLAHE_CLIP, CLAHE_TILES).apply(gray)
 

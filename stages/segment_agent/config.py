@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from pipeline.segmentation.config import LearningConfig
+
 
 @dataclass(frozen=True)
 class FoundationConfig:
@@ -16,20 +18,6 @@ class FoundationConfig:
     """Text prompt for the detector."""
     threshold: float = 0.3
     """Minimum detection score, 0..1."""
-
-
-@dataclass(frozen=True)
-class LearningConfig:
-    """Training of the appearance network on the first masks of the same recording."""
-
-    examples: int = 150
-    """Number of training frames that show the animal."""
-    steps: int = 300
-    """Training steps."""
-    batch: int = 6
-    """Crops per step."""
-    crop_px: int = 144
-    """Side of a crop at working resolution, pixels."""
 
 
 @dataclass(frozen=True)

@@ -8,27 +8,21 @@ from collections.abc import Iterator
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
 
-from stages.segment_agent.config import LearningConfig
-from stages.segment_agent.footage import MOVING, STILL, Footage, Region, dilated
+from pipeline.segmentation.config import LearningConfig
+from pipeline.segmentation.grabcut import grabcut, sharpened
+from stages.segment_agent.footage import MOVING, STILL, Footage
 from stages.segment_agent.prompts import Prompt
 from stages.segment_agent.propagation import CERTAIN, MAX_LOG_ODDS, LogOdds, propagate
 from stages.segment_agent.segmenter import Mask
 
 HEIGHT_PX = 240
 """picture height for propagation: flow is no finer"""
-ITERATIONS, MODEL_SIZE = 8, 65
-"""iterations of GrabCut; size of its models: five Gaussians with weight, mean and covariance"""
-BAND, SHARPENING = 0.05, 2
-"""half width of the band in which outlines are decided again, in roots of the area; iterations of GrabCut"""
 CLICK_REACH = 0.2
 """half size of the box around a click, as a share of the picture's height"""
 MOTION_GAPS, MIN_MOVING = (4, 8), 0.15
 """frame gaps over which motion is measured in the prompted frame, and share of the box that must move for it
 to be used"""
-Color = UInt8[np.ndarray, "height width 3"]
-Trimap = UInt8[np.ndarray, "height width"]
 
 
 def follow(
@@ -43,17 +37,6 @@ def follow(
         sharp = sharpened(footage.color(frame), inside, rng).astype(np.float32)
         inside = cv2.resize(sharp, footage.clip.color_size[::-1], interpolation=cv2.INTER_LINEAR) > 1 / 2
         yield Mask(np.where(inside, 255, 0).astype(np.uint8), bool(inside.any()), np.nan)
-
-
-def sharpened(color: Color, inside: Region, rng: np.random.Generator) -> Region:
-    """Let GrabCut decide again near the outline of a mask: colors are finer than flow."""
-    reach_px = max(1, round(BAND * float(np.sqrt(inside.sum()))))
-    core, far = ~dilated(~inside, reach_px), ~dilated(inside, reach_px)
-    if not (core.any() and far.any()):
-        return inside
-    probable = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD)
-    trimap = np.where(core, cv2.GC_FGD, np.where(far, cv2.GC_BGD, probable)).astype(np.uint8)
-    return grabcut(color, trimap, rng, SHARPENING)
 
 
 def segment_prompt(footage: Footage, prompt: Prompt, rng: np.random.Generator) -> LogOdds:
@@ -74,11 +57,3 @@ def segment_prompt(footage: Footage, prompt: Prompt, rng: np.random.Generator) -
     inside = inside if inside.any() else in_box
     log_odds = np.where(in_box, -(CERTAIN + MAX_LOG_ODDS) / 2, -MAX_LOG_ODDS)
     return np.where(inside, MAX_LOG_ODDS, log_odds).astype(np.float32)
-
-
-def grabcut(color: Color, trimap: Trimap, rng: np.random.Generator, iterations: int = ITERATIONS) -> Region:
-    """Segment a picture by GrabCut (Rother et al. 2004); ``trimap`` has OpenCV's four labels."""
-    cv2.setRNGSeed(int(rng.integers(2**31 - 1)))
-    models, by_mask = np.zeros((2, 1, MODEL_SIZE)), cv2.GC_INIT_WITH_MASK
-    found = cv2.grabCut(color, trimap.copy(), (0, 0, 0, 0), models[0], models[1], iterations, by_mask)[0]
-    return (found == cv2.GC_FGD) | (found == cv2.GC_PR_FGD)

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 
 from pipeline.data.clips import Clip
 from pipeline.data.flow import GAPS, open_confidence, open_flow
+from pipeline.segmentation.grabcut import Region, dilated
 from stages.segment_agent.windows import working_picture, working_size
 
 SPARSE_PX, INLIER_PX, MIN_CONFIDENCE = 8, 2.0, 0.3
@@ -23,7 +24,6 @@ MIN_TYPICAL_PX = 0.5
 """least median residual used for normalization: noise of the flow"""
 SHOWN_GAPS, SHOWN_LOG = (1, 4), 60.0
 """frame gaps of the motion channels; 8-bit levels per log(1 + residual), saturating at a residual of 70"""
-Region = Bool[np.ndarray, "height width"]
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,3 @@ class Footage:
 def pixel_indices(size: tuple[int, int]) -> Float[np.ndarray, "height width 2"]:
     """Return the index (x, y) of each pixel of a picture of (height, width)."""
     return np.stack(np.meshgrid(*(np.arange(side, dtype=np.float32) for side in size[::-1])), -1)
-
-
-def dilated(mask: Region, by_px: int) -> Region:
-    """Dilate a mask by a disc."""
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by_px + 1, 2 * by_px + 1))
-    return cv2.dilate(mask.astype(np.uint8), disc) > 0

@@ -19,8 +19,8 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from pipeline.data import npz
-from stages.segment_agent import appearance
-from stages.segment_agent.appearance import Appearance, Example, normalized, to_batch
+from pipeline.segmentation import appearance
+from pipeline.segmentation.appearance import Appearance, Example, normalized, to_batch
 from stages.segment_agent.identities.config import Config
 
 FILE, PORTRAITS = "identities.safetensors", "portraits.npz"

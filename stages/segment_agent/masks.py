@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip, usable_depth
 from pipeline.geometry import subsampling
+from pipeline.segmentation.appearance import Appearance, Example, learn
 from stages.segment_agent import free_space, movers, people, prompts
-from stages.segment_agent.appearance import Appearance, Example, learn
 from stages.segment_agent.config import Config
 from stages.segment_agent.evidence import motion_evidence, prefer_first
 from stages.segment_agent.follow import follow

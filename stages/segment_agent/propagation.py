@@ -17,9 +17,10 @@ from jaxtyping import Float, UInt8
 
 from pipeline.data.flow import GAPS
 from pipeline.geometry import subsampling
-from stages.segment_agent.appearance import Example, learn
-from stages.segment_agent.config import LearningConfig
-from stages.segment_agent.footage import SEARCH_PX, Footage, Region, dilated, pixel_indices
+from pipeline.segmentation.appearance import Example, learn
+from pipeline.segmentation.config import LearningConfig
+from pipeline.segmentation.grabcut import Region, dilated
+from stages.segment_agent.footage import SEARCH_PX, Footage, pixel_indices
 
 MAX_LOG_ODDS, MIN_LOG_ODDS = 4.0, 0.5
 """largest and smallest magnitude of a pixel's log-odds"""

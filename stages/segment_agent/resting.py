@@ -13,9 +13,9 @@ from jaxtyping import Float
 from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip, usable_depth
 from pipeline.geometry import cameras, rigid
+from pipeline.segmentation.grabcut import grabcut
 from stages.segment_agent import free_space, movers
 from stages.segment_agent.evidence import EvidenceOf
-from stages.segment_agent.follow import grabcut
 from stages.segment_agent.free_space import References
 from stages.segment_agent.movers import PlacedPrompt
 from stages.segment_agent.turnaround import CLEARANCE_M, cluster_evidence, find_cluster, surroundings

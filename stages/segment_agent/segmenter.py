@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipeline.data.clips import Clip
+from pipeline.segmentation.appearance import Appearance
 from stages.segment_agent import refine
-from stages.segment_agent.appearance import Appearance
 from stages.segment_agent.evidence import Evidence, EvidenceOf
 from stages.segment_agent.refine import ColorHistogram, Edges
 from stages.segment_agent.windows import Sphere, Window, crop_window, working_picture, working_size

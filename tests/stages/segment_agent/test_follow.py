@@ -8,9 +8,10 @@ import pytest
 from pipeline.data import images, npz
 from pipeline.data.clips import Clip
 from pipeline.data.flow import GAPS
+from pipeline.segmentation.grabcut import sharpened
 from stages.segment_agent import propagation
 from stages.segment_agent.config import LearningConfig
-from stages.segment_agent.follow import MOTION_GAPS, follow, segment_prompt, sharpened
+from stages.segment_agent.follow import MOTION_GAPS, follow, segment_prompt
 from stages.segment_agent.footage import Footage
 from stages.segment_agent.prompts import Prompt
 from stages.segment_agent.propagation import MAX_LOG_ODDS, Beliefs, connected, examples, message

@@ -10,8 +10,9 @@ import torch
 from pipeline.core.errors import InputError
 from pipeline.data import images, npz
 from pipeline.data.clips import Clip
-from stages.segment_agent import appearance, masks, movers, prompts
-from stages.segment_agent.appearance import Example, learn
+from pipeline.segmentation import appearance
+from pipeline.segmentation.appearance import Example, learn
+from stages.segment_agent import masks, movers, prompts
 from stages.segment_agent.config import AnimalConfig, Config, LearningConfig
 from stages.segment_agent.movers import Candidate, PlacedPrompt
 

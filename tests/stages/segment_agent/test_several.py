@@ -12,8 +12,8 @@ import pytest
 from pipeline.core.errors import InputError
 from pipeline.core.videos import Video
 from pipeline.data.clips import Clip, Masks, usable_depth
+from pipeline.segmentation.appearance import Example
 from stages.segment_agent import free_space, identity, locate, masks, several, stage, trajectory
-from stages.segment_agent.appearance import Example
 from stages.segment_agent.config import AnimalConfig, Config, LearningConfig
 from stages.segment_agent.identities import config as identities_config
 from stages.segment_agent.identities import stage as identities

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from stages.segment_agent.config import LearningConfig
+from pipeline.segmentation.config import LearningConfig
 
 ALIGNED_PX = 16
 """pictures are padded to a multiple of this"""
@@ -142,7 +142,7 @@ def learn(
         loss = F.binary_cross_entropy_with_logits(found, (labels == 255).float(), reduction="none")
         contradicted = torch.where(labels == 255, -found, found) > CONTRADICTION_LOG_ODDS
         counted = (labels != 128) & ~(contradicted & (step > LABEL_TRUST_SHARE * options.steps))
-        weight = _balanced(counted, labels == 255)
+        weight = balanced(counted, labels == 255)
         optimizer.zero_grad()
         ((loss * weight).sum() / weight.sum().clamp(min=1)).backward()
         optimizer.step()
@@ -150,7 +150,7 @@ def learn(
     return fold_batch_norms(network.eval())
 
 
-def _balanced(
+def balanced(
     counted: Bool[Tensor, "batch height width"], animal: Bool[Tensor, "batch height width"]
 ) -> Float[Tensor, "batch height width"]:
     """Return pixel weights: those of a small animal are raised, since the rest of a crop outnumbers them."""

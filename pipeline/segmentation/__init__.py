@@ -1,0 +1,1 @@
+"""Segmentation of the animal by appearance: a network trained per recording, and GrabCut."""
