@@ -19,6 +19,7 @@ from pipeline.data.clips import Clip, Masks
 from pipeline.geometry import subsampling
 from pipeline.segmentation import appearance
 from pipeline.segmentation.appearance import Appearance, Example
+from pipeline.segmentation.augmentation import Light, in_other_light, scaled_crop
 from pipeline.segmentation.grabcut import dilated, sharpened
 from stages.estimate_depth import views
 from stages.estimate_depth.foreground import ColorView
@@ -40,13 +41,12 @@ SHADOW_ABOVE, SHADOW_ASIDE, SHADOW_BELOW, SHADOW_BLUR = (0.3, 1.0), 0.15, (-0.05
 of its blur, shares of the animal's height."""
 MAX_SHADOW = 0.7
 """Largest darkening by a shadow."""
-EDGE_BLUR_PX, SHRINKING_BLUR_PX = 0.6, 0.4
-"""Standard deviations of the blur of composited outlines, and of pictures to be shrunk, crop pixels."""
+EDGE_BLUR_PX = 0.6
+"""Standard deviation of the blur of composited outlines, pixels."""
 BLURRED_SHARE, BLUR_PX = 0.3, (0.4, 1.2)
 """Share of blurred crops and range of the standard deviation: sessions are filmed while walking."""
-EXPOSURE, WHITE_BALANCE, CONTRAST, BRIGHTNESS, NOISE = 0.2, 0.06, 0.2, 0.1, 0.08
-"""Standard deviations of the augmentation of exposure (log), white balance (share per channel), contrast
-(share) and brightness (of -1..1), and largest deviation of added noise."""
+LIGHT = Light(exposure=0.2, white_balance=0.06, contrast=0.2, brightness=0.1, noise=0.08)
+"""Another day, the same phone."""
 REACH_PX = 12
 """The animal is at most this far from foreground, pixels of small pictures: parts of it resemble the room."""
 Crop = tuple[UInt8[np.ndarray, "side side 3"], UInt8[np.ndarray, "side side"]]
@@ -113,7 +113,7 @@ def recognize(
 def _training_crop(portraits: Sequence[Example], empty: Sequence[Example], rng: np.random.Generator) -> Crop:
     """Return a crop of the room, of the turnaround, or of its animal composited over the room."""
     room = empty[int(rng.integers(len(empty)))]
-    place = tuple(int(rng.integers(side)) for side in room.labels.shape)
+    place = int(rng.integers(len(room.labels))), int(rng.integers(room.labels.shape[1]))
     background = _crop(room, place, float(np.exp(rng.uniform(*np.log(ROOM_SCALE)))), 128, rng)
     kind = rng.random()
     if kind < ROOM_SHARE:
@@ -136,19 +136,11 @@ def _training_crop(portraits: Sequence[Example], empty: Sequence[Example], rng: 
 
 
 def _crop(
-    example: Example, middle: tuple[int, ...], scale: float, outside: int, rng: np.random.Generator
+    example: Example, place: tuple[float, float], scale: float, outside: int, rng: np.random.Generator
 ) -> Crop:
     """Return a scaled square crop that contains a pixel (row, column); labels are ``outside`` beyond it."""
-    shift = CROP_PX * rng.uniform(*PLACEMENT, 2)
-    row, column = middle
-    source = np.array([[1 / scale, 0, column - shift[0] / scale], [0, 1 / scale, row - shift[1] / scale]])
-    color, side = example.color, (CROP_PX, CROP_PX)
-    if scale < 1:
-        color = cv2.GaussianBlur(color, (0, 0), SHRINKING_BLUR_PX / scale)
-    linear, nearest = (how | cv2.WARP_INVERSE_MAP for how in (cv2.INTER_LINEAR, cv2.INTER_NEAREST))
-    color = cv2.warpAffine(color, source, side, flags=linear, borderMode=cv2.BORDER_REFLECT)
-    labels = cv2.warpAffine(example.labels, source, side, flags=nearest, borderValue=(outside,))
-    return color.astype(np.uint8), labels.astype(np.uint8)
+    shift_px = CROP_PX * rng.uniform(*PLACEMENT, 2)
+    return scaled_crop(example.color, example.labels, place, scale, shift_px, CROP_PX, outside)
 
 
 def _with_shadow(
@@ -174,9 +166,4 @@ def _augmented(crop: Crop, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
         color, labels = color[:, ::-1], labels[:, ::-1]
     if rng.random() < BLURRED_SHARE:
         color = cv2.GaussianBlur(np.ascontiguousarray(color), (0, 0), rng.uniform(*BLUR_PX))
-    tint = np.exp(EXPOSURE * rng.normal()) * (1 + WHITE_BALANCE * rng.normal(size=(3, 1, 1)))
-    shown = (appearance.normalized(color) + 1) * torch.from_numpy(tint).float() - 1
-    shown = shown * (1 + CONTRAST * rng.normal()) + BRIGHTNESS * rng.normal()
-    grain = rng.uniform(0, NOISE) * rng.standard_normal(shown.shape, np.float32)
-    shown = (shown + torch.from_numpy(grain)).clamp(-1, 1)
-    return shown.float(), torch.from_numpy(np.ascontiguousarray(labels))
+    return in_other_light(color, LIGHT, rng), torch.from_numpy(np.ascontiguousarray(labels))

@@ -20,7 +20,8 @@ from torch import Tensor, nn
 
 from pipeline.data import npz
 from pipeline.segmentation import appearance
-from pipeline.segmentation.appearance import Appearance, Example, normalized, to_batch
+from pipeline.segmentation.appearance import Appearance, Example, to_batch
+from pipeline.segmentation.augmentation import Light, in_other_light, scaled_crop
 from stages.segment_agent.identities.config import Config
 
 FILE, PORTRAITS = "identities.safetensors", "portraits.npz"
@@ -35,19 +36,14 @@ PASTE_SHARE = 0.6
 """share of crops into which another animal is pasted"""
 SCALE_RANGE = (0.12, 1.4)
 """range of scales of crops relative to the turnaround, which is filmed from nearby"""
-WHITE_BALANCE, EXPOSURE, CONTRAST, BRIGHTNESS = 0.08, 0.4, 0.25, 0.2
-"""standard deviations of the augmentation of white balance (share, per channel), exposure (log), contrast
-(share) and brightness (of -1..1): sessions are filmed in other light than turnarounds"""
-NOISE = 0.15
-"""largest standard deviation of added noise (of -1..1), as in the evening"""
+LIGHT = Light(exposure=0.4, white_balance=0.08, contrast=0.25, brightness=0.2, noise=0.15)
+"""sessions are filmed in other light than turnarounds, some in the evening"""
 COHERENT = 0.85
 """mean probability above which a connected component is one animal"""
 PLACEMENT = (0.15, 0.85)
 """range of the animal pixel's position in a crop, shares of its side"""
 MARGIN_PX = 80
 """margin kept around the animal of a portrait"""
-BLUR_PX = 0.4
-"""standard deviation of the anti-aliasing blur of downscaled crops, crop pixels"""
 WINDOW_SHARE = 0.08
 """side of the window over which touching bodies are separated, as a share of the picture's height"""
 
@@ -214,12 +210,8 @@ def _composited_crop(
         color, classes = np.where(front[..., None], pasted, color), np.where(front, pasted_classes, classes)
     if rng.random() < 0.5:
         color, classes = color[:, ::-1], classes[:, ::-1]
-    tint = np.exp(EXPOSURE * rng.normal()) * (1 + WHITE_BALANCE * rng.normal(size=(3, 1, 1)))
-    shown = (normalized(color) + 1) * torch.from_numpy(tint).float() - 1
-    shown = shown * (1 + CONTRAST * rng.normal()) + BRIGHTNESS * rng.normal()
-    grain = rng.uniform(0, NOISE) * rng.standard_normal(shown.shape, np.float32)
-    shown = (shown + torch.from_numpy(grain)).clamp(-1, 1)
-    return shown.float(), torch.from_numpy(np.ascontiguousarray(classes)).long()
+    shown = in_other_light(color, LIGHT, rng)
+    return shown, torch.from_numpy(np.ascontiguousarray(classes)).long()
 
 
 def _random_crop(
@@ -232,11 +224,5 @@ def _random_crop(
     row, column = inside[rng.integers(len(inside))] if len(inside) else np.array(classes.shape) // 2
     scale = float(np.exp(rng.uniform(*np.log(SCALE_RANGE))))
     shift = rng.uniform(*PLACEMENT, 2) * side
-    map_to = np.array([[1 / scale, 0, column - shift[0] / scale], [0, 1 / scale, row - shift[1] / scale]])
-    linear, nearest = (how | cv2.WARP_INVERSE_MAP for how in (cv2.INTER_LINEAR, cv2.INTER_NEAREST))
-    source, size = portrait.color, (side, side)
-    if scale < 1:
-        source = cv2.GaussianBlur(source, (0, 0), BLUR_PX / scale)
-    color = cv2.warpAffine(source, map_to, size, flags=linear, borderMode=cv2.BORDER_REPLICATE)
-    labels = cv2.warpAffine(classes, map_to, size, flags=nearest, borderValue=(IGNORED,))
-    return color, labels.astype(np.int64)
+    crop = scaled_crop(portrait.color, classes, (row, column), scale, shift, side, IGNORED)
+    return crop[0], crop[1].astype(np.int64)
