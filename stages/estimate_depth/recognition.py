@@ -26,7 +26,7 @@ from stages.estimate_depth.foreground import ColorView
 
 PORTRAITS, ROOMS = 50, 60
 """Pictures of the turnaround and of the walk-through."""
-STEPS, BATCH, CROP_PX = 400, 8, 144
+STEPS, BATCH, CROP_PX = 800, 8, 144
 """Training steps, crops per step, and side of a crop, pixels of small pictures."""
 ROOM_SHARE, TURNAROUND_SHARE = 0.15, 0.25
 """Shares of crops of the room alone, and of the turnaround; in the others the animal is composited."""
