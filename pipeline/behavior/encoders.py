@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from pipeline.behavior.trajectories import ABSENT_M, ANTICIPATED_SHARES
 from pipeline.geometry import rigid_torch
 
 POSE_CHANNELS = 9
@@ -16,6 +17,8 @@ CLOSE_RANGE_M, EDGE_SHARPNESS = 1.5, 4.0
 """offset of the encoded distance, meters, and steepness of the soft edge at the radius, per radius"""
 APPROACH_SCALE = 1.5
 """scale of approach speeds (at most 2 m/s), which gives them the range of the encoded distance, +-3"""
+MAX_MOTION_M = 3.0
+"""bound of the encoded motion of others until an anticipated frame"""
 HEADS = 4
 """attention heads, each for its part of the code"""
 ATTENDED_CHANNELS = 3
@@ -43,6 +46,16 @@ def other_channels_torch(
     place = companions[..., :3] @ new_from_ego.mT[:, None]
     unknown = place.new_zeros(*place.shape[:3], POSE_CHANNELS - 3)
     return torch.cat([first[:, None], torch.cat([place, unknown, companions[..., 3:]], dim=-1)], dim=1)
+
+
+def with_anticipated(
+    others: Float[Tensor, "batch other past_frame 10"], ahead: Float[Tensor, "batch anticipated_frame 3"]
+) -> Float[Tensor, "batch other frame 10"]:
+    """Append frames with where the observer will be, meters; that of companions is unknown."""
+    more = others.new_zeros(*others.shape[:2], ahead.shape[1], others.shape[3])
+    more[..., 0] = ABSENT_M
+    more[:, 0, :, :3] = ahead
+    return torch.cat([others, more], dim=2)
 
 
 class SetEncoder(nn.Module):
@@ -81,19 +94,24 @@ class OthersEncoder(SetEncoder):
     Distance and approach speed of each frame (meters, m/s) are explicit features, undamped well inside the
     radius: they decide whether the animal reacts, and learning them from positions takes thousands of steps.
     Beyond the radius all features are zero, so that far others and none at all have the same code.
+
+    Behind the past frames there may be those of `anticipated_frames`, with where the others will be. Without
+    them, and where others are absent in them, it is unknown.
     """
+
+    anticipates = True
 
     def __init__(
         self, frames: int, hidden: int, code: int, radius_m: float, rate_hz: float, *, positions: bool = False
     ):
-        super().__init__(frames * 5 + 2, hidden, code)
+        super().__init__(frames * 5 + 2 + len(ANTICIPATED_SHARES) * 5, hidden, code)
         self.frames, self.radius_m, self.rate_hz, self.positions = frames, radius_m, rate_hz, positions
 
     def forward(
-        self, others: Float[Tensor, "batch other past_frame 10"], keep: Float[Tensor, "batch"]
+        self, others: Float[Tensor, "batch other frame 10"], keep: Float[Tensor, "batch"]
     ) -> Float[Tensor, "batch number"]:
         """Return the code, then with ``positions`` `ATTENDED_CHANNELS` per head."""
-        position = others[..., :3:2]
+        position = others[..., : self.frames, :3:2]
         distance = (position.square().sum(-1) + 1e-6).sqrt()
         nearness = (1 - distance / self.radius_m).clamp_min(0)
         direction = position / (distance[..., None] + 0.1)
@@ -105,25 +123,47 @@ class OthersEncoder(SetEncoder):
         close = (CLOSE_RANGE_M - distance).clamp_min(-CLOSE_RANGE_M) * (2 * inside)
         step = (position[..., 1:, :] - position[..., :-1, :]) * self.rate_hz
         coming = -(step * direction[..., 1:, :]).sum(-1).clamp(-2, 2) * (APPROACH_SCALE * inside[..., 1:])
-        features = torch.cat([seen, moving.clamp(-2, 2), close, coming], dim=-1)
         inside = inside[..., -1:]
-        code, weight = self.code_of_set(features, others[..., -1, -1:], inside, keep)
+        ahead = self._ahead(others[..., self.frames :, :3:2], position[..., -1:, :], inside)
+        features = torch.cat([seen, moving.clamp(-2, 2), close, coming, ahead], dim=-1)
+        code, weight = self.code_of_set(features, others[..., self.frames - 1, -1:], inside, keep)
         if not self.positions:
             return code
         here = torch.cat([inside, inside * position[..., -1, :]], dim=-1)
         attended = (weight[..., None] * here[:, :, None]).sum(1).flatten(1)
         return torch.cat([code, attended * keep[:, None]], dim=-1)
 
+    def _ahead(
+        self,
+        then: Float[Tensor, "batch other anticipated_frame 2"],
+        now: Float[Tensor, "batch other 1 2"],
+        inside: Float[Tensor, "batch other 1"],
+    ) -> Float[Tensor, "batch other number"]:
+        """Return features of where others will be: motion, nearness, approach, and whether it is known."""
+        if not then.shape[2]:
+            then = torch.full_like(now, ABSENT_M).expand(-1, -1, len(ANTICIPATED_SHARES), -1)
+        known = (then.abs().amax(-1) < MAX_PRESENT_M).to(inside) * inside
+        distance, from_now = ((place.square().sum(-1) + 1e-6).sqrt() for place in (then, now))
+        close = (CLOSE_RANGE_M - distance).clamp(-CLOSE_RANGE_M, CLOSE_RANGE_M) * 2
+        coming = (from_now - distance).clamp(-2, 2) * APPROACH_SCALE
+        each = torch.stack([close, coming, torch.full_like(close, 2)], dim=-1)
+        each = torch.cat([(then - now).clamp(-MAX_MOTION_M, MAX_MOTION_M), each], dim=-1)
+        return (each * known[..., None]).flatten(-2)
+
 
 class OtherPosesEncoder(SetEncoder):
-    """Encode the past poses of others, without a radius (Eq. 12)."""
+    """Encode the past poses of others, without a radius (Eq. 12); not where they will be."""
+
+    anticipates = False
 
     def __init__(self, frames: int, hidden: int, code: int):
         super().__init__(frames * POSE_CHANNELS, hidden, code)
+        self.frames = frames
 
     def forward(
         self, others: Float[Tensor, "batch other past_frame 10"], keep: Float[Tensor, "batch"]
     ) -> Float[Tensor, "batch code"]:
+        others = others[:, :, : self.frames]
         near = (others[..., :3].square().sum(-1) < MAX_PRESENT_M**2).all(-1, keepdim=True)
         features = torch.where(near, others[..., :POSE_CHANNELS].flatten(-2), 0)
         return self.code_of_set(features, others[..., -1, -1:], near.to(features), keep)[0]

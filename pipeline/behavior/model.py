@@ -28,7 +28,7 @@ from pipeline.behavior.perception import (
     PerceptionConfig,
     PerceptionEnsemble,
 )
-from pipeline.behavior.trajectories import ABSENT_M, FUTURE, KINDS, PAST, RATE_HZ
+from pipeline.behavior.trajectories import ABSENT_M, FUTURE, KINDS, PAST, RATE_HZ, anticipated_frames
 from pipeline.core.errors import InputError, other_versions_refused
 from pipeline.geometry import rigid
 
@@ -97,6 +97,11 @@ class Architecture:
     def attended_channels(self) -> int:
         """Channels of attended positions of others, per member."""
         return ATTENDED_CHANNELS * HEADS if self.companions and self.observed_past == "positions" else 0
+
+    @property
+    def anticipated(self) -> list[int]:
+        """Frames for which it may know where the observer will be, if it perceives positions."""
+        return anticipated_frames(self.future).tolist() if self.observed_past == "positions" else []
 
     @property
     def code_length(self) -> int:
@@ -291,8 +296,9 @@ def contract(
             "others": {
                 "per_frame": ["x", "y", "z", *root, "kind"],
                 "kinds": list(KINDS),
+                "anticipated_frames": architecture.anticipated,
                 "absent_m": ABSENT_M,
-                "order": "other, frame, channel; the observer first, oldest frame first",
+                "order": "other, frame, channel; the observer first; oldest frame first, then anticipated",
             },
             "past": {
                 "per_frame": ["root_x", "root_y", "root_z", *root],

@@ -16,10 +16,18 @@ from torch import nn
 from pipeline.behavior import model
 from pipeline.behavior.config import Ego, Guided, PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule, guided, sample
+from pipeline.behavior.encoders import with_anticipated
 from pipeline.behavior.path_encoding import PATH_CHANNELS_OF, goal_error, snapped_to_goal
-from pipeline.behavior.perception import FeatureVolume, world_from_ego
+from pipeline.behavior.perception import POSITION, FeatureVolume, world_from_ego
 from pipeline.behavior.scenes import SceneConstraint, Scenes
-from pipeline.behavior.trajectories import ABSENT_M, Context, nearest, nearest_first
+from pipeline.behavior.trajectories import (
+    ABSENT_M,
+    Context,
+    anticipated,
+    anticipated_frames,
+    nearest,
+    nearest_first,
+)
 from pipeline.geometry import rigid
 
 Array = np.ndarray
@@ -60,8 +68,8 @@ class Observation:
     """The inputs of perception, in meters and the ego frame."""
 
     scene_grid: Float[np.ndarray, "batch channel 64 8 64"]
-    others: Float[np.ndarray, "batch other past_frame 10"]
-    """poses and kinds; the observer first"""
+    others: Float[np.ndarray, "batch other frame 10"]
+    """poses and kinds; the observer first; past frames, then anticipated ones, if any"""
     past: Float[np.ndarray, "batch past"]
     constraint: SceneConstraint | None = None
     """where the agents may be, for samplers with constraints"""
@@ -110,9 +118,16 @@ class SampledPlan:
 
 
 def observe(
-    context: Context, scenes: FeatureVolume | Scenes, rest: Float[np.ndarray, "bone 4 4"], ego: Ego
+    context: Context,
+    scenes: FeatureVolume | Scenes,
+    rest: Float[np.ndarray, "bone 4 4"],
+    ego: Ego,
+    future: int = 0,
 ) -> Observation:
-    """Encode contexts as network inputs (Eq. 11, 12, 13)."""
+    """Encode contexts as network inputs (Eq. 11, 12, 13).
+
+    In plans of ``future`` frames the observer is anticipated to go on as now; 0: what it will do is unknown.
+    """
     frame = world_from_ego(context.world_from_agent[:, -1], ego)
     ego_from_world = rigid.inverse(frame)
     companions, companion, agent = context.companions, None, context.world_from_agent[:, -1, :3, 3]
@@ -120,6 +135,10 @@ def observe(
         companion, companions = nearest_first(companions, agent), nearest(companions, agent)
         companions[..., :3] = rigid.apply(ego_from_world[:, None], companions[..., :3])
     others = model.other_channels(ego_from_world[:, None] @ context.world_from_observer, companions)
+    if future:
+        ahead = anticipated(context.observer_world, agent, anticipated_frames(future))
+        ahead = rigid.apply(ego_from_world, ahead).astype(np.float32)
+        others = with_anticipated(torch.from_numpy(others), torch.from_numpy(ahead)).numpy()
     bones = model.channels_from_bones(context.agent_from_bone, rest)
     past = model.past_channels(ego_from_world[:, None] @ context.world_from_agent, bones)
     scenes = scenes if isinstance(scenes, Scenes) else Scenes.of(scenes)
@@ -224,7 +243,7 @@ class Sampler:
         keep[:, 1 if by_observer else slice(None)] = 0
         if (accompanied and not each) or (not by_observer and sampling.guidance != 1):
             references.append(code(observation))
-        past = observation.past.reshape(len(observation), observation.others.shape[2], -1)
+        past = observation.past.reshape(len(observation), -1, POSITION + len(self.scaling.body_mean))
         start = np.repeat(past[:, -1, :3], count, axis=0)
         constraint = observation.constraint if sampling.avoid_solid and sampling.scene else None
         return PlanCondition(full, tuple(references), start, sampling, constraint, count)

@@ -240,7 +240,8 @@ class AnimalBatch:
         bones, observer = bones_from_channels(channels, self.rest), np.stack(self.observer, axis=1)[some]
         video = None if self.video is None else self.video[some]
         context = Context(root, bones, observer, video, companions=self._companions(some))
-        observation = observe(context, self.scenes, self.rest, self.ego)
+        future = self.sampler.scaling.path_std.shape[1]
+        observation = observe(context, self.scenes, self.rest, self.ego, future)
         frame = world_from_ego(root[:, -1], self.ego)
         self.plans_drawn += len(some)
         intent = np.full((len(some), 1, 3), np.nan) if intent is None else intent

@@ -27,6 +27,10 @@ KINDS = ("person", "animal")
 """kinds that the fourth channel of a companion indexes; the first three are its position"""
 ABSENT_M = 1000.0
 """distance at which absent others are placed, meters"""
+ANTICIPATED_SHARES = (1 / 7, 2 / 7, 1 / 2, 1)
+"""shares of the horizon after which a model may know where the observer will be"""
+STEP_FRAMES = 3
+"""last frames of a past that give the observer's velocity"""
 MAX_COMPANIONS = 15
 """maximum number of companions, the nearest: more hardly fit into the radius, nor crowds into memory"""
 WINDOWS_AT_ONCE = 8192
@@ -113,6 +117,27 @@ def frames_from_seconds(seconds: float, rate_hz: float = RATE_HZ) -> int:
         remedy = f"take a multiple of four frames: {4 / rate_hz:g} s"
         raise InputError("BEH-003", f"cannot predict {seconds:g} s", "horizon_s", remedy)
     return frames
+
+
+def anticipated_frames(future: int) -> Int[np.ndarray, "anticipated_frame"]:
+    """Return the frames of a plan for which a model may know where the observer will be, counted from 1."""
+    return np.array([max(round(share * future), 1) for share in ANTICIPATED_SHARES])
+
+
+def anticipated(
+    observer: Float[np.ndarray, "window past_frame 3"],
+    agent: Float[np.ndarray, "window 3"],
+    frames: Int[np.ndarray, "anticipated_frame"],
+) -> Float[np.ndarray, "window anticipated_frame 3"]:
+    """Return where observers will be if they go on as now, up to where they are nearest to the agent.
+
+    Whoever stands is expected to stand. Positions are in one frame with +y up, meters.
+    """
+    count, now = min(STEP_FRAMES, observer.shape[1] - 1), observer[:, -1]
+    step = (now - observer[:, -1 - count]) * [1.0, 0.0, 1.0] / count
+    nearest_at = ((agent - now) * step).sum(-1) / np.maximum((step**2).sum(-1), np.finfo(float).tiny)
+    last = np.where(nearest_at > 0, nearest_at, np.inf)
+    return now[:, None] + step[:, None] * np.minimum(frames, last[:, None])[..., None]
 
 
 def window_starts(

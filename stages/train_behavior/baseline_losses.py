@@ -19,6 +19,7 @@ from stages.train_behavior.objective import (
     TrainingPhase,
     joint_mask,
     level_losses,
+    partly_foreseen,
     perceive,
     squared_error,
 )
@@ -71,6 +72,7 @@ def one_stage_losses(
 ) -> dict[str, Float[Tensor, ""]]:
     """Return the denoising losses of path and body as one sequence without control."""
     assert phase == "all", "a model of one stage has no goals that could learn before"
+    batch = partly_foreseen(nets, batch, 0.0, generator)
     code = perceive(nets, batch, objective, generator, joint_mask(batch, objective, generator))
     known = batch.bones_known
     seen = torch.where(known[:, None, None], batch.body, torch.zeros_like(batch.body))

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from pipeline.behavior.config import Encoding
 from pipeline.behavior.diffusion import STANDARD
-from pipeline.behavior.encoders import other_channels_torch
+from pipeline.behavior.encoders import other_channels_torch, with_anticipated
 from pipeline.behavior.model import ROOT_CHANNELS, Architecture, Scaling, channels_from_bones
 from pipeline.behavior.path_encoding import GOAL_POWER_OF, velocity_channels_from_path, with_powered_length
 from pipeline.behavior.perception import POSITION, PerceptionEnsemble, world_from_ego
-from pipeline.behavior.trajectories import RATE_HZ
+from pipeline.behavior.trajectories import RATE_HZ, anticipated_frames
 from pipeline.geometry import rigid, rigid_torch
 from stages.train_behavior.config import AugmentationConfig
 from stages.train_behavior.homes import TrainingHomes
@@ -49,6 +49,8 @@ class EgoTracks:
     root: Float[Tensor, "window frame 3"]
     rotation: Float[Tensor, "window frame 3 3"]
     ego_from_observer: Float[Tensor, "window past_frame 4 4"]
+    ahead: Float[Tensor, "window anticipated_frame 3"]
+    """where the observer will be"""
     companions: Float[Tensor, "window companion past_frame 4"]
 
 
@@ -86,11 +88,14 @@ class TrainingWindows:
         ego_from_world = rigid_torch.inverse(self.world_from_ego[index])
         ego_from_agent = ego_from_world[:, None] @ self.world_from_agent[self.frame[index]]
         ego_from_observer = ego_from_world[:, None] @ self.world_from_observer[self.frame[index, : self.past]]
+        later = self.past - 1 + anticipated_frames(self.frame.shape[1] - self.past)
+        ahead = self.world_from_observer[self.frame[index][:, later]][..., :3, 3]
         companions = self.companions_world[index]
         place = rigid_torch.apply(ego_from_world[:, None], companions[..., :3])
         companions = torch.cat([place, companions[..., 3:]], dim=-1)
         root, rotation = ego_from_agent[..., :3, 3], ego_from_agent[..., :3, :3]
-        return EgoTracks(root, rotation, ego_from_observer, companions)
+        ahead = rigid_torch.apply(ego_from_world, ahead)
+        return EgoTracks(root, rotation, ego_from_observer, ahead, companions)
 
 
 @dataclass(frozen=True)
@@ -109,7 +114,8 @@ class TrainingBatch:
     """One augmented batch: inputs of perception, and clean targets in scaled units."""
 
     scene: Float[Tensor, "batch channel x y z"]
-    others: Float[Tensor, "batch other past_frame 10"]
+    others: Float[Tensor, "batch other frame 10"]
+    """past frames, then anticipated ones, with where the observer will be"""
     past: Float[Tensor, "batch past"]
     held: Float[Tensor, "batch held_frame held_channel"]
     """root and bones of the frames that give velocity and posture, without noise"""
@@ -299,6 +305,7 @@ def draw_batch(
     shift_m = OBSERVER_SHIFT_M if augmentation.past > 0 else 0.0
     shift = torch.randn(size, 1, 3, generator=generator) * shift_m
     observer = (tracks.ego_from_observer[..., :3, 3] + shift) @ new_from_old.mT
+    ahead = (tracks.ahead + shift) @ new_from_old.mT
     facing = new_from_old[:, None] @ tracks.ego_from_observer[..., :3, :3] @ flip[:, None]
     frames = windows.frame[index]
     known = rotation[:, :count], windows.bones[frames[:, :count]]
@@ -318,7 +325,7 @@ def draw_batch(
     places = future.mT / torch.from_numpy(scaling.path_std).float()
     return TrainingBatch(
         scene(ego.to(device), side.to(device), windows.scene[index].to(device)),
-        other_channels_torch(observer, facing, tracks.companions, new_from_old),
+        with_anticipated(other_channels_torch(observer, facing, tracks.companions, new_from_old), ahead),
         past.flatten(1),
         held,
         ((torch.rand(size, generator=generator) >= augmentation.hide_bones) & bones_known).float(),

@@ -14,12 +14,12 @@ from safetensors.torch import save_file
 
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule
-from pipeline.behavior.encoders import POSE_CHANNELS
+from pipeline.behavior.encoders import POSE_CHANNELS, with_anticipated
 from pipeline.behavior.model import Architecture, BehaviorNets, Scaling, contract, other_channels
 from pipeline.behavior.path_encoding import PATH_CHANNELS_OF
-from pipeline.behavior.perception import GRID_SHAPE
+from pipeline.behavior.perception import GRID_SHAPE, PerceptionEnsemble
 from pipeline.behavior.planning import Observation, Sampler, TorchNetworks
-from pipeline.behavior.trajectories import UP
+from pipeline.behavior.trajectories import UP, anticipated
 from pipeline.geometry import rigid
 
 NETWORKS = ("perception", "goal", "path", "body")
@@ -93,7 +93,7 @@ def signature(name: str, a: Architecture) -> tuple[dict[str, tuple[int, ...]], s
         case "perception":
             grid = {
                 "scene_grid": (a.scene_channels, *GRID_SHAPE),
-                "others": (1 + a.companions, a.past, POSE_CHANNELS + 1),
+                "others": (1 + a.companions, a.past + len(a.anticipated), POSE_CHANNELS + 1),
                 "past": (a.past * (9 + 6 * a.bones),),
             }
             return grid | {"keep": (3,)}, "condition"
@@ -122,6 +122,9 @@ def golden_observation(a: Architecture) -> Observation:
     walk = np.linspace(0.5, 1.0, a.past)
     companion = np.stack([walk, np.full(a.past, 0.1), 0.5 * walk, np.ones(a.past)], axis=-1)
     others = other_channels(facing[None], companion[None, None] if a.companions else None)
+    if a.anticipated:
+        there = anticipated(observer[None], np.zeros((1, 3)), np.array(a.anticipated)).astype(np.float32)
+        others = with_anticipated(torch.from_numpy(others), torch.from_numpy(there)).numpy()
     return Observation(scene, others, past)
 
 
@@ -170,10 +173,10 @@ def difference(module: torch.nn.Module, path: Path, inputs: dict[str, tuple[int,
     """
     rng = np.random.default_rng(0)
     drawn = {name: rng.standard_normal((4, *shape), dtype=np.float32) for name, shape in inputs.items()}
-    for name in {"past", "others"} & drawn.keys():
-        beings = inputs[name][0] if name == "others" else 1
-        still = drawn[name][-1].reshape(beings, inputs["others"][1], -1)
-        drawn[name][-1] = np.broadcast_to(still[:, :1], still.shape).reshape(drawn[name][-1].shape)
+    if isinstance(module, PerceptionEnsemble):
+        for name, shape in (("others", inputs["others"][:2]), ("past", (1, module.first.past.frames))):
+            still = drawn[name][-1].reshape(*shape, -1)
+            drawn[name][-1] = np.broadcast_to(still[:, :1], still.shape).reshape(drawn[name][-1].shape)
     if "keep" in drawn:
         drawn["keep"][-1] = 1
     options = onnxruntime.SessionOptions()

@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Literal, assert_never
 
@@ -21,6 +22,9 @@ Denoise = Callable[[Tensor, Tensor], Tensor]
 SequenceError = Callable[[Denoise, Float[Tensor, "row ..."]], Float[Tensor, "row ..."]]
 CONDITION_DROPOUT = 0.1
 """Probability of replacing a condition by its null, independently, for classifier-free guidance"""
+FORESEEN_SHARE = 0.5
+"""Share of samples of paths and bodies in which it is known where the observer will be, and weight of goals
+that know it beside the same goals that do not: if half of the goals know it, the others get worse"""
 EARLIEST_GOAL = 0.2
 """Earliest time of training targets of goals, as a share of the horizon"""
 MOTION_WEIGHT: dict[Weighting, float] = {"noise": 0.0, "velocity": 4.0, "flow": 4.0}
@@ -65,12 +69,16 @@ def level_losses(
 
     ``goal`` takes the perception code. Bodies have no loss if their share of the batch is 0.
     """
-    joint = joint_mask(batch, objective, generator)
+    joint, foreseen = joint_mask(batch, objective, generator), batch
+    batch = partly_foreseen(nets, batch, 0.0 if phase == "goals" else FORESEEN_SHARE, generator)
     with torch.no_grad() if phase == "sequences" else contextlib.nullcontext():
         code = perceive(nets, batch, objective, generator, joint)
     goal_loss = {} if phase == "sequences" else {"goal": goal(code).mean()}
     if phase == "goals":
-        return goal_loss
+        if not nets.perception.first.others.anticipates:
+            return goal_loss
+        informed = goal(perceive(nets, foreseen, objective, generator, joint)).mean()
+        return {"goal": (goal_loss["goal"] + FORESEEN_SHARE * informed) / (1 + FORESEEN_SHARE)}
     path_rows, body_rows, known = sequence_rows(batch, objective)
     control_keep = keep_mask(len(code), 1, generator).to(code.device) * joint
     towards, along = batch.goal[path_rows], batch.places[body_rows]
@@ -86,6 +94,16 @@ def level_losses(
     each = (body[:, :ROOT_CHANNELS].mean((1, 2)) + body[:, ROOT_CHANNELS:].mean((1, 2))) / 2
     count = distributed.mean(known.sum().float()).clamp_min(1 / distributed.size())
     return goal_loss | {"path": path.mean(), "body": (each * known).sum() / count}
+
+
+def partly_foreseen(
+    nets: BehaviorNets, batch: TrainingBatch, share: float, generator: torch.Generator
+) -> TrainingBatch:
+    """Return the batch with where observers will be in a random ``share`` of samples; else it is unknown."""
+    others = batch.others.clone()
+    unknown = torch.rand(len(others), generator=generator).to(others.device) >= share
+    others[unknown, :, nets.perception.first.past.frames :, 0] = ABSENT_M
+    return replace(batch, others=others)
 
 
 def sequence_rows(

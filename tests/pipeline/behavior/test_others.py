@@ -8,17 +8,27 @@ import torch
 
 from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
 from pipeline.behavior.diffusion import Schedule, guided
-from pipeline.behavior.encoders import ATTENDED_CHANNELS, HEADS, OthersEncoder
+from pipeline.behavior.encoders import (
+    ATTENDED_CHANNELS,
+    HEADS,
+    OtherPosesEncoder,
+    OthersEncoder,
+    with_anticipated,
+)
 from pipeline.behavior.model import BehaviorNets
 from pipeline.behavior.planning import Sampler, TorchNetworks, observe
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import AnimalBatch
 from pipeline.behavior.trajectories import (
     ABSENT_M,
+    ANTICIPATED_SHARES,
+    FUTURE,
     KINDS,
     MAX_COMPANIONS,
     PAST,
     BehaviorData,
+    anticipated,
+    anticipated_frames,
     as_companions,
     nearest,
 )
@@ -107,6 +117,29 @@ def test_nearest_companions_are_perceived():
     np.testing.assert_array_equal(some[2, 0], np.repeat(others[2, 4, -1:], PAST, 0))
     away = np.linalg.norm(some[2, :, -1][:, [0, 2]], axis=1)
     assert (np.diff(away) >= 0).all()
+
+
+def test_observers_are_expected_to_go_on_until_they_are_nearest():
+    back, here = np.arange(PAST - 1, -1, -1)[:, None], np.array([0.5, 1.4, 2.0])
+    speed = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -0.1], [0.0, 0.0, 0.1], [0.0, 0.1, 0.0]])
+    ahead = anticipated(here - back * speed[:, None], np.zeros((4, 3)), anticipated_frames(FUTURE))
+    np.testing.assert_allclose(ahead[0], [here] * len(ANTICIPATED_SHARES))
+    np.testing.assert_allclose(ahead[1, :, 2], [1.2, 0.4, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(ahead[2, :, 2], [2.8, 3.6, 4.8, 7.6])
+    np.testing.assert_allclose(ahead[3], ahead[0], err_msg="a phone that is lifted")
+
+
+def test_anticipation_matters_where_it_is_known_of_somebody_near(encoder):
+    one, keep = companions_nearby(1), torch.ones(2)
+    place = one[:, 0, -1:, :3].expand(-1, len(ANTICIPATED_SHARES), -1)
+    code, coming = encoder(one, keep), encoder(with_anticipated(one, place * 0.5), keep)
+    assert (coming - code).abs().max() > 1e-3
+    assert (coming - encoder(with_anticipated(one, place), keep)).abs().max() > 1e-3
+    torch.testing.assert_close(encoder(with_anticipated(one, place * 0 + ABSENT_M), keep), code)
+    far = one + torch.eye(10)[0] * 6.0
+    torch.testing.assert_close(encoder(with_anticipated(far, place), keep), encoder(far, keep))
+    poses = OtherPosesEncoder(8, 16, 8).eval()
+    torch.testing.assert_close(poses(with_anticipated(one, place), keep), poses(one, keep))
 
 
 def with_companions(data: BehaviorData) -> BehaviorData:

@@ -12,6 +12,7 @@ import torch
 import trimesh
 
 from pipeline.behavior.diffusion import Schedule, noised
+from pipeline.behavior.encoders import with_anticipated
 from pipeline.behavior.model import Architecture, BehaviorNets, Scaling
 from pipeline.behavior.path_encoding import (
     GOAL_LENGTH_POWER,
@@ -19,7 +20,7 @@ from pipeline.behavior.path_encoding import (
     with_powered_length,
 )
 from pipeline.behavior.support import mark_supported
-from pipeline.behavior.trajectories import FUTURE, BehaviorData, Trajectory
+from pipeline.behavior.trajectories import FUTURE, BehaviorData, Trajectory, anticipated, anticipated_frames
 from pipeline.data import npz, ply
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
@@ -148,7 +149,9 @@ def networks_that_flee(architecture: Architecture, steps: int = 250) -> Behavior
         goal = goal + 0.3 * torch.randn(128, 3) * torch.tensor([1.0, 0.1, 1.0])
         elsewhere = torch.randn(2, 128, architecture.code)  # independent of room and past
         chart = torch.randn(128, architecture.condition_length - architecture.code_length)
-        others = mind.others(person[:, None], torch.ones(128))
+        going_on = anticipated(observer.numpy(), np.zeros((128, 3)), anticipated_frames(FUTURE))
+        seen = with_anticipated(person[:, None], torch.from_numpy(going_on))
+        others = mind.others(seen, torch.ones(128))
         code, attended = others[:, : architecture.code], others[:, architecture.code :]
         condition = torch.cat([chart, elsewhere[0], code, elsewhere[1], attended], dim=-1)
         t = torch.randint(schedule.steps, (128,))

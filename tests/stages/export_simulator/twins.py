@@ -14,8 +14,9 @@ from playwright.sync_api import Page
 
 from pipeline.baselines.predictors import Ats
 from pipeline.behavior.config import PlanSamplingConfig
+from pipeline.behavior.planning import Observation, observe
 from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.trajectories import PAST, RATE_HZ, BehaviorData, Context, window_starts
+from pipeline.behavior.trajectories import FUTURE, PAST, RATE_HZ, BehaviorData, Context, window_starts
 from pipeline.geometry import rigid
 from tests.stages.export_simulator.reaction import FAR_M
 
@@ -25,6 +26,14 @@ ASK = """async (text) => {
   for (const question of JSON.parse(text)) goals.push((await ats.sampleGoals(question))[0]);
   return goals;
 }"""
+
+
+class Anticipating(Ats):
+    """The model as the page samples it: the observer is expected to go on as now."""
+
+    def observe(self, context: Context) -> Observation:
+        """Encode a context."""
+        return observe(context, self.scenes, self.agent_from_bone_rest, self.ego, FUTURE)
 
 
 @dataclass(frozen=True)
@@ -157,7 +166,7 @@ def goals_of_python(build: Path, simulator: Path, met: Approaches, checks: int) 
     def goals(observer: np.ndarray, guidance: float = 1.0) -> np.ndarray:
         count = len(observer)
         sampling = PlanSamplingConfig(settings["method"], max(STEPS, settings["goal_steps"]), STEPS, guidance)
-        ats = Ats.load(build / "behavior", scenes, sampling)
+        ats = Anticipating.load(build / "behavior", scenes, sampling)
         eyes = np.stack([observer[..., 0], np.full(observer.shape[:2], eyes_m), observer[..., 1]], -1)
         parts = []
         for some in np.array_split(

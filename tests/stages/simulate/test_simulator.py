@@ -15,7 +15,7 @@ from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.planning import observe
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import AnimalBatch
-from pipeline.behavior.trajectories import PoseFrames, blended_frames
+from pipeline.behavior.trajectories import FUTURE, PoseFrames, blended_frames
 from pipeline.core.errors import InputError
 from pipeline.data import glb, npz
 from pipeline.geometry import rigid
@@ -140,7 +140,7 @@ def test_plans_without_corrections_are_what_the_networks_predict(simulator):
         settings = {"sampling": animals.sampling, "chaining": ReplanningConfig(candidates=4)}
         batch = AnimalBatch(sampler, animals.scenes, animals.rest, "yaw", **settings)
         batch.begin(context, np.random.default_rng(0))
-        seen = observe(context, animals.scenes, animals.rest, "yaw")
+        seen = observe(context, animals.scenes, animals.rest, "yaw", FUTURE)
         plan = sampler.plan(seen, animals.sampling.networks_only(), np.random.default_rng(0))
         frame = world_from_ego(context.world_from_agent[:, -1], "yaw")
         roots.append((batch.plan.root, plan.world_from_agent(frame)))

@@ -11,13 +11,13 @@ from pipeline.behavior.planning import PlanCondition, SampledPlan
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import FUTURE, RATE_HZ
 from stages.tabulate_behavior import chaining
-from tests.pipeline.behavior.wandering import REST, room, wandering
+from tests.pipeline.behavior.wandering import REST, room, scaling, wandering
 
 
 class Breathing:
     """A sampler whose animal stays where it is and breathes."""
 
-    corrections = True
+    corrections, scaling = True, scaling()
 
     def codes(self, observation, sampling, count=1):
         rows = count * len(observation)

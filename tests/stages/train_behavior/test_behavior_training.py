@@ -15,7 +15,7 @@ from pipeline.behavior.diffusion import Schedule, noised
 from pipeline.behavior.perception import GRID_SHAPE
 from pipeline.behavior.planning import Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.trajectories import PAST, TEST, frames_from_seconds
+from pipeline.behavior.trajectories import ABSENT_M, PAST, TEST, frames_from_seconds
 from pipeline.core import training as fit
 from pipeline.core.errors import InputError
 from pipeline.geometry import rigid_torch
@@ -45,7 +45,14 @@ from stages.train_behavior.export import (
     write_networks,
 )
 from stages.train_behavior.homes import TrainingHomes
-from stages.train_behavior.objective import goal_error, joint_mask, losses, perceive, squared_error
+from stages.train_behavior.objective import (
+    goal_error,
+    joint_mask,
+    losses,
+    partly_foreseen,
+    perceive,
+    squared_error,
+)
 from stages.train_behavior.reactions import Reactions, measure, moments
 from stages.train_behavior.refusals import check_settings
 from stages.train_behavior.scene_sampler import SceneSampler
@@ -179,17 +186,31 @@ def test_rotation_and_mirroring_are_consistent(windows):
             )
             torch.testing.assert_close(ours[:, 1], theirs[:, 1])
         between = [
-            b.others[:, 0, -1, :3]
+            b.others[:, 0, PAST - 1, :3]
             - torch.from_numpy(statistics_from_windows(windows, 0.0).scaling.goal(b.goal.numpy())).float()
             for b in (plain, moved)
         ]
         torch.testing.assert_close(between[0].norm(dim=1), between[1].norm(dim=1), atol=1e-4, rtol=1e-4)
-        facing = [rigid_torch.rotation_from_6d(b.others[:, 0, :, 3:9]) for b in (plain, moved)]
+        facing = [rigid_torch.rotation_from_6d(b.others[:, 0, :PAST, 3:9]) for b in (plain, moved)]
         turned = [each[:, 0].mT @ each[:, -1] for each in facing]
         for each in turned:
             torch.testing.assert_close(each @ each.mT, torch.eye(3).expand(16, 3, 3), atol=1e-4, rtol=0)
         trace = [each.diagonal(dim1=1, dim2=2).sum(1) for each in turned]
         torch.testing.assert_close(*trace, atol=1e-4, rtol=0)
+
+
+def test_where_observers_will_be_is_turned_like_the_rest_and_known_in_some_samples(windows):
+    recorded = windows.tracks(torch.arange(len(windows))).ahead.norm(dim=-1)
+    nets = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0)
+    for augmentation in (replace(PLAIN, turn=1.0), replace(PLAIN, mirror=1.0)):
+        batch, _ = drawn(windows, augmentation)
+        distance = batch.others[:, 0, PAST:, :3].norm(dim=-1)
+        assert torch.cdist(distance, recorded).min(dim=1).values.max() < 1e-3
+        for share, bounds in ((0.0, (0, 0)), (0.5, (1, 15)), (1.0, (16, 16))):
+            some = partly_foreseen(nets, batch, share, torch.Generator().manual_seed(0)).others
+            known = (some[:, 0, PAST:, 0] < ABSENT_M).all(1)
+            assert bounds[0] <= known.sum() <= bounds[1] and (some[known] == batch.others[known]).all()
+            assert (some[:, :, :PAST] == batch.others[:, :, :PAST]).all()
 
 
 def test_approaches_are_oversampled_and_perceived(windows, monkeypatch):
@@ -525,7 +546,7 @@ class Timid:
     """
 
     def perceive(self, scene_grid, others, past, keep):
-        position = others[:, 0, -1, :3:2] * keep[:, 1:2]
+        position = others[:, 0, PAST - 1, :3:2] * keep[:, 1:2]
         distance = np.linalg.norm(position, axis=1, keepdims=True)
         return np.where((distance > 0) & (distance < 4), -position / np.maximum(distance, 1e-6), 0).astype(
             np.float32

@@ -39,7 +39,7 @@ export class Sampler {
 
   // The code with every condition, and the one without the observer, in which companions stay.
   async codes(observation, keep, interactivity) {
-    const rows = this.contract.past_frames;
+    const rows = this.contract.past_frames + this.contract.channels.others.anticipated_frames.length;
     const count = observation.others.length / (10 * rows);
     const perceive = (observer) =>
       this.networks.perception({

@@ -25,6 +25,7 @@ const UPRIGHT = 0.2;
 const [PERSON, ANIMAL] = [0, 1]; // kinds of others
 const ABSENT_M = 1000; // where somebody is put who is not there
 const TURNS = 8; // by which goals get out of something solid, up to a right angle either way
+const STEP_FRAMES = 3; // that give the velocity at which the observer is expected to go on
 const WITHIN = 0.01; // how far inside an allowed voxel a point is put, in edges of the voxel
 
 export class Senses {
@@ -32,6 +33,7 @@ export class Senses {
   constructor(contract, volume, allowed) {
     const { behavior } = contract;
     this.ego = behavior.architecture.ego;
+    this.anticipated = behavior.channels.others.anticipated_frames;
     this.grid = behavior.grid;
     this.recorded = halfTable(volume);
     this.about = contract.volume;
@@ -52,23 +54,43 @@ export class Senses {
   }
 
   // past: frames of rows (root, bones); observer: rows of the phone; companions: places [x, y, z] of each
-  // other animal, of which no more is known. Oldest first.
+  // other animal, of which no more is known. Oldest first, then where the observer will be, going on as now.
   observe(past, observer, companions = []) {
     const frame = this.frame(past.at(-1));
     const egoFromWorld = inverse(frame);
+    const unturned = [0, 0, 0, 0, 0, 0];
+    const unknown = this.anticipated.map(() => [ABSENT_M, 0, 0, ...unturned, PERSON]);
     return {
       frame,
       sceneGrid: this.around(frame),
       others: Float32Array.from(
         [
           observer.map((row) => [...poseChannels(compose(egoFromWorld, row)), PERSON]),
-          ...companions.map((places) =>
-            places.map((point) => [...apply(egoFromWorld, point), 0, 0, 0, 0, 0, 0, ANIMAL]),
-          ),
+          this.ahead(observer, past.at(-1)).map((point) => [
+            ...apply(egoFromWorld, point),
+            ...unturned,
+            PERSON,
+          ]),
+          ...companions.flatMap((places) => [
+            places.map((point) => [...apply(egoFromWorld, point), ...unturned, ANIMAL]),
+            unknown,
+          ]),
         ].flat(2),
       ),
       past: Float32Array.from(past.flatMap((rows) => this.pastChannels(egoFromWorld, rows))),
     };
+  }
+
+  // Where the observer will be if it goes on as now, up to where it is nearest to the animal.
+  ahead(observer, animal) {
+    const count = Math.min(STEP_FRAMES, observer.length - 1);
+    const [now, before] = [observer.at(-1), observer.at(-1 - count)];
+    const [x, z] = [0, 2].map((axis) => (now[axis] - before[axis]) / count);
+    const nearest = ((animal[0] - now[0]) * x + (animal[2] - now[2]) * z) / Math.max(x * x + z * z, 1e-300);
+    return this.anticipated.map((frame) => {
+      const frames = nearest > 0 ? Math.min(frame, nearest) : frame;
+      return [now[0] + x * frames, now[1], now[2] + z * frames];
+    });
   }
 
   // world_from_ego at a root pose.
