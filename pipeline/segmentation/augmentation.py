@@ -15,7 +15,7 @@ SHRINKING_BLUR_PX = 0.4
 
 
 @dataclass(frozen=True)
-class Light:
+class LightVariation:
     """How much light varies."""
 
     exposure: float
@@ -55,7 +55,7 @@ def scaled_crop(
 
 
 def in_other_light(
-    color: UInt8[np.ndarray, "height width 3"], light: Light, rng: np.random.Generator
+    color: UInt8[np.ndarray, "height width 3"], light: LightVariation, rng: np.random.Generator
 ) -> Float[Tensor, "3 height width"]:
     """Return a picture as network input, -1..1, in random light and with random noise."""
     tint = np.exp(light.exposure * rng.normal()) * (1 + light.white_balance * rng.normal(size=(3, 1, 1)))

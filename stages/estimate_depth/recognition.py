@@ -19,14 +19,14 @@ from pipeline.data.clips import Clip, Masks
 from pipeline.geometry import subsampling
 from pipeline.segmentation import appearance
 from pipeline.segmentation.appearance import Appearance, Example
-from pipeline.segmentation.augmentation import Light, in_other_light, scaled_crop
+from pipeline.segmentation.augmentation import LightVariation, in_other_light, scaled_crop
 from pipeline.segmentation.grabcut import dilated, sharpened
 from stages.estimate_depth import views
 from stages.estimate_depth.foreground import ColorView
 
 PORTRAITS, ROOMS = 50, 60
 """Pictures of the turnaround and of the walk-through."""
-STEPS, BATCH, CROP_PX = 800, 8, 144
+STEPS, BATCH, CROP_PX = 1600, 8, 144
 """Training steps, crops per step, and side of a crop, pixels of small pictures."""
 ROOM_SHARE, TURNAROUND_SHARE = 0.15, 0.25
 """Shares of crops of the room alone, and of the turnaround; in the others the animal is composited."""
@@ -45,7 +45,7 @@ EDGE_BLUR_PX = 0.6
 """Standard deviation of the blur of composited outlines, pixels."""
 BLURRED_SHARE, BLUR_PX = 0.3, (0.4, 1.2)
 """Share of blurred crops and range of the standard deviation: sessions are filmed while walking."""
-LIGHT = Light(exposure=0.2, white_balance=0.06, contrast=0.2, brightness=0.1, noise=0.08)
+LIGHT = LightVariation(exposure=0.2, white_balance=0.06, contrast=0.2, brightness=0.1, noise=0.08)
 """Another day, the same phone."""
 REACH_PX = 12
 """The animal is at most this far from foreground, pixels of small pictures: parts of it resemble the room."""

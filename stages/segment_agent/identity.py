@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from pipeline.data import npz
 from pipeline.segmentation import appearance
 from pipeline.segmentation.appearance import Appearance, Example, to_batch
-from pipeline.segmentation.augmentation import Light, in_other_light, scaled_crop
+from pipeline.segmentation.augmentation import LightVariation, in_other_light, scaled_crop
 from stages.segment_agent.identities.config import Config
 
 FILE, PORTRAITS = "identities.safetensors", "portraits.npz"
@@ -36,7 +36,7 @@ PASTE_SHARE = 0.6
 """share of crops into which another animal is pasted"""
 SCALE_RANGE = (0.12, 1.4)
 """range of scales of crops relative to the turnaround, which is filmed from nearby"""
-LIGHT = Light(exposure=0.4, white_balance=0.08, contrast=0.25, brightness=0.2, noise=0.15)
+LIGHT = LightVariation(exposure=0.4, white_balance=0.08, contrast=0.25, brightness=0.2, noise=0.15)
 """sessions are filmed in other light than turnarounds, some in the evening"""
 COHERENT = 0.85
 """mean probability above which a connected component is one animal"""

@@ -491,6 +491,16 @@ def test_session_without_depth_is_read_with_estimated_depth(small_checkout):
     assert {"frames/v000", "estimated_frames/v001", "estimated_frames/v002"} <= read["reconstruction"]
 
 
+def test_sessions_without_depth_of_several_animals_do_not_wait_for_masks(small_checkout):
+    for name in ("walkthrough.r3d", "turnaround_a.mp4", "turnaround_b.mp4", "s.mp4", "t.mp4"):
+        small_checkout.write(f"captures/toy/{name}", name)
+    assert small_checkout.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
+    jobs = json.loads((small_checkout.folder / "build/toy/plan/dag.json").read_text())
+    read = {job["id"]: {each["name"] for each in job["inputs"]} for job in jobs if job["home"] == "toy"}
+    sessions = [names for job, names in read.items() if job.startswith("estimated_frames.")]
+    assert len(sessions) == 4 and not any(name.startswith("masks") for names in sessions for name in names)
+
+
 def test_make_starts_what_templates_need_first_and_long_recordings_before_short_ones(small_checkout):
     for name, size in {"walkthrough": 1, "turnaround": 1, "a": 10, "b": 30, "c": 20}.items():
         small_checkout.write(f"captures/toy/{name}.r3d", "x" * size)
