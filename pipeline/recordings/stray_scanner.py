@@ -4,6 +4,7 @@ Timestamps are the odometry's (the video's are synthetic); focal lengths are per
 """
 
 import csv
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,8 +56,8 @@ def open_recording(path: Path) -> Recording:
         raise errors.no_frames(container.where, "none has color, depth and odometry")
     index = rows.frame[valid]
     timestamp_s = movie.timestamp_s[index] if rows.timestamp_s is None else rows.timestamp_s[valid]
-    some = [container.meters(depth[int(number)]) for number in index[:: max(1, len(index) // 5)]]
-    size = some[0].shape
+    size = _depth(container, depth[int(index[0])], None).shape
+    some = [_depth(container, depth[int(number)], None) for number in index[:: max(1, len(index) // 5)]]
     if all(np.ptp(picture, axis=1).max() == 0 and np.ptp(picture) > 0 for picture in some):
         what = "every row of the depth pictures holds one value: a fault of this version of Stray Scanner"
         remedy = "update the app and record again; the depth of this recording is lost"
@@ -76,7 +77,7 @@ def open_recording(path: Path) -> Recording:
         color_size=movie.size,
         depth_size=size,
         read_color=movie.read,
-        read_depth=lambda i: container.meters(depth[i], size),
+        read_depth=lambda i: _depth(container, depth[i], size),
         read_confidence=confident if confidence else None,
         up=Y_UP,
         remarks=movie.remarks,
@@ -132,3 +133,19 @@ def _intrinsics(
         coefficients = np.tile(coefficients, (int(valid.sum()), 1))
     height, width = (size[0] / INTRINSICS_SIZE[0], size[1] / INTRINSICS_SIZE[1])
     return intrinsics_from_coefficients(coefficients * [width, height, width, height], container.where)
+
+
+def _depth(
+    container: FolderContainer, name: str, size: tuple[int, int] | None
+) -> Float[np.ndarray, "height width"]:
+    """Read uint16 millimeters from PNG, or `.npy` of older apps, as meters. Raises CAP-008."""
+    if not name.endswith(".npy"):
+        return container.meters(name, size)
+    try:
+        raw = np.load(io.BytesIO(container.read(name)), allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise errors.wrong_depth(container.place(name), str(error)) from error
+    if raw.ndim != 2 or raw.dtype != np.uint16:
+        raise errors.wrong_depth(container.place(name), f"{raw.dtype} {raw.shape}")
+    errors.refuse_other_size(raw.shape, size, container.place(name))
+    return raw.astype(np.float32) / np.float32(1000)

@@ -6,6 +6,7 @@ import struct
 from fractions import Fraction
 
 import av
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -194,6 +195,19 @@ def test_all_versions_of_stray_scanner_are_read(tmp_path, columns):
     np.testing.assert_allclose(np.abs(recording.pose), np.abs(made_formats.quaternion_poses(made)), atol=1e-9)
     if columns > 7:  # the oldest version has only the timestamps of the video
         np.testing.assert_allclose(recording.timestamp_s, made.timestamp_s, atol=1e-6)
+
+
+def test_npy_depth_of_old_stray_scanners_is_read(tmp_path):
+    path = made_formats.stray(tmp_path / "a", walk(6, quarter_turns=LANDSCAPE))
+    before = [open_recording(path).read_depth(number) for number in range(6)]
+    for picture in sorted((path / "depth").glob("*.png")):
+        np.save(picture.with_suffix(".npy"), cv2.imread(str(picture), cv2.IMREAD_UNCHANGED))
+        picture.unlink()
+    recording = open_recording(path)
+    np.testing.assert_array_equal([recording.read_depth(number) for number in range(6)], before)
+    np.save(path / "depth/000000.npy", np.ones((4, 4)))
+    with pytest.raises(InputError, match="CAP-008"):
+        open_recording(path)
 
 
 @pytest.mark.parametrize(("app", "folder"), [("stray", "confidence"), ("polycam", "keyframes/confidence")])
