@@ -285,7 +285,7 @@ def test_appearance_is_learned_despite_label_noise():
 def test_small_animals_weigh_more():
     counted, animal = torch.ones(2, 100, 100, dtype=torch.bool), torch.zeros(2, 100, 100, dtype=torch.bool)
     animal[0, :10, :10], animal[1, :50, :50] = True, True
-    weight = appearance._balanced(counted, animal)
+    weight = appearance.balanced(counted, animal)
     assert weight[0][animal[0]].sum() == appearance.ANIMAL_SHARE * 100**2
     assert (weight[0][~animal[0]] == 1).all() and (weight[1] == 1).all()
 
