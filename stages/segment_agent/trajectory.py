@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import cache, partial
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from pipeline.data.clips import Clip, back_project_pixels, usable_depth
 from pipeline.data.flow import STRIDE_PX, open_flow
@@ -71,13 +71,16 @@ def estimate_without_movers(clip: Clip, flow: Path, references: int, seed: int) 
     poses = path.world_from_camera
     voting = free_space.gather(clip, poses, references)
 
-    @lru_cache(maxsize=2)
-    def static_depth(frame: int) -> Float[np.ndarray, "height width"]:
+    @cache
+    def near_movers(frame: int) -> UInt8[np.ndarray, "row column"]:
         depth = usable_depth(clip, frame, keep_steps=False)
         points = free_space.world_points(clip, frame, poses[frame], depth, MOVING_STRIDE)
         moving = movers.moving(free_space.vote(voting, points, frame)).astype(np.uint8)
-        near = cv2.dilate(cv2.erode(moving, OPENING), DILATION)
-        return np.where(cv2.resize(near, depth.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0, 0, depth)
+        return cv2.dilate(cv2.erode(moving, OPENING), DILATION)
+
+    def static_depth(frame: int) -> Float[np.ndarray, "height width"]:
+        near = cv2.resize(near_movers(frame), clip.depth_size[::-1], interpolation=cv2.INTER_NEAREST)
+        return np.where(near > 0, 0, usable_depth(clip, frame, keep_steps=False))
 
     return estimate_trajectory(clip, flow, np.random.default_rng(seed), static_depth)
 
