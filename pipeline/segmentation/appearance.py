@@ -6,9 +6,10 @@ learns the appearance. `learn` trains it; `Appearance.log_odds` segments a pictu
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -46,6 +47,8 @@ MIN_PX = 60
 """minimum animal pixels of an example"""
 CONTRAST, BRIGHTNESS = 0.2, 0.15
 """standard deviations of the augmentation of contrast (share) and brightness (of -1..1)"""
+
+Network = TypeVar("Network", bound=nn.Module)
 
 
 @dataclass(frozen=True)
@@ -122,9 +125,7 @@ def learn(
     if not pool:
         return None
     pool += room
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(rng.integers(2**31)))
-        network = Appearance(channels=pool[0].color.shape[-1])
+    network = initialized(lambda: Appearance(channels=pool[0].color.shape[-1]), rng)
     optimizer = torch.optim.AdamW(network.parameters(), RATE, weight_decay=WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=options.steps)
     hard_negatives = None
@@ -139,15 +140,31 @@ def learn(
             crops.append(_crop(example, middle, options.crop_px, rng))
         color, labels = (torch.stack(parts) for parts in zip(*crops, strict=True))
         found = network(color)
-        loss = F.binary_cross_entropy_with_logits(found, (labels == 255).float(), reduction="none")
         contradicted = torch.where(labels == 255, -found, found) > CONTRADICTION_LOG_ODDS
         counted = (labels != 128) & ~(contradicted & (step > LABEL_TRUST_SHARE * options.steps))
-        weight = balanced(counted, labels == 255)
         optimizer.zero_grad()
-        ((loss * weight).sum() / weight.sum().clamp(min=1)).backward()
+        balanced_loss(found, labels, counted).backward()
         optimizer.step()
         schedule.step()
     return fold_batch_norms(network.eval())
+
+
+def initialized(build: Callable[[], Network], rng: np.random.Generator) -> Network:
+    """Return a network whose initial weights ``rng`` determines."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(rng.integers(2**31)))
+        return build()
+
+
+def balanced_loss(
+    found: Float[Tensor, "batch height width"],
+    labels: UInt8[Tensor, "batch height width"],
+    counted: Bool[Tensor, "batch height width"],
+) -> Float[Tensor, ""]:
+    """Return the mean cross-entropy of log-odds with labels (255: animal) where ``counted``, `balanced`."""
+    loss = F.binary_cross_entropy_with_logits(found, (labels == 255).float(), reduction="none")
+    weight = balanced(counted, labels == 255)
+    return (loss * weight).sum() / weight.sum().clamp(min=1)
 
 
 def balanced(

@@ -43,10 +43,8 @@ def scaled_crop(
 
     Beyond the picture labels are ``outside`` and colors continue.
     """
-    row, column = place
-    source = np.array(
-        [[1 / scale, 0, column - shift_px[0] / scale], [0, 1 / scale, row - shift_px[1] / scale]]
-    )
+    left, top = np.array(place)[::-1] - shift_px / scale
+    source = np.array([[1 / scale, 0, left], [0, 1 / scale, top]])
     linear, nearest = (how | cv2.WARP_INVERSE_MAP for how in (cv2.INTER_LINEAR, cv2.INTER_NEAREST))
     if scale < 1:
         color = cv2.GaussianBlur(color, (0, 0), SHRINKING_BLUR_PX / scale)

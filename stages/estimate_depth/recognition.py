@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
@@ -54,19 +53,17 @@ Crop = tuple[UInt8[np.ndarray, "side side 3"], UInt8[np.ndarray, "side side"]]
 
 def rooms_of(walk: Clip) -> list[UInt8[np.ndarray, "height width 3"]]:
     """Return evenly spread small pictures of the walk-through."""
-    frames, size = subsampling.evenly(len(walk), ROOMS).tolist(), views.small_size(walk.color_size)
-    return [cv2.resize(walk.color(frame), size[::-1], interpolation=cv2.INTER_AREA) for frame in frames]
+    return [views.small(walk.color(frame)) for frame in subsampling.evenly(len(walk), ROOMS).tolist()]
 
 
 def portraits_of(turnaround: Clip, masks: Masks) -> list[Example]:
     """Return evenly spread small pictures of the turnaround with labels: 255 animal, 0 not, 128 unknown."""
-    found, size = [], views.small_size(turnaround.color_size)
+    found = []
     for frame in subsampling.evenly(len(turnaround), PORTRAITS).tolist():
-        labels = cv2.resize(masks[frame], size[::-1], interpolation=cv2.INTER_NEAREST)
-        if (labels == 255).any():
-            color = cv2.resize(turnaround.color(frame), size[::-1], interpolation=cv2.INTER_AREA)
-            found.append(Example(color, labels))
-    return found
+        color = views.small(turnaround.color(frame))
+        labels = cv2.resize(masks[frame], color.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+        found.append(Example(color, labels))
+    return [each for each in found if (each.labels == 255).any()]
 
 
 def learn(
@@ -76,19 +73,15 @@ def learn(
 ) -> Appearance:
     """Train the network on portraits of the animal and pictures of the room without it."""
     empty = [Example(room, np.zeros(room.shape[:2], np.uint8)) for room in rooms]
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(rng.integers(2**31)))
-        network = Appearance()
+    network = appearance.initialized(Appearance, rng)
     optimizer = torch.optim.AdamW(network.parameters(), appearance.RATE, weight_decay=appearance.WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, appearance.RATE, total_steps=STEPS)
     for _ in track(range(STEPS), "learning the animal's appearance"):
         network.train()
         crops = [_augmented(_training_crop(portraits, empty, rng), rng) for _ in range(BATCH)]
         color, labels = (torch.stack(parts) for parts in zip(*crops, strict=True))
-        loss = F.binary_cross_entropy_with_logits(network(color), (labels == 255).float(), reduction="none")
-        weight = appearance.balanced(labels != 128, labels == 255)
         optimizer.zero_grad()
-        ((loss * weight).sum() / weight.sum().clamp(min=1)).backward()
+        appearance.balanced_loss(network(color), labels, labels != 128).backward()
         optimizer.step()
         schedule.step()
     return appearance.fold_batch_norms(network.eval())
@@ -130,9 +123,8 @@ def _training_crop(portraits: Sequence[Example], empty: Sequence[Example], rng: 
     animal = labels == 255
     shaded = _with_shadow(background[0], animal, rng)
     opacity = cv2.GaussianBlur(animal.astype(np.float32), (0, 0), EDGE_BLUR_PX)[..., None]
-    return (opacity * color + (1 - opacity) * shaded).astype(np.uint8), np.where(animal, 255, 0).astype(
-        np.uint8
-    )
+    composite = opacity * color + (1 - opacity) * shaded
+    return composite.astype(np.uint8), np.where(animal, 255, 0).astype(np.uint8)
 
 
 def _crop(

@@ -40,16 +40,16 @@ class View:
     """Of the surface, meters; 0 where there is none."""
 
 
-def small_size(size: tuple[int, ...]) -> tuple[int, int]:
-    """Return the (height, width) of small pictures of a recording."""
-    scale = min(1.0, SHORTER_PX / min(size[:2]))
-    return round(size[0] * scale), round(size[1] * scale)
+def small(picture: UInt8[np.ndarray, "height width *channel"]) -> UInt8[np.ndarray, "row column *channel"]:
+    """Reduce a picture to `SHORTER_PX` on the shorter side; smaller ones stay as they are."""
+    scale = min(1.0, SHORTER_PX / min(picture.shape[:2]))
+    size = round(picture.shape[1] * scale), round(picture.shape[0] * scale)
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
 
 def small_gray(color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "small_height small_width"]:
     """Reduce a picture and equalise its contrast."""
-    size = small_size(color.shape)
-    gray = cv2.resize(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), size[::-1], interpolation=cv2.INTER_AREA)
+    gray = small(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY))
     return cv2.createCLAHE(CLAHE_CLIP, CLAHE_TILES).apply(gray)
 
 

@@ -156,9 +156,7 @@ def learn_identities(
     portraits: Sequence[Portrait], names: Sequence[str], config: Config, rng: np.random.Generator
 ) -> Identities:
     """Train the network on portraits of every animal."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(rng.integers(2**31)))
-        network = Identities(names)
+    network = appearance.initialized(lambda: Identities(names), rng)
     optimizer = torch.optim.AdamW(network.parameters(), appearance.RATE, weight_decay=appearance.WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, appearance.RATE, total_steps=config.steps)
     own = [[each for each in portraits if each.animal == index] for index in range(len(names))]
