@@ -26,7 +26,6 @@ from pipeline.behavior.trajectories import (
     anticipated,
     anticipated_frames,
     nearest,
-    nearest_first,
 )
 from pipeline.geometry import rigid
 
@@ -132,7 +131,7 @@ def observe(
     ego_from_world = rigid.inverse(frame)
     companions, companion, agent = context.companions, None, context.world_from_agent[:, -1, :3, 3]
     if companions is not None:
-        companion, companions = nearest_first(companions, agent), nearest(companions, agent)
+        companions, companion = nearest(companions, agent)
         companions[..., :3] = rigid.apply(ego_from_world[:, None], companions[..., :3])
     others = model.other_channels(ego_from_world[:, None] @ context.world_from_observer, companions)
     if future:

@@ -203,7 +203,8 @@ class AnimalBatch:
             new = PoseFrames(plan.root[mine], plan.bones[mine])
             new = blended_frames(old, new, self.chaining.blend_frames)
             self.plan.root[animal], self.plan.bones[animal] = new.root, new.bones
-        self.plan.root[some, :, :3, 3] = self._where_allowed(self.plan.root[some, :, :3, 3], some)
+        blended = some, slice(self.chaining.blend_frames), slice(3), 3
+        self.plan.root[blended] = self._where_allowed(self.plan.root[blended], some)
         self.played[some], self.planned_others[some] = 0, self._others_now()[some]
 
     def _intent(self, some: Int[np.ndarray, "some"]) -> Float[np.ndarray, "some frame 3"]:

@@ -289,7 +289,7 @@ class BehaviorData:
             some = slice(begin, begin + WINDOWS_AT_ONCE)
             there = self._companions(index[some], self.start[index[some]][:, None] + np.arange(self.past))
             if there is not None:
-                parts.append(nearest(there, agent[some]))
+                parts.append(nearest(there, agent[some])[0])
         most = max((part.shape[1] for part in parts), default=0)
         whole = np.zeros((len(index), most, self.past, 4), np.float32)
         whole[..., :3] = agent[:, None, None] + np.array([ABSENT_M, 0.0, 0.0])
@@ -307,32 +307,26 @@ def as_companions(
     return np.concatenate([positions_world, kind], axis=-1)
 
 
-def nearest_first(
-    companions: Float[np.ndarray, "window companion past_frame 4"], agent: Float[np.ndarray, "window 3"]
-) -> Int[np.ndarray, "window some"]:
-    """Return the indices of the companions that `nearest` returns, the nearest one first."""
-    level = [0, 2]
-    distance = np.linalg.norm(companions[:, :, -1, level] - agent[:, None, level], axis=-1)
-    count = min(int(np.isfinite(distance).sum(1).max(initial=0)), MAX_COMPANIONS)
-    return np.argsort(np.nan_to_num(distance, nan=np.inf), axis=1, kind="stable")[:, :count]
-
-
 def nearest(
     companions: Float[np.ndarray, "window companion past_frame 4"], agent: Float[np.ndarray, "window 3"]
-) -> Float[np.ndarray, "window some past_frame 4"]:
-    """Return the companions nearest to the agent's current position, at most `MAX_COMPANIONS`.
+) -> tuple[Float[np.ndarray, "window some past_frame 4"], Int[np.ndarray, "window some"]]:
+    """Return the companions nearest to the agent's current position, at most `MAX_COMPANIONS`, the nearest
+    first, and their indices.
 
     Positions are meters in one frame. Companions with NaN in the last frame are absent; earlier frames that
     are unknown take the first known position, so that nothing of the future is needed.
     """
-    order = nearest_first(companions, agent)
+    level = [0, 2]
+    distance = np.linalg.norm(companions[:, :, -1, level] - agent[:, None, level], axis=-1)
+    count = min(int(np.isfinite(distance).sum(1).max(initial=0)), MAX_COMPANIONS)
+    order = np.argsort(np.nan_to_num(distance, nan=np.inf), axis=1, kind="stable")[:, :count]
     some = np.take_along_axis(companions, order[..., None, None], axis=1)
     for frame in range(some.shape[2] - 2, -1, -1):
         unknown = np.isnan(some[:, :, frame]).any(-1)
         some[:, :, frame][unknown] = some[:, :, frame + 1][unknown]
     absent = np.asarray(np.isnan(some[:, :, -1]).any(-1))
     far = np.pad(agent + np.array([ABSENT_M, 0.0, 0.0]), ((0, 0), (0, 1)))
-    return np.where(absent[..., None, None], far[:, None, None], some)
+    return np.where(absent[..., None, None], far[:, None, None], some), order
 
 
 def blended_frames(old: PoseFrames, new: PoseFrames, frames: int) -> PoseFrames:

@@ -110,10 +110,10 @@ def test_nearest_companions_are_perceived():
     others[2, 4, :-1] = np.nan  # has just arrived
     others[2, 4, -1, :3] = 0.1
     agent = np.zeros((3, 3))
-    some = nearest(others, agent)
+    some, order = nearest(others, agent)
     assert some.shape[1] == MAX_COMPANIONS and np.isfinite(some).all()
     assert (some[0, :, :, 0] == ABSENT_M).all()
-    assert not (some[1] == others[1, 3, 0]).all(-1).any()
+    assert not (some[1] == others[1, 3, 0]).all(-1).any() and order[2, 0] == 4
     np.testing.assert_array_equal(some[2, 0], np.repeat(others[2, 4, -1:], PAST, 0))
     away = np.linalg.norm(some[2, :, -1][:, [0, 2]], axis=1)
     assert (np.diff(away) >= 0).all()
