@@ -17,14 +17,16 @@ from stages.export_simulator.reading import support_contract
 
 SOURCES = Path(__file__).parents[3] / "stages/export_simulator/web/src"
 ASK = """
-import { nearestAllowed } from '%(sources)s/clearing.js';
+import { FreeSpace } from '%(sources)s/clearing.js';
 import { Senses } from '%(sources)s/senses.js';
 import { Support } from '%(sources)s/support.js';
+import { Timeline } from '%(sources)s/timeline.js';
 const { volume, marks, paths, fastest } = JSON.parse(await new Response(process.stdin).text());
 const senses = Object.create(Senses.prototype);
 const allowed = Uint8Array.from(marks);
-Object.assign(senses, { volume, allowed, nearest: nearestAllowed(allowed, volume.shape.slice(1)), support: new
-Support(volume, allowed) }); const told = paths.map((path) => %(answer)s); console.log(JSON.stringify(told));
+const space = new FreeSpace(volume, allowed);
+Object.assign(senses, { volume, space, support: new Support(volume, allowed) });
+console.log(JSON.stringify(paths.map((path) => %(answer)s)));
 """
 needs_node = pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 
@@ -86,7 +88,7 @@ def test_page_and_python_project_points_to_the_same_free_space(free):
     ours = Scenes((scene,), (allowed,), np.zeros(1, int)).out_of_solid(points, None)
     volume = {"shape": [1, *allowed.shape], "origin": scene.origin.tolist(), "voxel_m": 0.1}
     theirs = page_answers(
-        "path.map((point) => senses.cleared(point))",
+        "path.map((point) => space.cleared(point))",
         volume=volume,
         marks=allowed.ravel().astype(int).tolist(),
         paths=points.tolist(),
@@ -101,6 +103,47 @@ def test_page_and_python_project_points_to_the_same_free_space(free):
     same = (mine == other).all(-1)
     np.testing.assert_allclose(theirs[same], ours[same], atol=1e-12)
     assert same.mean() > 0.7
+
+
+@needs_node
+def test_page_and_python_project_blends_of_plans_to_the_same_free_space():
+    """Two plans pass pillars on different sides; a new one fades in over four ticks from tick 5."""
+    rng, frames = np.random.default_rng(3), 12
+    allowed = np.ones((30, 6, 30), bool)
+    for x, z in rng.integers(1, 28, (60, 2)):
+        allowed[x : x + 2, :, z : z + 2] = False
+    scene = FeatureVolume(
+        np.zeros((1, *allowed.shape), np.float32), (~allowed).astype(np.uint8), np.array([-1.5, 0, -1.5]), 0.1
+    )
+    scenes = Scenes((scene,), (allowed,), np.zeros(1, int))
+    begin, end = rng.uniform([-1, 0.2, -1], [1, 0.4, 1], (2, 80, 2, 1, 3))
+    plans = begin + (end - begin) * np.linspace(0, 1, frames)[:, None]
+    plans = scenes.out_of_solid(plans, None).astype(np.float32)
+    linear = np.arange(1, 5)[:, None] / 4
+    share = linear**2 * (3 - 2 * linear)
+    old, new = plans[:, 0, 5:9].astype(float), plans[:, 1, :4].astype(float)
+    blend = old + share * (new - old)
+    theirs = page_answers(
+        """(() => {
+          const rows = path.map((plan) => plan.map((place) => Float32Array.of(...place, 1, 0, 0, 0)));
+          const timeline = new Timeline([rows[0][0]], 0, (place) => space.cleared(place));
+          timeline.follow(0, rows[0], -9);
+          timeline.follow(5, rows[1], 5);
+          return [6, 7, 8, 9].map((tick) => Array.from(timeline.at(tick).subarray(0, 3)));
+        })()""",
+        volume={"shape": [1, *allowed.shape], "origin": scene.origin.tolist(), "voxel_m": 0.1},
+        marks=allowed.ravel().astype(int).tolist(),
+        paths=plans.tolist(),
+    )
+    assert scenes.inside_solid(blend, None).mean() > 0.05, "blends of plans cut pillars"
+    assert not scenes.inside_solid(theirs, None).any()
+    ours = scenes.out_of_solid(blend, None)
+    own, mine, other = (scene.voxel(part)[0] for part in (blend, ours, theirs))
+    far = [((part - own) ** 2).sum(-1) for part in (mine, other)]
+    np.testing.assert_array_equal(*far, "as near, where several voxels are")
+    same = (mine == other).all(-1)
+    np.testing.assert_allclose(theirs[same], ours[same], atol=1e-6)
+    assert same.mean() > 0.9 and (np.abs(ours - blend)[same] > 0.01).any(), "meters"
 
 
 @needs_node

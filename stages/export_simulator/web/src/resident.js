@@ -4,6 +4,7 @@
 import * as assets from './assets.js';
 import { Animal } from './animal.js';
 import { clearanceOf } from './avoidance.js';
+import { FreeSpace } from './clearing.js';
 import { Clips } from './clips.js';
 import { Overlays } from './overlays.js';
 import { distance } from './path_encoding.js';
@@ -42,6 +43,7 @@ export class Resident {
     resident.occupancy = await assets.bytes(`${prefix}occupancy`);
     resident.detour = null;
     resident.support = new Support(contract.volume, resident.allowed);
+    resident.space = new FreeSpace(contract.volume, resident.allowed);
     resident.place = [0, floor, 0];
     resident.clearance = clearanceOf(contract.behavior.agent_from_bone_rest);
     return resident;
@@ -78,7 +80,7 @@ export class Resident {
   // Begin at a moment of its clips; the person has stood where it stands.
   begin(moment) {
     this.take = new Take();
-    this.timeline = new Timeline(moment.frames);
+    this.timeline = this.timed(moment.frames);
     this.turnNumber = 0;
     this.planStart = 0;
     this.waiting = false;
@@ -94,6 +96,14 @@ export class Resident {
     if (this.clip) this.replay(this.clip.name === moment.clip.name ? moment.last : this.count - 1);
   }
 
+  // A line in time whose blends of plans stay where plans do.
+  timed(past, tick) {
+    const { avoid_solid: kept } = this.contract.behavior.sampling;
+    return new Timeline(past, tick, (place) =>
+      kept && this.home.state.scene ? this.space.cleared(place) : place,
+    );
+  }
+
   // Live, replay a clip, or be away, from now on.
   change(does) {
     if (this.does === does) return;
@@ -103,13 +113,13 @@ export class Resident {
     this.urgent = true;
     this.overlays.plan = null;
     this.overlays.refresh();
-    this.timeline = new Timeline(this.timeline.past(this.count), Math.floor(this.home.now));
+    this.timeline = this.timed(this.timeline.past(this.count), Math.floor(this.home.now));
     if (this.clip) this.replay(this.count - 1);
   }
 
   // Furniture has been moved: plan anew, and wait for that plan where the one that is followed would cross it.
   rearranged(support, detour) {
-    Object.assign(this, { support, detour });
+    Object.assign(this, { support, detour, space: new FreeSpace(support.volume, support.allowed) });
     if (!this.timeline) return;
     this.epoch += 1;
     this.waiting = false;
@@ -129,7 +139,7 @@ export class Resident {
       Array.from({ length: to - from }, (_, i) => clips.frame(clip, Math.max(0, from + i)));
     const now = Math.floor(this.home.now);
     const last = Math.min(tick, clip.count - 2);
-    this.timeline = new Timeline(frames(last + 1 - this.count, last + 1), now);
+    this.timeline = this.timed(frames(last + 1 - this.count, last + 1), now);
     this.timeline.follow(now, frames(last + 1, clip.count), now);
   }
 

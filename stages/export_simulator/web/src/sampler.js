@@ -167,7 +167,7 @@ export class Sampler {
     for (let at = 0; at < scaled.length; at += length) {
       const mine = scaled.subarray(at, at + length);
       const moved = this.placesOf(mine, start).map((place) =>
-        apply(egoFromWorld, this.senses.cleared(apply(frame, place))),
+        apply(egoFromWorld, this.senses.space.cleared(apply(frame, place))),
       );
       out.set(this.channelsAlong(mine, start, moved), at);
     }
@@ -323,7 +323,7 @@ export class Sampler {
 
   // The numbers of goals, those that lie in the allowed space first, otherwise as sampled.
   insideFirst(goals) {
-    const inside = goals.map((goal) => this.senses.allows(goal));
+    const inside = goals.map((goal) => this.senses.space.allows(goal));
     return goals.map((_, i) => i).sort((a, b) => inside[b] - inside[a] || a - b);
   }
 
@@ -363,7 +363,10 @@ export class Sampler {
   // carries it.
   constrained(frame, start, places, { frame: perceived, detour, bodies }) {
     const egoFromWorld = inverse(frame);
-    const [from, clear] = [apply(frame, start), (place) => (perceived ? this.senses.cleared(place) : place)];
+    const [from, clear] = [
+      apply(frame, start),
+      (place) => (perceived ? this.senses.space.cleared(place) : place),
+    ];
     const wanted = places.map((place) => apply(frame, place));
     const avoiding = bodies.reduceRight(
       (path, body) => aroundPerson(path, from, body, this.clearance, clear),
@@ -400,7 +403,7 @@ export class Sampler {
       const places = this.positions(paths.subarray(i * length, (i + 1) * length)).map((place) =>
         apply(frame, place),
       );
-      const outside = places.filter((place) => !this.senses.allows(place)).length;
+      const outside = places.filter((place) => !this.senses.space.allows(place)).length;
       const off = intent.reduce((sum, place, frames) => sum + distance(places[frames], place), 0);
       return { i, outside, off };
     });

@@ -2,7 +2,7 @@
 // The counterpart of pipeline/behavior/perception.py and behavior.py; both are held together by a golden
 // plan.
 
-import { nearestAllowed } from './clearing.js';
+import { FreeSpace } from './clearing.js';
 import { Detour } from './detour.js';
 import { Grid, movedFeatures } from './furniture.js';
 import { Support } from './support.js';
@@ -26,7 +26,6 @@ const [PERSON, ANIMAL] = [0, 1]; // kinds of others
 const ABSENT_M = 1000; // where somebody is put who is not there
 const TURNS = 8; // by which goals get out of something solid, up to a right angle either way
 const STEP_FRAMES = 3; // that give the velocity at which the observer is expected to go on
-const WITHIN = 0.01; // how far inside an allowed voxel a point is put, in edges of the voxel
 
 export class Senses {
   // contract: simulator.json; volume: half-precision features, channel first; allowed: bytes per voxel.
@@ -47,8 +46,7 @@ export class Senses {
     const { recorded, about: volume } = this;
     const values = moves.length ? movedFeatures(recorded, new Grid(volume), moves) : recorded;
     this.volume = { ...volume, values };
-    this.allowed = allowed;
-    this.nearest = nearestAllowed(allowed, volume.shape.slice(1));
+    this.space = new FreeSpace(volume, allowed);
     this.support = new Support(this.volume, allowed);
     this.detour = moves.length ? new Detour(volume, allowed, moves, band) : null;
   }
@@ -133,41 +131,9 @@ export class Senses {
     return out;
   }
 
-  // Whether the root may be at a point of the world; nowhere outside the volume.
-  allows(point) {
-    const {
-      shape: [, vx, vy, vz],
-      origin,
-      voxel_m: voxel,
-    } = this.volume;
-    const [a, b, c] = [0, 1, 2].map((axis) => Math.floor((point[axis] - origin[axis]) / voxel));
-    return (
-      a >= 0 && b >= 0 && c >= 0 && a < vx && b < vy && c < vz && this.allowed[(a * vy + b) * vz + c] > 0
-    );
-  }
-
-  // A point of the world, moved to the nearest voxel where the root may be; the point itself where it may be
-  // there, or nowhere.
-  cleared(point) {
-    const {
-      shape: [, vx, vy, vz],
-      origin,
-      voxel_m: voxel,
-    } = this.volume;
-    const clamped = [vx, vy, vz].map((count, axis) =>
-      Math.min(count - 1, Math.max(0, Math.floor((point[axis] - origin[axis]) / voxel))),
-    );
-    const target = this.nearest[(clamped[0] * vy + clamped[1]) * vz + clamped[2]];
-    if (target < 0 || this.allows(point)) return point;
-    return [Math.floor(target / (vy * vz)), Math.floor(target / vz) % vy, target % vz].map((index, axis) => {
-      const low = origin[axis] + (index + WITHIN) * voxel;
-      return Math.min(low + (1 - 2 * WITHIN) * voxel, Math.max(low, point[axis]));
-    });
-  }
-
   // A goal, turned about where the animal is, as little as possible, to where the root may be; else cleared.
   turnedFree(goal, start) {
-    const [cleared, [x, y, z]] = [this.cleared(goal), goal.map((value, axis) => value - start[axis])];
+    const [cleared, [x, y, z]] = [this.space.cleared(goal), goal.map((value, axis) => value - start[axis])];
     const nearer = (cleared[0] - goal[0]) * z >= (cleared[2] - goal[2]) * x ? 1 : -1;
     for (let turns = 0; turns <= 2 * TURNS; turns++) {
       const angle = (nearer * Math.ceil(turns / 2) * (turns % 2 ? 1 : -1) * Math.PI) / 2 / TURNS;
@@ -175,7 +141,7 @@ export class Senses {
       const turned = [cosine * x + sine * z, y, cosine * z - sine * x].map(
         (value, axis) => start[axis] + value,
       );
-      if (this.allows(turned)) return turned;
+      if (this.space.allows(turned)) return turned;
     }
     return cleared;
   }

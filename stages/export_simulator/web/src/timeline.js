@@ -7,8 +7,9 @@ const FADE_TICKS = 4;
 const HOLD_TICKS = 10; // an animal that has to wait stands so long, unless a plan comes before
 
 export class Timeline {
-  // Start from frames of the past; the last of them is this tick.
-  constructor(past, tick = 0) {
+  // Start from frames of the past; the last of them is this tick. clear: moves a place to where the root may be.
+  constructor(past, tick = 0, clear = (point) => point) {
+    this.clear = clear;
     this.history = past.map((frame) => Float32Array.from(frame));
     this.lastTick = tick;
     this.base = this.history.at(-1);
@@ -37,11 +38,28 @@ export class Timeline {
     return plan ? plan.start + plan.frames.length - now : 0;
   }
 
-  // The pose at a time: each plan is blended over the one before it.
+  // The pose at a time: each plan is blended over the one before it. Both are where the root may be, what is
+  // between them need not be: it is moved there at every tick, as in Python, and in between along with them.
   at(now) {
+    const pose = this.blended(now);
+    if (this.plans.length < 2 || share(this.plans.at(-1), now) >= 1) return pose;
+    const [before, after] = [this.pushed(Math.floor(now)), this.pushed(Math.ceil(now))];
+    for (let axis = 0; axis < 3; axis++)
+      pose[axis] += before[axis] + (now - Math.floor(now)) * (after[axis] - before[axis]);
+    return pose;
+  }
+
+  blended(now) {
     let pose = this.base;
     for (const plan of this.plans) pose = blend(pose, sample(plan, now), share(plan, now));
     return pose;
+  }
+
+  // How far the root of a blend is moved at a tick.
+  pushed(tick) {
+    const place = Array.from(this.blended(tick).subarray(0, 3));
+    const free = this.clear(place);
+    return place.map((value, axis) => free[axis] - value);
   }
 
   // Write down every tick that has passed, so that the next plan knows its past.
