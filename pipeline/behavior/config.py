@@ -47,8 +47,8 @@ class PlanSamplingConfig:
     """Scale s of classifier-free guidance, for bodies at most 1. Of 1, 1.25, 1.5, 2 it has the least energy
     score of goals and the right share of flights in left-out sessions of the built-in cat."""
     companions_guidance: float | tuple[float, ...] = 1.0
-    """Guidance scale of companions, where the reference keeps all other conditions; or one scale of each, in
-    the order in which a context holds them, where the reference lacks only that one."""
+    """Guidance scale of companions, for bodies at most 1, where the reference keeps all other conditions; or
+    one scale of each, in the order in which a context holds them, where the reference lacks only that one."""
     scene: bool = True
     """Condition on the scene."""
     observer: bool = True
@@ -71,6 +71,12 @@ class PlanSamplingConfig:
     max_path_draws: int = 3
     """Maximum draws of a path until it reaches its goal. Paths drawn once rest too often: 67 % of the time,
     against 64 % with up to three draws and 63 % in truth (four held-out homes)."""
+
+    def for_bodies(self) -> "PlanSamplingConfig":
+        """Return settings under which guidance amplifies nobody: bodies would be contorted."""
+        scales = self.companions_guidance
+        most = tuple(min(each, 1.0) for each in scales) if isinstance(scales, tuple) else min(scales, 1.0)
+        return replace(self, guidance=min(self.guidance, 1.0), companions_guidance=most)
 
     def networks_only(self) -> "PlanSamplingConfig":
         """Return settings under which plans are what the networks predict, as in the paper: not projected out

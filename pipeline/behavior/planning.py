@@ -20,13 +20,7 @@ from pipeline.behavior.encoders import with_anticipated
 from pipeline.behavior.path_encoding import PATH_CHANNELS_OF, goal_error, snapped_to_goal
 from pipeline.behavior.perception import POSITION, FeatureVolume, world_from_ego
 from pipeline.behavior.scenes import SceneConstraint, Scenes
-from pipeline.behavior.trajectories import (
-    ABSENT_M,
-    Context,
-    anticipated,
-    anticipated_frames,
-    nearest,
-)
+from pipeline.behavior.trajectories import ABSENT_M, Context, anticipated, anticipated_frames, nearest
 from pipeline.geometry import rigid
 
 Array = np.ndarray
@@ -304,8 +298,7 @@ class Sampler:
 
         shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
         denoisers = [denoise(codes.full, 1.0), *map(denoise, codes.references)]
-        guidance = min(codes.sampling.guidance, 1.0)
-        solver, steps = self.of_sequences(replace(codes.sampling, guidance=guidance))
+        solver, steps = self.of_sequences(codes.sampling.for_bodies())
         body = self._denoised(denoisers, shape, solver, steps, rng, noise_std=solver.body_noise_std)
         return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
 

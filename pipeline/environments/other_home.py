@@ -1,11 +1,13 @@
-"""The animal of one build in the reconstructed home of another; both homes are in meters.
+"""The animals of one build in the reconstructed home of another; both homes are in meters.
 
-`ReconstructedHome.of_build` opens the home of a finished build. `move_in` puts an animal into another home:
+`ReconstructedHome.of_build` opens the home of a finished build. `move_in` puts an animal into another home,
+`move_in_together` all animals of a home:
 features are converted to the basis that its model was trained on, recorded moments are placed on the other
 floor, and `share_known` measures how much of the other home looks like its own.
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,6 +25,7 @@ from pipeline.behavior.support import SUPPORTED, Support, floor_level
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, Trajectory
 from pipeline.core.errors import InputError
 from pipeline.data import npz
+from pipeline.environments.moments import moments_together, recorded_at
 from pipeline.geometry import rigid, subsampling
 from pipeline.workflow import artifact
 
@@ -118,12 +121,22 @@ class MovedAnimal:
 
 
 def move_in(own: ReconstructedHome, other: ReconstructedHome, data: BehaviorData) -> MovedAnimal:
-    """Put the animal of ``own`` and ``data`` into the other home. Raises ART-007 and SIM-011 as `perceived`
-    does, SIM-011 where no moment fits in.
+    """Put the animal of ``own`` and ``data`` into the other home, as `move_in_together` does."""
+    return move_in_together({"": (own, data)}, other)[""]
+
+
+def move_in_together(
+    animals: Mapping[str, tuple[ReconstructedHome, BehaviorData]], other: ReconstructedHome
+) -> dict[str, MovedAnimal]:
+    """Put all animals of a home, each as it perceives it and with its recordings, into the other home.
+
+    Raises ART-007 and SIM-011 as `perceived` does, SIM-011 where no moment fits in.
     """
-    seen = replace(perceived(own, other), stands_m=own.stands_m)
-    starts = place_starts(data, own, seen, np.random.default_rng(0))
-    return MovedAnimal(seen, starts, share_known(own, seen))
+    owns = {name: own for name, (own, _) in animals.items()}
+    seen = {name: replace(perceived(own, other), stands_m=own.stands_m) for name, own in owns.items()}
+    recorded = {name: data for name, (_, data) in animals.items()}
+    starts = place_starts(recorded, owns, next(iter(seen.values())), np.random.default_rng(0))
+    return {name: MovedAnimal(seen[name], starts[name], share_known(owns[name], seen[name])) for name in seen}
 
 
 def perceived(own: ReconstructedHome, other: ReconstructedHome) -> ReconstructedHome:
@@ -191,32 +204,41 @@ def _surface(home: ReconstructedHome) -> tuple[Float[np.ndarray, "cell 17"], Flo
 
 
 def place_starts(
-    data: BehaviorData, own: ReconstructedHome, other: ReconstructedHome, rng: np.random.Generator
-) -> BehaviorData:
-    """Place recorded moments on the floor of the other home, each moved rigidly as a whole.
+    data: Mapping[str, BehaviorData],
+    owns: Mapping[str, ReconstructedHome],
+    other: ReconstructedHome,
+    rng: np.random.Generator,
+) -> dict[str, BehaviorData]:
+    """Place recorded moments of all animals on the floor of the other home, each moved rigidly as a whole.
 
-    Each becomes a recording `<recording>-<first frame>` whose past frames are valid. The animal keeps its
-    height above its support, the observer its height above the floor; an observer who was present stands on
-    the floor. Raises SIM-011 if no moment fits.
+    Each becomes a recording `<recording>-<first frame>` of the first animal, whose past frames are valid;
+    the others are where they were then, or at the nearest recorded time. Animals keep their heights above
+    their supports, the observer its height above the floor; an observer who was present stands on the floor.
+    Raises SIM-011 if no moment fits.
     """
-    tracks: dict[str, Trajectory] = {}
-    splits: list[int] = []
+    leading, splits = next(iter(data)), []
+    tracks: dict[str, dict[str, Trajectory]] = {name: {} for name in data}
     scenes, floor = other.scenes(), _floor_places(other)
     for split, count in STARTS.items():
-        windows = data.indices(split)
-        some = windows[subsampling.evenly(len(windows), count)]
-        for window in some.tolist():
-            name, start = data.videos[data.video[window]], int(data.start[window])
-            moment = _cut(data.trajectories[name], start, data.past, data.future)
-            placed = _placed(moment, own, other, scenes, floor, rng)
+        windows = data[leading].indices(split)
+        for window in windows[subsampling.evenly(len(windows), count)].tolist():
+            begun = moments_together(data, leading, window, split)
+            moments = {name: _cut(data[name], each) for name, each in begun.items()}
+            placed = _placed(moments, owns, other, scenes, floor, rng)
             if placed is not None:
-                tracks[f"{name}-{start}"] = placed
+                begin = f"{data[leading].videos[data[leading].video[window]]}-{data[leading].start[window]}"
+                for name, track in placed.items():
+                    tracks[name][begin] = track
                 splits.append(split)
     if TRAIN not in splits:
-        raise _unusable("has no free floor on which the animal can be set down", Path("the other home"))
-    number = np.arange(len(tracks), dtype=np.int32)
+        what = "has no free floor on which the animal can be set down, or all animals together"
+        raise _unusable(what, Path("the other home"))
+    number = np.arange(len(splits), dtype=np.int32)
     windows = {"video": number, "start": np.zeros_like(number), "split": np.array(splits, np.uint8)}
-    return replace(data, trajectories=tracks, videos=tuple(tracks), **windows)
+    return {
+        name: replace(data[name], trajectories=mine, videos=tuple(mine), **windows)
+        for name, mine in tracks.items()
+    }
 
 
 def _floor_places(home: ReconstructedHome) -> Float[np.ndarray, "place 3"]:
@@ -227,43 +249,64 @@ def _floor_places(home: ReconstructedHome) -> Float[np.ndarray, "place 3"]:
     return np.stack([place[:, 0], np.full(len(place), home.floor_m), place[:, 1]], axis=-1)
 
 
-def _cut(track: Trajectory, start: int, past: int, future: int) -> Trajectory:
-    part = slice(start, start + past + future)
-    valid = np.arange(past + future) < past
+def _cut(data: BehaviorData, window: int) -> Trajectory:
+    """Return the frames of a window as a recording, of which the past is valid."""
+    track, start = recorded_at(data, window)
+    part = slice(start, start + data.past + data.future)
+    valid = np.arange(data.past + data.future) < data.past
     time_s = track.timestamp_s[part] - track.timestamp_s[start]
     poses = track.world_from_agent[part], track.agent_from_bone[part], track.world_from_camera[part]
     return Trajectory(time_s, *poses, valid)
 
 
 def _placed(
-    moment: Trajectory,
-    own: ReconstructedHome,
+    moments: Mapping[str, Trajectory],
+    owns: Mapping[str, ReconstructedHome],
     other: ReconstructedHome,
     scenes: Scenes,
     floor: Float[np.ndarray, "place 3"],
     rng: np.random.Generator,
-) -> Trajectory | None:
-    """Move a moment to a random floor place where its past is not in collision; None if none is found."""
-    past = int(moment.valid.sum())
-    now = moment.world_from_agent[past - 1, :3, 3]
-    step = now - moment.world_from_agent[past - 2, :3, 3]
-    step_s = float(moment.timestamp_s[past - 1] - moment.timestamp_s[past - 2])
-    moves = bool(np.hypot(step[0], step[2]) > REST_SPEED_M_S * step_s)
-    height = own.height_above_top(now, moves=moves)
+) -> dict[str, Trajectory] | None:
+    """Move a moment of all animals to where their past is not in collision, the first to a random floor
+    place; None if none is found.
+    """
+    first, past = next(iter(moments)), {name: int(each.valid.sum()) for name, each in moments.items()}
+    now = {name: each.world_from_agent[past[name] - 1, :3, 3] for name, each in moments.items()}
+    height = {
+        name: owns[name].height_above_top(now[name], moves=_moves(moments[name], past[name]))
+        for name in moments
+    }
     for _ in range(PLACE_DRAWS):
         turn = rigid.rotation_from_vector(np.array([0.0, rng.uniform(0, 2 * np.pi), 0.0]))
-        target = floor[rng.integers(len(floor))] + [0.0, height, 0.0]
-        other_from_own = rigid.make(turn, target - turn @ now)
-        roots = other_from_own @ moment.world_from_agent
-        if scenes.inside_solid(roots[None, :past, :3, 3], None).any():
-            continue
-        camera = other_from_own @ moment.world_from_camera
-        camera[:, 1, 3] = moment.world_from_camera[:, 1, 3] - own.floor_m + other.floor_m
-        eye = camera[past - 1, :3, 3]
-        on_floor = np.abs(floor[:, [0, 2]] - eye[[0, 2]]).max(1).min() <= other.volume.voxel_m / 2
-        if on_floor or np.linalg.norm(eye - target) > PRESENT_M:
-            return replace(moment, world_from_agent=roots, world_from_camera=camera)
+        target, moved = floor[rng.integers(len(floor))], {}
+        for name, moment in moments.items():
+            place = target + (turn @ (now[name] - now[first])) * [1.0, 0.0, 1.0] + [0.0, height[name], 0.0]
+            moved[name] = rigid.make(turn, place - turn @ now[name])
+            roots = moved[name] @ moment.world_from_agent[: past[name]]
+            if scenes.inside_solid(roots[None, :, :3, 3], None).any():
+                break
+        else:
+            camera = moved[first] @ moments[first].world_from_camera
+            camera[:, 1, 3] = moments[first].world_from_camera[:, 1, 3] - owns[first].floor_m + other.floor_m
+            eye = camera[past[first] - 1, :3, 3]
+            on_floor = np.abs(floor[:, [0, 2]] - eye[[0, 2]]).max(1).min() <= other.volume.voxel_m / 2
+            if on_floor or np.linalg.norm(eye - target) > PRESENT_M:
+                return {
+                    name: replace(
+                        moment,
+                        world_from_agent=moved[name] @ moment.world_from_agent,
+                        world_from_camera=camera,
+                    )
+                    for name, moment in moments.items()
+                }
     return None
+
+
+def _moves(moment: Trajectory, past: int) -> bool:
+    """Return whether the animal moves in the last of its past frames."""
+    step = np.diff(moment.world_from_agent[past - 2 : past, :3, 3], axis=0)[0]
+    step_s = float(np.diff(moment.timestamp_s[past - 2 : past])[0])
+    return bool(np.hypot(step[0], step[2]) > REST_SPEED_M_S * step_s)
 
 
 def _unusable(what: str, where: Path) -> InputError:

@@ -1,4 +1,4 @@
-"""Animals that live together in a home: which there are, where they begin, and whom they perceive."""
+"""Animals that live together in a home: which there are, and whom they perceive."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,11 +9,10 @@ from jaxtyping import Float
 
 from pipeline.baselines.samplers import sampler_of
 from pipeline.behavior import model as behavior
-from pipeline.behavior.avoidance import clearance_of
 from pipeline.behavior.config import Ego
 from pipeline.behavior.planning import Sampler, TorchNetworks
 from pipeline.behavior.simulator import AnimalBatch
-from pipeline.behavior.trajectories import TRAIN, BehaviorData, Trajectory, as_companions
+from pipeline.behavior.trajectories import BehaviorData, as_companions
 from pipeline.core.config import refuse_unknown
 from pipeline.core.errors import InputError
 from pipeline.environments.config import EnvironmentConfig
@@ -76,39 +75,9 @@ def folders_of(build: Path, animal: str | None) -> dict[str, Path | None]:
     return {name: living.get(name) for name in every} if found else {ALONE: build}
 
 
-def recorded_at(data: BehaviorData, window: int) -> tuple[Trajectory, int]:
-    """Return the recording of a window and the window's first frame in it."""
-    return data.trajectories[data.videos[int(data.video[window])]], int(data.start[window])
-
-
 def companions_of(
     name: str, past_world: Mapping[str, Float[np.ndarray, "*life past_frame 3"]]
 ) -> Float[np.ndarray, "*life companion past_frame 4"] | None:
     """Return all animals but one as companions, from their past positions (meters); None if it is alone."""
     others = [past_world[other] for other in past_world if other != name]
     return as_companions(np.stack(others, axis=-3)) if others else None
-
-
-def moments_together(
-    data: Mapping[str, BehaviorData], leading: str, window: int, split: int = TRAIN
-) -> dict[str, int]:
-    """Return a window of each animal: the others' are the nearest in time to the ``window`` of the
-    ``leading`` one, preferably of the same recording, in which bodies do not overlap.
-
-    They are of ``split``, of any for an animal that has none in it.
-    """
-    windows, begin_s = {leading: window}, data[leading].begin_s[window]
-    placed, video = (
-        data[leading].place_world[[window]],
-        data[leading].videos[int(data[leading].video[window])],
-    )
-    for name in (other for other in data if other != leading):
-        mine = data[name]
-        known = mine.indices(split) if (mine.split == split).any() else np.arange(len(mine.split))
-        elsewhere = np.array(mine.videos)[mine.video[known]] != video
-        order = known[np.lexsort((np.abs(mine.begin_s[known] - begin_s), elsewhere))]
-        off = (placed[:, None] - mine.place_world[order])[..., [0, 2]]
-        free = (np.linalg.norm(off, axis=-1) >= clearance_of(mine.agent_from_bone_rest)).all(0)
-        windows[name] = int(order[free.argmax()])
-        placed = np.concatenate([placed, mine.place_world[[windows[name]]]])
-    return windows

@@ -24,7 +24,8 @@ from pipeline.core.errors import InputError
 from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.floor import PersonFloor, to_local, to_world
 from pipeline.environments.homes import Habitat
-from pipeline.environments.residents import Resident, companions_of, folders_of, moments_together
+from pipeline.environments.moments import moments_together
+from pipeline.environments.residents import Resident, companions_of, folders_of
 from pipeline.environments.rewards import ENDING, REWARDS, StepOutcome
 from pipeline.environments.rgbd import RgbdCamera
 from pipeline.metrics.flight import flees

@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from pipeline.behavior.config import PlanSamplingConfig
-
 ObserverScript = Literal["away", "still", "approach"]
 """What a scripted observer does."""
 SubgoalSource = Literal["none", "visited", "behavior"]
@@ -21,8 +19,9 @@ class Config:
     """What the observer does."""
     observer_speed_m_s: float = 1.0
     """Walking speed of the observer, m/s."""
-    guidance: float = PlanSamplingConfig.guidance
-    """Scale of classifier-free guidance: the interactivity."""
+    guidance: tuple[str, ...] = ()
+    """Scales of classifier-free guidance, the interactivity, by who is perceived: `person=1.5` for the
+    observer, `dog=1.5` for an animal of the home; 1.25 and 1 by default."""
     goal_steps: int = 0
     """Denoising steps of the goal; 0: as the model is best sampled."""
     sequence_steps: int = 0

@@ -12,7 +12,8 @@ from jaxtyping import Float, Int
 from pipeline.behavior.simulator import Simulator, SimulatorState
 from pipeline.behavior.trajectories import RATE_HZ, TRAIN, BehaviorData
 from pipeline.data import images
-from pipeline.environments.residents import companions_of, moments_together, recorded_at
+from pipeline.environments.moments import moments_together, recorded_at
+from pipeline.environments.residents import companions_of
 from pipeline.geometry import views
 from pipeline.geometry.meshes import Mesh
 from stages.simulate.observers import Observer

@@ -1,7 +1,6 @@
 """Make takes of every kind from finished artifacts."""
 
-import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,8 +16,8 @@ from pipeline.behavior.simulator import Simulator
 from pipeline.behavior.trajectories import TRAIN, BehaviorData, Trajectory
 from pipeline.core import progress
 from pipeline.core.errors import InputError, other_versions_refused
-from pipeline.data import glb, npz, ply
-from pipeline.environments.other_home import ReconstructedHome, move_in
+from pipeline.data import glb, ply
+from pipeline.environments.other_home import MovedAnimal, ReconstructedHome, move_in, move_in_together
 from pipeline.longterm import journeys
 from pipeline.longterm.bodies import load_body
 from pipeline.longterm.config import MotionOptimizationConfig
@@ -27,7 +26,7 @@ from pipeline.longterm.motion_synthesis import LongTerm
 from pipeline.longterm.short_motions import BodyMotion
 from pipeline.longterm.subgoals import Subgoal, move_into_scene, sample_visited_subgoals
 from pipeline.longterm.surroundings import MotionScene
-from stages.simulate import journey_files
+from stages.simulate import elsewhere, journey_files
 from stages.simulate.chained_goals import chained_goals
 from stages.simulate.config import Config
 from stages.simulate.inputs import Inputs
@@ -41,6 +40,8 @@ MOVED_M = 0.25
 DEFAULT_OBSERVER_OFFSET_M = np.array([1.0, 1.4, 0.0])
 """Phone position relative to the animal's first position if the recording has no observer."""
 
+PERSON = "person"
+"""The observer among those who are perceived; no animal has this name (CAP-043)."""
 UNINTERRUPTED = ReplanningConfig(observer_motion_ratio=np.inf, blend_frames=0)
 """Every plan is played to its end."""
 
@@ -60,7 +61,7 @@ def of_behavior(inputs: Inputs, c: Config, device: str) -> FinishedTake:
     if inputs.home is not None:
         return _elsewhere(inputs, inputs.home, data, c, device)
     scenes = Scenes.load(_required(inputs, "behavior_data"), data.videos)
-    simulator = _simulator(inputs, data, scenes, c, ReplanningConfig(), device)
+    simulator = _simulator(inputs, data, scenes, _sampling(c), ReplanningConfig(), device)
     take = rollout(simulator, _observer(simulator, c), seconds=c.seconds, seed=c.seed)
     blocked = float(take.blocked.mean())
     summary = f"{c.seconds:g} s, {blocked:.1%} of the plans' frames outside the allowed space"
@@ -84,70 +85,95 @@ def of_behavior(inputs: Inputs, c: Config, device: str) -> FinishedTake:
 
 def _elsewhere(inputs: Inputs, home: Path, data: BehaviorData, c: Config, device: str) -> FinishedTake:
     """Let the animal live in the home of another build."""
-    artifacts = (_required(inputs, name) for name in ("behavior_data", "feature_basis", "scene_template"))
-    moved = move_in(ReconstructedHome.load(*artifacts), ReconstructedHome.of_build(home), data)
-    simulator = _simulator(inputs, moved.data, moved.home.scenes(), c, ReplanningConfig(), device)
+    own = _own_home(inputs, _required(inputs, "behavior_data"))
+    moved = move_in(own, ReconstructedHome.of_build(home), data)
+    simulator = _simulator(inputs, moved.data, moved.home.scenes(), _sampling(c), ReplanningConfig(), device)
     take = rollout(simulator, _observer(simulator, c), seconds=c.seconds, seed=c.seed)
-    goals = np.unique(take.goal_world, axis=0)
-    in_solid = float(moved.home.scenes().inside_solid(goals[:, None], None).mean())
-    summary = f"{c.seconds:g} s in the home of {home.name}, of which {moved.share_known:.0%} of the surfaces "
-    summary += f"look like the known home's; {in_solid:.1%} of {len(goals)} goals in something solid, "
-    summary += f"{float(take.blocked.mean()):.1%} of the plans' frames outside the allowed space"
 
     def write(folder: Path) -> None:
         write_take(folder, take)
-        volume, marks = moved.home.volume, moved.home.marks
-        npz.save(
-            folder / "volume.npz", compress=True, **vars(volume), allowed=marks, stands_m=moved.home.stands_m
-        )
-        about = {"home": home.name, "share_known": moved.share_known}
-        about |= {"goals": len(goals), "goals_in_solid": in_solid}
-        (folder / "home.json").write_text(json.dumps(about, indent=1) + "\n")
+        elsewhere.write_home(folder, take, moved, home.name)
 
-    return FinishedTake(summary, write)
+    about = elsewhere.summary(take, moved)
+    return FinishedTake(f"{c.seconds:g} s in the home of {home.name}: {about}", write)
 
 
 def of_home(inputs: Inputs, animals: Path, c: Config, device: str) -> FinishedTake:
-    """Simulate all animals of a home together. Raises InputError SIM-013 for unknown names or if no animal is
-    left, ART-003 for an animal without model or windows.
+    """Simulate all animals of a home together, there or in the home of another build.
+
+    Raises InputError SIM-013 for unknown names or if no animal is left, ART-003 for an animal without model
+    or windows, and for another build without surface.
     """
-    known = sorted(path.name for path in animals.iterdir() if path.is_dir())
-    unknown = sorted({*c.absent, *c.replayed} - set(known))
-    names = [name for name in known if name not in c.absent]
-    if unknown or not names:
-        what = f"there is no animal {unknown[0]!r}" if unknown else "nobody is left"
-        raise InputError("SIM-013", what, str(animals), f"known: {', '.join(known)}")
+    names = _names(animals, c)
+    sampling = {name: _sampling(c, names, name) for name in names}
+    data = {name: BehaviorData.load(animals / name / "behavior_data") for name in names}
+    moved: dict[str, MovedAnimal] = {}
+    where = animals / names[0] if inputs.home is None else inputs.home
+    if not (where / "reconstruction/scene.ply").is_file():
+        raise InputError("ART-003", "has no reconstruction", str(where), "make <agent>.reconstruction")
+    if inputs.home is not None:
+        homes = {name: _own_home(inputs, animals / name / "behavior_data") for name in names}
+        recorded = {name: (homes[name], data[name]) for name in names}
+        moved = move_in_together(recorded, ReconstructedHome.of_build(inputs.home))
     living: dict[str, Simulator | ReplayedAnimal] = {}
     for name in names:
-        needed = ("reconstruction", "behavior_data", *(() if name in c.replayed else ("behavior",)))
-        for artifact in needed:
-            if not (animals / name / artifact / "manifest.json").is_file():
-                remedy = f"make it: make <agent>.{artifact}; or leave {name} out"
-                raise InputError("ART-003", f"{name} has no {artifact}", str(animals), remedy)
-        data = BehaviorData.load(animals / name / "behavior_data")
         if name in c.replayed:
-            living[name] = ReplayedAnimal(data)
+            living[name] = ReplayedAnimal(data[name])
             continue
-        scenes = Scenes.load(animals / name / "behavior_data", data.videos)
         own = replace(inputs, behavior=animals / name / "behavior")
-        living[name] = _simulator(own, data, scenes, c, ReplanningConfig(), device)
+        if name in moved:
+            mine, scenes = moved[name].data, moved[name].home.scenes()
+        else:
+            mine = data[name]
+            scenes = Scenes.load(animals / name / "behavior_data", mine.videos)
+        living[name] = _simulator(own, mine, scenes, sampling[name], ReplanningConfig(), device)
     home = SharedHome(living)
     begun = home.reset(c.seed)[names[0]].world_from_agent[:3, 3]
     takes = rollout_of_all(home, _recorded_person(home.recording, begun, c), seconds=c.seconds, seed=c.seed)
     apart = np.linalg.norm(
         takes[names[0]].world_from_agent[:, :3, 3] - takes[names[-1]].world_from_agent[:, :3, 3], axis=-1
     )
-    scene = ply.read_ply(animals / names[0] / "reconstruction/scene.ply")
+    scene = ply.read_ply(where / "reconstruction/scene.ply")
     summary = f"{c.seconds:g} s of {', '.join(names)}"
     summary += f", {apart.min():.2f} m apart at least" if len(names) == 2 else ""
-    return FinishedTake(summary, lambda folder: write_takes(folder, takes, scene))
+    for name, here in moved.items():
+        summary += f"; {name}: {elsewhere.summary(takes[name], here)}"
+
+    def write(folder: Path) -> None:
+        write_takes(folder, takes, scene)
+        for name, here in moved.items():
+            elsewhere.write_home(folder / name, takes[name], here, where.name)
+
+    return FinishedTake(summary, write)
+
+
+def _names(animals: Path, c: Config) -> list[str]:
+    """Return the animals that are there, checked as `of_home` says."""
+    known = sorted(path.name for path in animals.iterdir() if path.is_dir())
+    unknown = sorted({*c.absent, *c.replayed} - set(known))
+    names = [name for name in known if name not in c.absent]
+    if unknown or not names:
+        what = f"there is no animal {unknown[0]!r}" if unknown else "nobody is left"
+        raise InputError("SIM-013", what, str(animals), f"known: {', '.join(known)}")
+    for name in names:
+        needed = ("reconstruction", "behavior_data", *(() if name in c.replayed else ("behavior",)))
+        for artifact in needed:
+            if not (animals / name / artifact / "manifest.json").is_file():
+                remedy = f"make it: make <agent>.{artifact}; or leave {name} out"
+                raise InputError("ART-003", f"{name} has no {artifact}", str(animals), remedy)
+    return names
+
+
+def _own_home(inputs: Inputs, behavior_data: Path) -> ReconstructedHome:
+    shared = (_required(inputs, name) for name in ("feature_basis", "scene_template"))
+    return ReconstructedHome.load(behavior_data, *shared)
 
 
 def live(inputs: Inputs, c: Config, device: str) -> FinishedTake:
     """Let the animal live in a browser until interrupted."""
     data, shown = BehaviorData.load(_required(inputs, "behavior_data")), _required(inputs, "simulator")
     scenes = Scenes.load(_required(inputs, "behavior_data"), data.videos)
-    simulator = _simulator(inputs, data, scenes, c, ReplanningConfig(), device)
+    simulator = _simulator(inputs, data, scenes, _sampling(c), ReplanningConfig(), device)
     with other_versions_refused("simulator", str(shown)):
         mesh, skin, _ = glb.read_skinned((shown / "agent.glb").read_bytes())
         look = LiveAppearance(mesh, skin, (shown / "scene.glb").read_bytes())
@@ -166,7 +192,7 @@ def through_subgoals(inputs: Inputs, written: list[Subgoal] | None, c: Config, d
         subgoals = written
     elif c.places == "behavior":
         scenes = Scenes.load(_required(inputs, "behavior_data"), data.videos)
-        simulator = _simulator(inputs, data, scenes, c, UNINTERRUPTED, device)
+        simulator = _simulator(inputs, data, scenes, _sampling(c), UNINTERRUPTED, device)
         drawn = chained_goals(simulator, _observer(simulator, c), c.place_count, c.seed)
         subgoals = move_into_scene(drawn, world.scene, world.model.motion_prior)
     else:
@@ -201,15 +227,45 @@ def _world(inputs: Inputs, data: BehaviorData) -> LongTermWorld:
 
 
 def _simulator(
-    inputs: Inputs, data: BehaviorData, scenes: Scenes, c: Config, chaining: ReplanningConfig, device: str
+    inputs: Inputs,
+    data: BehaviorData,
+    scenes: Scenes,
+    sampling: PlanSamplingConfig,
+    chaining: ReplanningConfig,
+    device: str,
 ) -> Simulator:
     architecture, nets, scaling, schedule, _ = behavior.load(_required(inputs, "behavior"))
     behavior.refuse_unplayable(architecture, str(inputs.behavior))
-    sampling = PlanSamplingConfig(
-        goal_steps=c.goal_steps, sequence_steps=c.sequence_steps, guidance=c.guidance
-    )
     sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
     return Simulator(sampler, data, scenes, architecture.ego, sampling=sampling, chaining=chaining)
+
+
+def _sampling(c: Config, animals: Sequence[str] = (), name: str = "") -> PlanSamplingConfig:
+    """Return how an animal plans, the one with this name where several ``animals`` live together."""
+    scales = guidance_scales(c.guidance, animals)
+    of_others = tuple(scales[other] for other in animals if other != name)
+    return PlanSamplingConfig(None, c.goal_steps, c.sequence_steps, scales[PERSON], of_others)
+
+
+def guidance_scales(written: Sequence[str], animals: Sequence[str]) -> dict[str, float]:
+    """Return the guidance scale of the person and of each of the ``animals``, as ``written`` (`NAME=SCALE`)
+    or the default. Raises InputError SIM-013 for a name that nobody perceives, and where there is no scale.
+    """
+    scales = {PERSON: PlanSamplingConfig.guidance}
+    scales |= {name: 1.0 for name in animals if len(animals) > 1}
+    for each in written:
+        name, _, text = each.partition("=")
+        if name not in scales:
+            what, remedy = f"nobody perceives {name!r}", f"known: {', '.join(sorted(scales))}"
+            raise InputError("SIM-013", what, "guidance", remedy)
+        try:
+            scales[name] = float(text)
+        except ValueError:
+            scales[name] = np.nan
+        if not 0 <= scales[name] < np.inf:
+            remedy = f"write NAME=SCALE, such as {name}=1.5"
+            raise InputError("SIM-013", f"{each!r} gives no scale from 0 up", "guidance", remedy)
+    return scales
 
 
 def _observer(simulator: Simulator, c: Config) -> Observer:

@@ -12,7 +12,14 @@ from pipeline.behavior.support import mark_supported
 from pipeline.behavior.trajectories import PAST, TEST, TRAIN
 from pipeline.core.errors import InputError
 from pipeline.data import npz
-from pipeline.environments.other_home import ReconstructedHome, change_basis, move_in, share_known
+from pipeline.environments.moments import moments_together
+from pipeline.environments.other_home import (
+    ReconstructedHome,
+    change_basis,
+    move_in,
+    move_in_together,
+    share_known,
+)
 from tests.pipeline.behavior.wandering import room, wandering
 
 RAW = 40
@@ -94,6 +101,32 @@ def test_start_states_are_on_the_other_floor_in_free_space():
         again.data.windows(np.arange(5))[0].world_from_agent,
         moved.data.windows(np.arange(5))[0].world_from_agent,
     )
+
+
+def test_animals_begin_together_as_they_were_at_home():
+    own, other = home(), home(origin=(10.0, 2.0, -7.0))
+    data = {name: wandering(seed) for seed, name in enumerate(("cat", "dog"))}
+    moved = move_in_together({name: (own, each) for name, each in data.items()}, other)
+    cat, dog = (each.data for each in moved.values())
+    assert cat.videos == dog.videos and set(cat.split) == {TRAIN, TEST}
+    for window in range(len(cat.videos)):
+        found = moments_together({"cat": cat, "dog": dog}, "cat", window, int(cat.split[window]))
+        assert found["dog"] == window, "the same moment of the other"
+        video, start = cat.videos[window].rsplit("-", 1)
+        (recorded,) = np.flatnonzero(
+            (np.array(data["cat"].videos)[data["cat"].video] == video) & (data["cat"].start == int(start))
+        )
+        begun = moments_together(data, "cat", int(recorded), int(cat.split[window]))
+        gaps = [
+            np.diff([each["cat"].place_world[k["cat"]], each["dog"].place_world[k["dog"]]], axis=0)
+            for each, k in ((data, begun), ({"cat": cat, "dog": dog}, found))
+        ]
+        level = [np.hypot(gap[0, 0], gap[0, 2]) for gap in gaps]
+        assert level[0] == pytest.approx(level[1], abs=1e-5), "meters: as far apart as at home"
+        cameras = [each.trajectories[cat.videos[window]].world_from_camera for each in (cat, dog)]
+        np.testing.assert_array_equal(*cameras, "one person for all")
+        roots = dog.trajectories[cat.videos[window]].world_from_agent[None, :PAST, :3, 3]
+        assert not moved["dog"].home.scenes().inside_solid(roots, None).any()
 
 
 def test_unseen_features_reduce_the_fraction_of_known_cells():

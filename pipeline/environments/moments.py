@@ -1,0 +1,38 @@
+"""Recorded moments in which several animals of a home are together."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pipeline.behavior.avoidance import clearance_of
+from pipeline.behavior.trajectories import TRAIN, BehaviorData, Trajectory
+
+
+def recorded_at(data: BehaviorData, window: int) -> tuple[Trajectory, int]:
+    """Return the recording of a window and the window's first frame in it."""
+    return data.trajectories[data.videos[int(data.video[window])]], int(data.start[window])
+
+
+def moments_together(
+    data: Mapping[str, BehaviorData], leading: str, window: int, split: int = TRAIN
+) -> dict[str, int]:
+    """Return a window of each animal: the others' are the nearest in time to the ``window`` of the
+    ``leading`` one, preferably of the same recording, in which bodies do not overlap.
+
+    They are of ``split``, of any for an animal that has none in it.
+    """
+    windows, begin_s = {leading: window}, data[leading].begin_s[window]
+    placed, video = (
+        data[leading].place_world[[window]],
+        data[leading].videos[int(data[leading].video[window])],
+    )
+    for name in (other for other in data if other != leading):
+        mine = data[name]
+        known = mine.indices(split) if (mine.split == split).any() else np.arange(len(mine.split))
+        elsewhere = np.array(mine.videos)[mine.video[known]] != video
+        order = known[np.lexsort((np.abs(mine.begin_s[known] - begin_s), elsewhere))]
+        off = (placed[:, None] - mine.place_world[order])[..., [0, 2]]
+        free = (np.linalg.norm(off, axis=-1) >= clearance_of(mine.agent_from_bone_rest)).all(0)
+        windows[name] = int(order[free.argmax()])
+        placed = np.concatenate([placed, mine.place_world[[windows[name]]]])
+    return windows
