@@ -32,6 +32,7 @@ PLAIN := a b c d e f g h i j k l m n o p q r s t u v w x y z 0 1 2 3 4 5 6 7 8 9
 rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)
 $(foreach name,AGENT NAME ABSENT REPLAYED OTHER VARIANT FORMAT PLACES PROCESSES LOCK BODY,$(if $(call rest,$(PLAIN),$(value $(name))),$(error REC-004 \
   $(name) is no plain name: use a-z, 0-9, _ and -)))
+$(if $(call rest,$(PLAIN) = .,$(subst $() $(),,$(value GUIDANCE))),$(error REC-004 GUIDANCE is no list of NAME=SCALE: person=1.5 dog=2))
 # Folder of an agent, of its variant, or of one animal of a home (NAME=); `INPUTS` takes what a variant does not change from
 # its agent.
 ANIMAL := $(or $(AGENT),cat)
@@ -105,12 +106,13 @@ export: .venv/.ok
 
 # The behavior model without a page: half a minute beside a scripted observer; `serve` shows it live. In a home of several
 # animals all are simulated, without one (ABSENT=) or with a recorded one (REPLAYED=); a single one with NAME=. In the home of
-# another build (HOME=other): a take, and a page that starts from it.
+# another build (HOME=other): a take, and a page that starts from it. GUIDANCE='person=1.5 dog=2': reactions to whom.
 JOURNEY = $(if $(SUBGOALS)$(PLACES),longterm) $(if $(SUBGOALS)$(filter-out behavior,$(PLACES)),,behavior)
 export SUBGOALS
 ELSEWHERE = $(HOME_OF)/homes/$(OTHER)
 MOVED = reconstruction splats behavior behavior_data
-TOGETHER = $(if $(SUBGOALS)$(PLACES)$(OTHER),INPUTS,TOGETHER_INPUTS)
+TOGETHER = $(if $(SUBGOALS)$(PLACES),INPUTS,TOGETHER_INPUTS)
+PAGES = stages.export_simulator
 simulate: .venv/.ok
 	@test -z "$$SUBGOALS" || test -f "$$SUBGOALS" || { { echo "error: SIM-004 $$SUBGOALS: there is no such file"; echo "  -> write it as docs/long_motion.md explains"; } >&2; exit 2; }
 	@$(if $(PLACES),$(PYTHON) -m stages.simulate --places '$(PLACES)' --help >/dev/null)
@@ -118,9 +120,11 @@ simulate: .venv/.ok
 	@$(MAKE) $(NESTING) $(JOURNEY:%=$(ANIMAL).%) $(if $(OTHER),$(ANIMAL).splats $(OTHER).splats $(OTHER).behavior_data)
 	@$(call $(TOGETHER),$(JOURNEY) $(if $(filter longterm,$(JOURNEY)),reconstruction) behavior_data $(if $(OTHER),feature_basis scene_template)) && \
 	$(PYTHON) -m stages.simulate $$inputs $(if $(SUBGOALS),--subgoals "$$SUBGOALS") $(if $(PLACES),--places '$(PLACES)') $(if $(OTHER),--home build/$(OTHER)) \
-	  $(if $(ABSENT),--absent $(ABSENT)) $(if $(REPLAYED),--replayed $(REPLAYED)) --out $(if $(OTHER),$(ELSEWHERE),$(HOME_OF))/take
-	@$(if $(OTHER),$(call INPUTS,$(MOVED)) && $(PYTHON) -m stages.export_simulator $$inputs --config $(HOME_OF)/plan/configs/simulator.json \
-	  --home build/$(OTHER) --take $(ELSEWHERE)/take --out $(ELSEWHERE)/simulator && echo '[$(HOME_OF)] open: $(ELSEWHERE)/simulator/index.html')
+	  $(if $(ABSENT),--absent $(ABSENT)) $(if $(REPLAYED),--replayed $(REPLAYED)) $(if $(GUIDANCE),--guidance $(GUIDANCE)) --out $(if $(OTHER),$(ELSEWHERE),$(HOME_OF))/take
+	@$(if $(OTHER),$(call TOGETHER_INPUTS,$(MOVED)) && case "$$inputs" in (--animals*) kind=home_simulator page=$(PAGES).home; \
+	  set -- $$inputs; inputs="--reconstruction $$2 --splats $$2 --behavior $$2 --behavior-data $$2";; (*) kind=simulator page=$(PAGES);; esac && \
+	$(PYTHON) -m $$page $$inputs --config $(HOME_OF)/plan/configs/$$kind.json \
+	  --home build/$(OTHER) --take $(ELSEWHERE)/take --out $(ELSEWHERE)/$$kind && echo "[$(HOME_OF)] open: $(ELSEWHERE)/$$kind/index.html")
 
 serve: .venv/.ok
 	@$(MAKE) $(NESTING) $(ANIMAL).simulator

@@ -148,7 +148,8 @@ def mark_redo(home: Home, name: str) -> None:
 def inputs(home: Home, names: Sequence[str], *, together: bool = False) -> str:
     """Return `--name path` of finished artifacts, from the variant or its agent.
 
-    In a home of several animals ``together`` gives `--animals` instead. Raises REC-007, REC-008.
+    In a home of several animals ``together`` gives `--animals` in place of what is theirs. Raises REC-007,
+    REC-008.
     """
     animals = [str(each.animal) for each in _animal_homes(home.base)]
     if home.animal and home.animal not in animals:
@@ -159,16 +160,16 @@ def inputs(home: Home, names: Sequence[str], *, together: bool = False) -> str:
         remedy = f"artifacts: {', '.join(known)}"
         raise InputError("REC-007", f"no artifact {unknown[0]!r}", str(home), remedy)
     own = home.folder / "animals"
-    if not home.animal and any(known[name].is_relative_to(own) for name in names):
-        if together:
-            return f"--animals {own}"
+    theirs = [name for name in names if not home.animal and known[name].is_relative_to(own)]
+    if theirs and not together:
         what, each = f"{home} is a home of several animals", f"one of them: NAME={animals[0]}"
         raise InputError("REC-008", what, ", ".join(names), each)
     several = {name for name in names if dag.NODES[name].roles}
-    return " ".join(
-        f"--{name.replace('_', '-')} {known[name].parent if name in several else known[name]}"
-        for name in names
-    )
+    options = [f"--animals {own}"] if theirs else []
+    for name in (name for name in names if name not in theirs):
+        path = known[name].parent if name in several else known[name]
+        options.append(f"--{name.replace('_', '-')} {path}")
+    return " ".join(options)
 
 
 def new_agent(name: str, taken: Sequence[str] = ()) -> None:

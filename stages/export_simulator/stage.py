@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.core.errors import InputError
 from pipeline.core.videos import Video
 from pipeline.data import ply, qa
 from stages.export_simulator import export, reading, surroundings, writing
@@ -30,13 +29,8 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
     Raises EXP-001 where no session is long enough, EXP-002 for a model that cannot be sampled, EXP-003 for
     another home without a take in it, ART-003 where that home lacks its surfaces.
     """
-    if inputs.home is None and inputs.take is None:
-        place = surroundings.at_home(inputs.reconstruction, inputs.splats, inputs.behavior_data)
-    elif inputs.home is not None and inputs.take is not None:
-        place = surroundings.elsewhere(inputs.home, inputs.take, config.name)
-    else:
-        what = "a page of another home needs that build and a take in it"
-        raise InputError("EXP-003", what, "export_simulator", "give both --home and --take")
+    made = inputs.reconstruction, inputs.splats, inputs.behavior_data
+    place = surroundings.of(*made, home=inputs.home, take=inputs.take, name=config.name)
     parts = export.simulator(
         reading.body(inputs.reconstruction),
         ply.read_ply(place.surface),

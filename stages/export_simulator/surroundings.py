@@ -15,6 +15,8 @@ from stages.export_simulator import reading
 from stages.export_simulator.actions import SessionClip
 
 _CLIP = "take"
+REMEDY = "make it: make simulate AGENT=... HOME=..."
+"""How a take in another home is made."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,27 @@ class Surroundings:
     """What a visitor should know of them."""
 
 
+def of(
+    reconstruction: Path,
+    splats: Path,
+    behavior_data: Path,
+    *,
+    home: Path | None,
+    take: Path | None,
+    name: str,
+) -> Surroundings:
+    """Return an animal's own home or, given both, the ``home`` of another build with a ``take`` in it.
+
+    Raises EXP-003 where one of both is missing, and what `elsewhere` raises.
+    """
+    if home is None and take is None:
+        return at_home(reconstruction, splats, behavior_data)
+    if home is not None and take is not None:
+        return elsewhere(home, take, name)
+    what = "a page of another home needs that build and a take in it"
+    raise InputError("EXP-003", what, "export_simulator", "give both --home and --take")
+
+
 def at_home(reconstruction: Path, splats: Path, behavior_data: Path) -> Surroundings:
     """Return the animal's own home with its recordings."""
     tracks = BehaviorData.load(behavior_data).trajectories.values()
@@ -56,8 +79,7 @@ def elsewhere(home: Path, take: Path, name: str) -> Surroundings:
             remedy = f"make it: make <agent>.{file.parent.name}"
             raise InputError("ART-003", f"has no {file.parent.name}", str(home), remedy)
     if not (take / "home.json").is_file():
-        remedy = "make it: make simulate AGENT=... HOME=..."
-        raise InputError("EXP-003", "is no take in another home", str(take), remedy)
+        raise InputError("EXP-003", "is no take in another home", str(take), REMEDY)
     share = json.loads((take / "home.json").read_bytes())["share_known"]
     clip = _clip(take)
     remark = f"Home of {home.name}: {share:.0%} of it looks like the home that {name} knows."

@@ -48,21 +48,24 @@ def write_home(
     animals: Mapping[str, tuple[SimulatorParts, BehaviorAssets]],
     config: Config,
     labels: Mapping[str, str],
+    remarks: Mapping[str, str | None],
 ) -> dict[str, float]:
     """Write the page of several animals, by name, in the room of the first; return megabytes by part.
 
-    Assets and contract of each are those of its own page, and when clips begin in their sessions, so that all
-    begin at one moment.
+    ``remarks`` are what a visitor should know of the home of each. Assets and contract of each are those of
+    its own page, and when clips begin in their sessions, so that all begin at one moment.
     """
     contracts = []
     for name, (parts, behavior) in animals.items():
-        about = contract(parts, behavior, name, labels, None)
+        about = contract(parts, behavior, name, labels, remarks[name])
         about["assets"] = f"{name}-"
         for clip, motion in zip(about["clips"], parts.motions, strict=True):
             clip["begin_s"] = round(motion.begin_s, 4)
         contracts.append(about)
     shared = ("version", "units", "up", "quaternion", "rows", "scene", "observer", "controls")
     whole = {"name": config.name, **{key: contracts[0][key] for key in shared}, "animals": contracts}
+    warnings = dict.fromkeys(each["scene"]["warning"] for each in contracts if each["scene"]["warning"])
+    whole["scene"] = {**whole["scene"], "warning": " ".join(warnings) or None}
     first = next(iter(animals.values()))[0]
     assets = _room(first, glb.static(first.scene, "scene"))
     for name, (parts, behavior) in animals.items():

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.core.errors import InputError
 from pipeline.core.videos import Video
 from pipeline.data import ply, qa
 from stages.export_simulator import export, pictures, reading, surfaces, surroundings, writing
@@ -20,18 +21,28 @@ class Inputs:
     splats: Mapping[str, Path]
     behavior: Mapping[str, Path]
     behavior_data: Mapping[str, Path]
+    home: Path | None = None
+    """Folder of another build, in whose home the animals live; with `take`."""
+    take: Path | None = None
+    """What `simulate` wrote of them in that home."""
 
 
 def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] = ()) -> float:
-    """Write page and `simulator.json`, the room that of the first animal; return the page's megabytes.
+    """Write page and `simulator.json`, the room that of the first animal or that of another build; return the
+    page's megabytes.
 
     Raises EXP-001 where an animal has no session long enough, EXP-002 for a model that the page cannot
-    sample.
+    sample, and what `surroundings.of` raises for another home.
     """
     places = {}
     for name in inputs.behavior:
+        take = None if inputs.take is None else inputs.take / name
+        if take is not None and not take.is_dir():
+            continue  # it was absent
         made = inputs.reconstruction[name], inputs.splats[name], inputs.behavior_data[name]
-        places[name] = surroundings.at_home(*made)
+        places[name] = surroundings.of(*made, home=inputs.home, take=take, name=name)
+    if not places:
+        raise InputError("EXP-003", "holds no take", str(inputs.take), surroundings.REMEDY)
     first = next(iter(places.values()))
     surface, animals = ply.read_ply(first.surface), {}
     for name, place in places.items():
@@ -48,8 +59,9 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
     been = np.concatenate([place.roots_world for place in places.values()])
     setting = surfaces.extent(room, been)
     animals = {name: (replace(parts, setting=setting), assets) for name, (parts, assets) in animals.items()}
-    labels = {video.id: Path(video.file).stem for video in videos}
-    sizes_mb = writing.write_home(out, animals, config, labels)
+    labels = {video.id: Path(video.file).stem for video in videos} | first.labels
+    remarks = {name: place.remark for name, place in places.items()}
+    sizes_mb = writing.write_home(out, animals, config, labels, remarks)
     sheets = {name: pictures.visits(room, setting.floor_m, places[name].motions) for name in animals}
     qa.write(
         out,

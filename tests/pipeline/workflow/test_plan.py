@@ -155,6 +155,8 @@ def test_animals_of_a_home_share_the_scene_artifacts(small_checkout):
     asked = ("behavior", "behavior_data")
     together = small_checkout.python("pipeline.workflow.plan", "together", "toy", *asked)
     assert together.stdout == "--animals build/toy/animals\n"
+    shared = small_checkout.python("pipeline.workflow.plan", "together", "toy", *asked, "feature_basis")
+    assert shared.stdout == "--animals build/toy/animals --feature-basis build/toy/feature_basis\n"
     one = small_checkout.python("pipeline.workflow.plan", "together", "toy/animals/cat", *asked).stdout
     assert one.startswith("--behavior build/toy/animals/cat/behavior ")
     for home, code in (("toy", "REC-008"), ("toy/animals/bird", "REC-007.*bird: no such animal\n.*cat, dog")):

@@ -268,11 +268,12 @@ def write_home(animals: Path) -> None:
     data.save(animals / "dog/behavior_data")
 
 
-def exported_home(animals: Path, out: Path) -> Path:
-    """Export the page of both into an empty folder; return the folder."""
+def exported_home(animals: Path, out: Path, **elsewhere: Path) -> Path:
+    """Export the page of both into an empty folder; return the folder. ``elsewhere``: home and take."""
     out.mkdir(parents=True)
     inputs = {name: {animal: animals / animal / name for animal in ("cat", "dog")} for name in READS}
-    home_stage.run(home_stage.Inputs(**inputs), HomeConfig(name="home", others=("cat", "dog")), out)
+    config = HomeConfig(name="home", others=("cat", "dog"))
+    home_stage.run(home_stage.Inputs(**inputs, **elsewhere), config, out)
     return out
 
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from pipeline.baselines.predictors import Ats
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import BehaviorData, Context, as_companions
+from pipeline.core.errors import InputError
+from pipeline.data import npz
 from tests.stages.export_simulator import browser, small_world, twins
 from tests.stages.export_simulator.test_page import check_golden
 
@@ -86,6 +89,46 @@ def test_plan_has_the_goal_of_the_intent(home: Path, chromium: Browser) -> None:
             ends.append(plan["end"])
         assert np.ptp(np.array(ends), axis=0).max() > 0.1, "meters"
         assert wrong == []
+
+
+@pytest.fixture(scope="module")
+def take(animals: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Takes of both in another home, as `simulate` writes them: their second sessions."""
+    folder = tmp_path_factory.mktemp("take")
+    for name, share in (("cat", 0.42), ("dog", 0.9)):
+        (folder / name).mkdir()
+        recorded = BehaviorData.load(animals / name / "behavior_data").trajectories["v003"]
+        arrays = {
+            key: getattr(recorded, key) for key in ("timestamp_s", "world_from_agent", "agent_from_bone")
+        }
+        eyes = np.tile([0.2, 1.4, 0.0], (len(recorded.timestamp_s), 1))
+        npz.save(folder / name / "take.npz", **arrays, observer_world=eyes)
+        shutil.copy(animals / name / "behavior_data/volume.npz", folder / name)
+        about = {"home": "other", "share_known": share}
+        (folder / name / "home.json").write_text(json.dumps(about))
+    return folder
+
+
+def test_page_of_another_home_has_all_animals(animals: Path, take: Path, tmp_path: Path, chromium: Browser):
+    out = small_world.exported_home(animals, tmp_path / "page", home=animals / "cat", take=take)
+    document = json.loads((out / "simulator.json").read_bytes())
+    for animal in document["animals"]:
+        assert [clip["name"] for clip in animal["clips"]] == ["take"]
+    warning = document["scene"]["warning"]
+    assert "42% of it looks like the home that cat knows" in warning and "90%" in warning
+    with browser.shown(chromium, (out / "index.html").as_uri()) as (page, wrong):
+        page.wait_for_function(ALL_PLAN, timeout=60_000)
+        assert page.inner_text("#warning") == warning and wrong == []
+    shutil.copytree(take / "dog", tmp_path / "take/dog")
+    alone = small_world.exported_home(animals, tmp_path / "dog", home=animals / "cat", take=tmp_path / "take")
+    (dog,) = json.loads((alone / "simulator.json").read_bytes())["animals"]
+    assert dog["name"] == "dog", "the cat was absent"
+    with browser.shown(chromium, (alone / "index.html").as_uri()) as (page, wrong):
+        page.wait_for_function(ALL_PLAN, timeout=60_000)
+        assert wrong == []
+    for number, more in enumerate(({"take": take}, {"home": take}, {"take": tmp_path / "no", "home": take})):
+        with pytest.raises(InputError, match="EXP-003"):
+            small_world.exported_home(animals, tmp_path / f"refused/{number}", **more)
 
 
 def _check_goals(page: Page, home: Path, cat: Path) -> None:
