@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.behavior.config import MAX_GUIDANCE, ReplanningConfig
+from pipeline.behavior.config import MAX_GUIDANCE, PlanSamplingConfig, ReplanningConfig
 from pipeline.geometry import rigid
 from stages.export_simulator.actions import SessionClip
 from stages.export_simulator.export import SimulatorParts
@@ -86,7 +86,12 @@ def controls(sampling: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return what a visitor sets, its range and default; `interactivity` is the scale of guidance."""
     steps = int(sampling["sequence_steps"])
     return {
-        "interactivity": {"least": 0.0, "most": MAX_GUIDANCE, "default": float(sampling["guidance"])},
+        "interactivity": {
+            "least": 0.0,
+            "most": MAX_GUIDANCE,
+            "default": float(sampling["guidance"]),
+            "companions": PlanSamplingConfig.companions_guidance,
+        },
         "samples": {"choices": list(GOAL_CHOICES), "default": GOALS},
         "steps": {"choices": sorted({steps, FINE_STEPS}), "default": steps},
     }

@@ -149,22 +149,23 @@ def _check_goals(page: Page, home: Path, cat: Path) -> None:
     }
     questions = [dict(zip(asked, each, strict=True)) for each in zip(*asked.values(), strict=True)]
     found = {}
-    for name, changes in {"near": {}, "alone": {"companions": []}}.items():
+    for name, changes in {"near": {}, "alone": {"companions": []}, "guided": {"company": [1.6]}}.items():
         text = json.dumps(
-            [q | changes | {"K": 1, "steps": twins.STEPS, "interactivity": 1} for q in questions]
+            [q | changes | {"K": 1, "steps": twins.STEPS, "interactivity": 0.7} for q in questions]
         )
         found[name] = np.array(page.evaluate(twins.ASK, text))[:, [0, 2]]
     settings = contract["animals"][0]["behavior"]["sampling"]
-    sampling = PlanSamplingConfig(
-        settings["method"], max(twins.STEPS, settings["goal_steps"]), twins.STEPS, 1.0
-    )
-    ats = Ats.load(cat / "behavior", Scenes.load(cat / "behavior_data", ("any",)), sampling)
     eyes_m = contract["scene"]["floor_m"] + contract["observer"]["eye_height_m"]
     eyes = np.stack([met.far[..., 0], np.full(met.far.shape[:2], eyes_m), met.far[..., 1]], -1)
     companions = np.stack([as_companions(each[None]) for each in place])
     context = Context(met.context.world_from_agent, met.context.agent_from_bone, eyes, companions=companions)
-    expected = ats.goals(context, 1, twins.PageNoise(met.seed)).goal[:, 0][:, [0, 2]]
-    assert np.median(np.abs(found["near"] - expected)) < 1e-3, "meters"
+    for name, scales in (("near", (1.0,)), ("guided", (1.6,))):
+        steps = max(twins.STEPS, settings["goal_steps"]), twins.STEPS
+        sampling = PlanSamplingConfig(settings["method"], *steps, 0.7, scales)
+        ats = Ats.load(cat / "behavior", Scenes.load(cat / "behavior_data", ("any",)), sampling)
+        expected = ats.goals(context, 1, twins.PageNoise(met.seed)).goal[:, 0][:, [0, 2]]
+        assert np.median(np.abs(found[name] - expected)) < 1e-3, "meters"
+    assert np.median(np.abs(found["guided"] - found["near"])) > 0.02, "meters"
     away_m = -((found["near"] - found["alone"]) * met.side).sum(-1)
     assert (away_m > 0.1).mean() > 0.4, "it flees from whom it perceives"
 
@@ -193,6 +194,29 @@ def test_animals_are_selected_removed_and_replayed(home: Path, animals: Path, ch
             "the address keeps it"
         )
         assert wrong == []
+
+
+def test_reactions_to_one_animal_are_set_kept_and_restored(home: Path, chromium: Browser) -> None:
+    address = (home / "index.html").as_uri()
+    with browser.shown(chromium, f"{address}#guidance=bird:2", size=(1100, 760)) as (page, wrong):
+        assert "guidance=bird:2" in page.inner_text("#help"), "what was ignored"
+        page.wait_for_function(ALL_PLAN, timeout=60_000)
+        before = page.evaluate("ats.state().animals.map(({ plans }) => plans)")
+        page.get_by_role("combobox", name="To whom animals react").select_option("dog")
+        assert page.inner_text("#interactivity-value") == "1.00", "of companions"
+        page.locator("#interactivity").press("End")
+        assert page.inner_text("#interactivity-value") == "2.00"
+        assert page.locator(".hint.ends").first.inner_text().split() == "ignores dog reacts to dog".split()
+        assert "guidance=dog%3A2" in page.evaluate("location.hash")
+        page.wait_for_function("n => ats.state().animals.every((a, i) => a.plans > n[i])", arg=before)
+        page.get_by_role("combobox", name="To whom animals react").select_option("")
+        assert page.inner_text("#interactivity-value") == "1.25", "of the visitor, as before"
+        page.reload()
+        page.wait_for_function(f"window.ats && {ALL_PLAN}", timeout=60_000)
+        assert page.evaluate("ats.state().settings.guidance") == "dog:2"
+        page.get_by_role("combobox", name="To whom animals react").select_option("dog")
+        assert page.inner_text("#interactivity-value") == "2.00" and wrong == []
+        page.screenshot(path=home.parent / "reactions.png")
 
 
 def _check_it_is_away(page: Page) -> None:

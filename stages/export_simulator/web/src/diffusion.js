@@ -15,14 +15,25 @@ export function visited(schedule, count, method) {
   return [...new Set(evenly(ratios[last], ratios[0]).map(nearest))];
 }
 
-// e = e_without + scale (e_with - e_without); one call where the scale is 0 or 1.
-export function guided(withCondition, without, scale) {
-  if (scale === 1) return withCondition;
-  if (scale === 0) return without;
+// What weights the noise predicted with everybody, without the observer, and without that and each companion, so
+// that each has a scale of its own: e = e_left + observer (e_full - e_left) + sum of (scale - 1) (e_left - e_k).
+export function guidanceWeights([observer, ...companions]) {
+  const more = companions.reduce((sum, scale) => sum + scale - 1, 0);
+  return [observer, 1 + more - observer, ...companions.map((scale) => 1 - scale)];
+}
+
+// The weighted sum of what denoisers predict, of weights that add up to 1; those of weight 0 are not called.
+export function guided(denoisers, weights) {
+  const called = denoisers.map((denoise, i) => [weights[i] ?? 0, denoise]).filter(([weight]) => weight);
+  const [, last] = called.pop();
   return async (x, t) => {
-    const reference = await without(x, t);
-    const full = await withCondition(x, t);
-    return reference.map((value, i) => value + scale * (full[i] - value));
+    const reference = await last(x, t);
+    const sum = Float32Array.from(reference);
+    for (const [weight, denoise] of called) {
+      const noise = await denoise(x, t);
+      noise.forEach((value, i) => (sum[i] += weight * (value - reference[i])));
+    }
+    return sum;
   };
 }
 

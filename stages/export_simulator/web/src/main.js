@@ -15,7 +15,17 @@ import { Planner } from './planner.js';
 import { Resident, TICK_S } from './resident.js';
 import { Room } from './room.js';
 import { Route } from './route.js';
-import { doingsText, readDoings, readMoves, readPlaces, readPoint, readState, writeState } from './state.js';
+import {
+  doingsText,
+  readDoings,
+  readMoves,
+  readPlaces,
+  readPoint,
+  readScales,
+  readState,
+  scalesText,
+  writeState,
+} from './state.js';
 import { Stops, meters, placesText } from './stops.js';
 import { Tags } from './tags.js';
 import { save } from './take.js';
@@ -123,10 +133,23 @@ class Simulator {
     this.changed('does');
   }
 
+  // How strongly the others react to each of the animals, by name.
+  get scales() {
+    return readScales(this.state.guidance, this.contract);
+  }
+
+  // To one of them from now on.
+  guide(name, scale) {
+    this.state.guidance = scalesText({ ...this.scales, [name]: scale }, this.contract);
+    this.panel.refresh();
+    this.changed('guidance');
+  }
+
   connect() {
     this.playing = true;
     this.panel = panel.buildPanel(this.state, this.contract, {
       employ: (name, does) => this.employ(name, does),
+      guide: (name, scale) => this.guide(name, scale),
       change: (key) => this.changed(key),
       play: () => this.play(),
       reset: () => this.reset(),

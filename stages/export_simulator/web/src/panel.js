@@ -1,6 +1,6 @@
 // The controls: they read and write the state and call back; they know nothing of the room.
 
-import { AWAY, SPEEDS, readDoings } from './state.js';
+import { AWAY, SPEEDS, readDoings, readScales } from './state.js';
 
 const at = (id) => document.getElementById(id);
 const touch = matchMedia('(pointer: coarse)').matches;
@@ -24,13 +24,7 @@ export function buildPanel(state, contract, on) {
     on.change(key);
   };
 
-  at('interactivity').addEventListener('input', (event) =>
-    change('interactivity', Number(event.target.value)),
-  );
-  sync.push(() => {
-    at('interactivity').value = state.interactivity;
-    at('interactivity-value').textContent = state.interactivity.toFixed(2);
-  });
+  sync.push(interactivity(state, contract, change, on.guide));
 
   for (const box of document.querySelectorAll('[data-sense]')) toggle(box, box.dataset.sense);
   for (const box of document.querySelectorAll('[data-layer]')) toggle(box, box.dataset.layer);
@@ -112,6 +106,28 @@ export function buildPanel(state, contract, on) {
   if (matchMedia('(max-width: 720px), (max-height: 620px)').matches) fold(); // as in style.css
   sync.forEach((update) => update());
   return { refresh: () => sync.forEach((update) => update()) };
+}
+
+// How strongly animals react to the visitor or, in a home of several, to one of them. Returns what refreshes it.
+function interactivity(state, contract, change, guide) {
+  const { animals = [] } = contract;
+  at('whom').hidden = animals.length < 2;
+  for (const { name } of animals)
+    at('whom').append(
+      Object.assign(document.createElement('option'), { value: name, textContent: `to ${name}` }),
+    );
+  const show = () => {
+    const name = at('whom').value;
+    const scale = name ? readScales(state.guidance, contract)[name] : state.interactivity;
+    at('interactivity').value = scale;
+    at('interactivity-value').textContent = scale.toFixed(2);
+    for (const place of document.querySelectorAll('.whom')) place.textContent = name || 'you';
+  };
+  at('whom').addEventListener('change', show);
+  at('interactivity').addEventListener('input', ({ target: { value } }) =>
+    at('whom').value ? guide(at('whom').value, Number(value)) : change('interactivity', Number(value)),
+  );
+  return show;
 }
 
 // The animals of the home by name: which is selected, and what each does. Returns what refreshes the list.

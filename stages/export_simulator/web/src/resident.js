@@ -308,6 +308,7 @@ export class Resident {
         : [],
       keep: { scene: state.scene, observer: state.observer, past: state.past, goal: state.goal },
       interactivity: state.interactivity,
+      company: this.others.map(({ name }) => this.home.scales[name]),
       samples: state.samples,
       steps: state.steps,
       aim: next && [next[0], next[2] ? this.rootAt(next) : this.place[1], next[1]],

@@ -2,10 +2,10 @@
 // pipeline/behavior/planning.py.
 
 import { aroundPerson, clearanceOf } from './avoidance.js';
-import { guided, sample } from './diffusion.js';
+import { guidanceWeights, guided, sample } from './diffusion.js';
 import { normals } from './noise.js';
 import { apply, inverse } from './rigid.js';
-import { withoutObserver } from './senses.js';
+import { withoutSome } from './senses.js';
 import {
   velocityChannelsAlong,
   distance,
@@ -37,18 +37,21 @@ export class Sampler {
     this.clearance = clearanceOf(this.contract.agent_from_bone_rest);
   }
 
-  // The code with every condition, and the one without the observer, in which companions stay.
-  async codes(observation, keep, interactivity) {
+  // The code with every condition, and the references of guidance: without the observer, then without each
+  // companion too, where their scales, `interactivity` and `company`, are not 1.
+  async codes(observation, keep, interactivity, company = []) {
     const rows = this.contract.past_frames + this.contract.channels.others.anticipated_frames.length;
     const count = observation.others.length / (10 * rows);
-    const perceive = (observer) =>
+    const perceive = (observer, absent = []) =>
       this.networks.perception({
         scene_grid: [
           observation.sceneGrid,
           [1, this.contract.architecture.scene_channels, ...this.contract.grid.shape],
         ],
         others: [
-          observer || count === 1 ? observation.others : withoutObserver(observation.others, rows),
+          observer || count === 1
+            ? observation.others
+            : withoutSome(observation.others, [0, ...absent], rows),
           [1, count, rows, 10],
         ],
         past: [observation.past, [1, observation.past.length]],
@@ -57,15 +60,19 @@ export class Sampler {
     const full = await perceive(keep.observer);
     const last = observation.past.length / this.contract.past_frames;
     const start = Array.from(observation.past.slice(-last).slice(0, 3));
-    return { full, start, withoutObserver: interactivity === 1 ? full : await perceive(0) };
+    const apart = company.some((scale) => scale !== 1);
+    const references = [interactivity === 1 && !apart ? full : await perceive(0)];
+    for (const [i, scale] of company.entries())
+      references.push(scale === 1 ? full : await perceive(0, [i + 1]));
+    return { full, start, references };
   }
 
   // Scaled goals, `count` of them, three numbers each.
-  async goals(codes, count, { noise, steps, interactivity, method, draw, frame }) {
+  async goals(codes, count, { noise, steps, interactivity, company, method, draw, frame }) {
     const denoise = (code) => (x, t) =>
       this.networks.goal({ x: [x, [count, 3]], ...this.step(count, t, code) });
-    const options = { method, count: steps, draw, interactivity };
-    const drawn = await this.run(denoise(codes.full), denoise(codes.withoutObserver), noise, options);
+    const options = { method, count: steps, draw, interactivity, company };
+    const drawn = await this.run(denoise, codes, noise, options);
     return frame ? this.goalsCleared(frame, codes.start, drawn) : drawn;
   }
 
@@ -110,7 +117,11 @@ export class Sampler {
 
   // A scaled path towards each scaled goal. The reference of the guidance sees neither observer nor goal, but
   // a goal that the visitor has set is not taken away.
-  async pathsOnce(codes, goals, { noise, steps, interactivity, frame, keepGoal = 1, commanded = false }) {
+  async pathsOnce(
+    codes,
+    goals,
+    { noise, steps, interactivity, company, frame, keepGoal = 1, commanded = false },
+  ) {
     const count = goals.length / 3;
     const denoise = (code, keep) => (x, t) =>
       this.networks.path({
@@ -121,10 +132,10 @@ export class Sampler {
       });
     const correct = frame && ((clean) => this.pathsCleared(frame, codes.start, clean));
     const drawn = await this.run(
-      denoise(codes.full, keepGoal),
-      denoise(codes.withoutObserver, commanded ? 1 : 0),
+      (code, number) => denoise(code, number ? Number(commanded) : keepGoal),
+      codes,
       noise,
-      { method: 'dpm_solver', count: steps, interactivity, correct },
+      { method: 'dpm_solver', count: steps, interactivity, company, correct },
     );
     const snapped = this.contract.sampling.snap_to_goal ? keepGoal * Math.min(interactivity, 1) : 0;
     const pull = commanded ? 1 : snapped;
@@ -205,7 +216,7 @@ export class Sampler {
 
   // A scaled body [channels, frames] along a scaled path, drawn from fainter noise than goals and paths are,
   // and no other.
-  body(codes, path, { noise, steps, interactivity }) {
+  body(codes, path, { noise, steps, interactivity, company = [] }) {
     const denoise = (code) => (x, t) =>
       this.networks.body({
         x: [x, [1, this.channels, this.frames]],
@@ -214,10 +225,11 @@ export class Sampler {
         keep: [Float32Array.of(1), [1, 1]],
       });
     const faint = noise.map((value) => value * this.contract.sampling.body_noise_std);
-    return this.run(denoise(codes.full), denoise(codes.withoutObserver), faint, {
+    return this.run(denoise, codes, faint, {
       method: 'dpm_solver',
       count: steps,
       interactivity: Math.min(interactivity, 1),
+      company: company.map((scale) => Math.min(scale, 1)),
     });
   }
 
@@ -227,8 +239,11 @@ export class Sampler {
     return { t: [new Float32Array(count).fill(t), [count]], condition: [condition, [count, code.length]] };
   }
 
-  run(full, withoutObserver, noise, { interactivity, ...options }) {
-    return sample(guided(full, withoutObserver, interactivity), noise, this.contract.schedule, options);
+  // denoise: gives the denoiser of a code, by its number among the full one and the references of guidance.
+  run(denoise, codes, noise, { interactivity, company = [], ...options }) {
+    const denoisers = [codes.full, ...codes.references].map((code, number) => denoise(code, number));
+    const weights = guidanceWeights([interactivity, ...company]);
+    return sample(guided(denoisers, weights), noise, this.contract.schedule, options);
   }
 
   // Goals alone, in the world.
@@ -238,7 +253,7 @@ export class Sampler {
       question.observer,
       question.companions,
     );
-    const codes = await this.codes(observation, question.keep, question.interactivity);
+    const codes = await this.codes(observation, question.keep, question.interactivity, question.company);
     return {
       goals: this.goalsInWorld(
         frame,
@@ -249,13 +264,14 @@ export class Sampler {
 
   // How a plan is drawn; `frame` is among it where the scene, which plans are kept to, is perceived. Plans that
   // are what the networks predict are kept neither to it nor away from bodies.
-  drawing(frame, { seed, steps, interactivity, keep, observer, companions = [] }) {
+  drawing(frame, { seed, steps, interactivity, company, keep, observer, companions = [] }) {
     const { avoid_solid: kept } = this.contract.sampling;
     return {
       method: this.contract.sampling.method,
       draw: normals(seed),
       steps,
       interactivity,
+      company,
       frame: keep.scene && kept ? frame : null,
       detour: keep.scene ? this.senses.detour : null,
       bodies: (kept ? [observer, ...companions] : []).map((places) => [places.at(-1)[0], places.at(-1)[2]]),
@@ -272,13 +288,14 @@ export class Sampler {
     return Array.from({ length: scaled.length / 3 }, (_, i) => apply(frame, this.goal(scaled, i)));
   }
 
-  // A whole plan. question: {past, observer, companions, keep, interactivity, samples, steps, seed, aim, raised, path}.
+  // A whole plan. question: {past, observer, companions, keep, interactivity, company, samples, steps, seed, aim,
+  // raised, path}, of which `company` holds the scales of guidance of the companions.
   // `cleared` is where a plan ends that goes all the way to the aim: as near to it as the animal may be.
   async plan(question) {
     const observation = this.senses.observe(question.past, question.observer, question.companions);
     const { frame } = observation;
     const options = this.drawing(frame, question);
-    const codes = await this.codes(observation, question.keep, question.interactivity);
+    const codes = await this.codes(observation, question.keep, question.interactivity, question.company);
     if (question.path) return this.followed(frame, codes, question.path, options);
     const commanded = Boolean(question.aim);
     const leg = commanded && this.leg(frame, question.aim, question.raised, options.detour);

@@ -174,10 +174,10 @@ export class Senses {
   }
 }
 
-// Others with the first of them, the observer, out of sight; `frames` of ten numbers each.
-export function withoutObserver(others, frames) {
+// Others with some of them, by number, the observer's 0, out of sight; `frames` of ten numbers each.
+export function withoutSome(others, numbers, frames) {
   const out = Float32Array.from(others);
-  for (let i = 0; i < frames; i++) out[10 * i] = ABSENT_M;
+  for (const number of numbers) for (let i = 0; i < frames; i++) out[10 * (number * frames + i)] = ABSENT_M;
   return out;
 }
 

@@ -10,6 +10,7 @@ const SWITCHES = ['scene', 'observer', 'companions', 'past', 'goal', 'goals', 'p
 export function defaults({ controls: { interactivity, samples, steps }, animals }) {
   return {
     interactivity: interactivity.default,
+    guidance: '',
     scene: 1,
     observer: 1,
     companions: 1,
@@ -45,6 +46,7 @@ export function readState(contract, clips, hash = location.hash) {
   const places = (text) => (readPlaces(text).length && readPlaces(text).every(within) ? text : null);
   const read = {
     interactivity: number(interactivity.least, interactivity.most),
+    guidance: (text) => (readScales(text, contract) ? text : null),
     samples: among(samples.choices),
     steps: among(steps.choices),
     seed: (text) => (/^\d+$/.test(text) ? number(0, LARGEST_SEED)(text) : null),
@@ -84,6 +86,26 @@ export function readDoings(text, { animals = [] }) {
   });
   return sound ? Object.fromEntries(found) : null;
 }
+
+// 'name:scale,...', how strongly others react to animals, to the scales of all animals; null where it is something
+// else.
+export function readScales(text, { controls: { interactivity }, animals = [] }) {
+  const found = text ? text.split(',').map((each) => each.split(':')) : [];
+  const { least, most, companions } = interactivity;
+  const sound = found.every(
+    ([name, scale]) =>
+      animals.some((each) => each.name === name) && scale && Number(scale) >= least && Number(scale) <= most,
+  );
+  const usual = animals.map(({ name }) => [name, companions]);
+  const read = found.map(([name, scale]) => [name, Number(scale)]);
+  return sound ? Object.fromEntries([...usual, ...read]) : null;
+}
+
+export const scalesText = (scales, { controls: { interactivity } }) =>
+  Object.entries(scales)
+    .filter(([, scale]) => scale !== interactivity.companions)
+    .map((each) => each.join(':'))
+    .join(',');
 
 export const doingsText = (doings) =>
   Object.entries(doings)
