@@ -216,7 +216,6 @@ def test_reactions_to_one_animal_are_set_kept_and_restored(home: Path, chromium:
         assert page.evaluate("ats.state().settings.guidance") == "dog:2"
         page.get_by_role("combobox", name="To whom animals react").select_option("dog")
         assert page.inner_text("#interactivity-value") == "2.00" and wrong == []
-        page.screenshot(path=home.parent / "reactions.png")
 
 
 def _check_it_is_away(page: Page) -> None:
