@@ -96,16 +96,21 @@ class ReconstructedHome:
         support = Support.of(self.volume, self.marks, self.stands_m)
         return Scenes((self.volume,), (self.marks > 0,), np.zeros(1, int), (support,))
 
-    def height_above_top(self, root_world: Float[np.ndarray, "3"], *, moves: bool) -> float:
-        """Return the height of a root above its support, meters, clipped to the animal's usual range."""
+    def height_above_top(self, track: Trajectory, count: int) -> float:
+        """Return the height of the root above its support in the last of ``count`` frames, meters, clipped to
+        the animal's usual range at rest or in motion.
+        """
         support = Support.of(self.volume, self.marks, self.stands_m)
         assert support is not None, "checked by `load`"
-        column = np.floor((root_world[[0, 2]] - support.corner) / support.voxel_m).astype(int)
+        before, root = track.world_from_agent[count - 2 : count, :3, 3]
+        step_s = track.timestamp_s[count - 1] - track.timestamp_s[count - 2]
+        moves = bool(np.hypot(*(root - before)[[0, 2]]) > REST_SPEED_M_S * step_s)
+        column = np.floor((root[[0, 2]] - support.corner) / support.voxel_m).astype(int)
         column = np.clip(column, 0, np.array(support.tops.shape[:2]) - 1)
         tops = support.tops[tuple(column)]
-        beneath = tops[tops <= root_world[1]]
+        beneath = tops[tops <= root[1]]
         top = beneath.max() if len(beneath) else self.floor_m
-        return float(np.clip(root_world[1] - top, *self.stands_m[int(moves)]))
+        return float(np.clip(root[1] - top, *self.stands_m[int(moves)]))
 
 
 @dataclass(frozen=True)
@@ -132,11 +137,12 @@ def move_in_together(
 
     Raises ART-007 and SIM-011 as `perceived` does, SIM-011 where no moment fits in.
     """
-    owns = {name: own for name, (own, _) in animals.items()}
-    seen = {name: replace(perceived(own, other), stands_m=own.stands_m) for name, own in owns.items()}
-    recorded = {name: data for name, (_, data) in animals.items()}
-    starts = place_starts(recorded, owns, next(iter(seen.values())), np.random.default_rng(0))
-    return {name: MovedAnimal(seen[name], starts[name], share_known(owns[name], seen[name])) for name in seen}
+    seen = {name: replace(perceived(own, other), stands_m=own.stands_m) for name, (own, _) in animals.items()}
+    starts = place_starts(animals, next(iter(seen.values())), np.random.default_rng(0))
+    return {
+        name: MovedAnimal(seen[name], starts[name], share_known(own, seen[name]))
+        for name, (own, _) in animals.items()
+    }
 
 
 def perceived(own: ReconstructedHome, other: ReconstructedHome) -> ReconstructedHome:
@@ -204,8 +210,7 @@ def _surface(home: ReconstructedHome) -> tuple[Float[np.ndarray, "cell 17"], Flo
 
 
 def place_starts(
-    data: Mapping[str, BehaviorData],
-    owns: Mapping[str, ReconstructedHome],
+    animals: Mapping[str, tuple[ReconstructedHome, BehaviorData]],
     other: ReconstructedHome,
     rng: np.random.Generator,
 ) -> dict[str, BehaviorData]:
@@ -216,6 +221,8 @@ def place_starts(
     their supports, the observer its height above the floor; an observer who was present stands on the floor.
     Raises SIM-011 if no moment fits.
     """
+    data = {name: recorded for name, (_, recorded) in animals.items()}
+    owns = {name: own for name, (own, _) in animals.items()}
     leading, splits = next(iter(data)), []
     tracks: dict[str, dict[str, Trajectory]] = {name: {} for name in data}
     scenes, floor = other.scenes(), _floor_places(other)
@@ -272,10 +279,7 @@ def _placed(
     """
     first, past = next(iter(moments)), {name: int(each.valid.sum()) for name, each in moments.items()}
     now = {name: each.world_from_agent[past[name] - 1, :3, 3] for name, each in moments.items()}
-    height = {
-        name: owns[name].height_above_top(now[name], moves=_moves(moments[name], past[name]))
-        for name in moments
-    }
+    height = {name: owns[name].height_above_top(each, past[name]) for name, each in moments.items()}
     for _ in range(PLACE_DRAWS):
         turn = rigid.rotation_from_vector(np.array([0.0, rng.uniform(0, 2 * np.pi), 0.0]))
         target, moved = floor[rng.integers(len(floor))], {}
@@ -300,13 +304,6 @@ def _placed(
                     for name, moment in moments.items()
                 }
     return None
-
-
-def _moves(moment: Trajectory, past: int) -> bool:
-    """Return whether the animal moves in the last of its past frames."""
-    step = np.diff(moment.world_from_agent[past - 2 : past, :3, 3], axis=0)[0]
-    step_s = float(np.diff(moment.timestamp_s[past - 2 : past])[0])
-    return bool(np.hypot(step[0], step[2]) > REST_SPEED_M_S * step_s)
 
 
 def _unusable(what: str, where: Path) -> InputError:

@@ -30,7 +30,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
     another home without a take in it, ART-003 where that home lacks its surfaces.
     """
     made = inputs.reconstruction, inputs.splats, inputs.behavior_data
-    place = surroundings.of(*made, home=inputs.home, take=inputs.take, name=config.name)
+    place = surroundings.of(*made, inputs.home, inputs.take, config.name)
     parts = export.simulator(
         reading.body(inputs.reconstruction),
         ply.read_ply(place.surface),

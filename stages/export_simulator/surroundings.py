@@ -40,13 +40,7 @@ class Surroundings:
 
 
 def of(
-    reconstruction: Path,
-    splats: Path,
-    behavior_data: Path,
-    *,
-    home: Path | None,
-    take: Path | None,
-    name: str,
+    reconstruction: Path, splats: Path, behavior_data: Path, home: Path | None, take: Path | None, name: str
 ) -> Surroundings:
     """Return an animal's own home or, given both, the ``home`` of another build with a ``take`` in it.
 

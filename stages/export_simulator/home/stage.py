@@ -40,7 +40,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
         if take is not None and not take.is_dir():
             continue  # it was absent
         made = inputs.reconstruction[name], inputs.splats[name], inputs.behavior_data[name]
-        places[name] = surroundings.of(*made, home=inputs.home, take=take, name=name)
+        places[name] = surroundings.of(*made, inputs.home, take, name)
     if not places:
         raise InputError("EXP-003", "holds no take", str(inputs.take), surroundings.REMEDY)
     first = next(iter(places.values()))
