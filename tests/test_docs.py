@@ -48,7 +48,7 @@ def check_make(words: list[str]) -> None:
         if word in ("|",) or re.fullmatch(r"-j\d*", word):
             continue
         if "=" in word:
-            name, value = word.split("=")
+            name, value = word.split("=", 1)
             assert (
                 f"$({name})" in makefile or f"$(or $({name})" in makefile or f"$(if $({name})" in makefile
             ), word
