@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.behavior.avoidance import clearance_of
-from pipeline.behavior.config import ReplanningConfig
-from pipeline.behavior.trajectories import RATE_HZ, TRAIN, BehaviorData, Context
+from pipeline.behavior.trajectories import RATE_HZ, BehaviorData, Context
 from pipeline.core.progress import log
 from pipeline.core.videos import Video
 from pipeline.data import npz
@@ -102,26 +101,6 @@ def simulated_session(home: Room, rng: np.random.Generator) -> MeasuredMotion:
     return MeasuredMotion(clock, *motion, rest(), volume_of(home))
 
 
-def without_surprises(data: BehaviorData) -> BehaviorData:
-    """Leave out training windows in which a person who stands now moves noticeably before the window ends.
-
-    The model cannot know that the person will come, learns that standing persons startle, and hardly regards
-    how fast persons come. In closed loop the animal replans when the person moves.
-    """
-    train = data.indices(TRAIN)
-    context, _ = data.windows(train, bones=False)
-    frames = data.start[train][:, None] + data.past + np.arange(data.future)
-    tracks = [data.trajectories[data.videos[video]].world_from_camera for video in data.video[train]]
-    later = np.stack([track[row, :3, 3] for track, row in zip(tracks, frames, strict=True)])[..., [0, 2]]
-    person, animal = context.observer_world[..., [0, 2]], context.world_from_agent[:, -1, [0, 2], 3]
-    now, before = person[:, -1], person[:, -1 - STANDS_FRAMES]
-    stands = np.linalg.norm(now - before, axis=-1) < STANDS_M
-    noticeable = ReplanningConfig.observer_motion_ratio * np.linalg.norm(animal - now, axis=-1)
-    comes = np.linalg.norm(later - now[:, None], axis=-1).max(1) > noticeable
-    left = np.delete(np.arange(len(data.start)), train[stands & comes])
-    return replace(data, video=data.video[left], start=data.start[left], split=data.split[left])
-
-
 def simulated_build(out: Path) -> None:
     """Simulate sessions, slice them into windows and train the model, unless ``out`` has it."""
     if (out / "behavior" / "behavior.json").is_file():
@@ -142,7 +121,6 @@ def simulated_build(out: Path) -> None:
         (out / part).mkdir()
     windows = SlicingConfig(stride=WINDOW_STRIDE)
     slicing.run(slicing.Inputs(trajectories=tables), windows, out / "behavior_data", videos=tuple(videos))
-    without_surprises(BehaviorData.load(out / "behavior_data")).save(out / "behavior_data")
     training.run(training.Inputs(out / "behavior_data"), MODEL, out / "behavior")
 
 

@@ -89,8 +89,11 @@ class PlanSamplingConfig:
 class ReplanningConfig:
     """When and how a plan is replaced by the next one."""
 
-    reaction_frames: int = 8
-    """Frames of a plan that are played before replanning is allowed."""
+    reaction_frames: int = 3
+    """Frames of a plan that are played before the animal reacts to the observer; who comes at 1.2 m/s has
+    reached it after 8."""
+    commitment_frames: int = 8
+    """Frames of a plan that are played before other animals or a command may replace it."""
     observer_motion_ratio: float = 0.25
     """Motion of the observer since planning that triggers replanning, relative to its distance from the
     agent; infinite: never."""

@@ -185,11 +185,11 @@ class AnimalBatch:
 
     def _must_replan(self) -> Bool[np.ndarray, "animal"]:
         """Return which animals must replan: their plan ends, another moved, or their command changed."""
-        seen = self._moved_noticeably().any(1) & self.sampling.observer
-        outdated = seen & (self.played >= self.chaining.reaction_frames)
-        changed = np.linalg.norm(np.nan_to_num(self.goal_command - self.goal), axis=-1) > GOAL_CHANGE_M
-        redirected = changed & (self.played >= self.chaining.reaction_frames)
-        return outdated | redirected | (self.played >= self.plan_frames - self.chaining.blend_frames)
+        moved = self._moved_noticeably() & self.sampling.observer
+        reacts = moved[:, 0] & (self.played >= self.chaining.reaction_frames)
+        redirected = np.linalg.norm(np.nan_to_num(self.goal_command - self.goal), axis=-1) > GOAL_CHANGE_M
+        outdated = (moved.any(1) | redirected) & (self.played >= self.chaining.commitment_frames)
+        return reacts | outdated | (self.played >= self.plan_frames - self.chaining.blend_frames)
 
     def _replan(self, some: Int[np.ndarray, "some"]) -> None:
         """Replan for some of the animals and blend their new plans in."""

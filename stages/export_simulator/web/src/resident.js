@@ -187,16 +187,19 @@ export class Resident {
   // Replanned at every step, the goal would switch mid-walk; only a visitor's commands are replanned at once.
   get due() {
     const { now, state, residents } = this.home;
-    const { reaction_frames: soonest, blend_frames: fade } = this.contract.replanning;
+    const {
+      reaction_frames: soonest,
+      commitment_frames: kept,
+      blend_frames: fade,
+    } = this.contract.replanning;
     if (this.clip) return this.timeline.ticksLeft(now) <= 0;
     if (this.urgent) return true;
     // one worker plans for all
     const thinking = residents.length * ((this.milliseconds ?? 0) / 1000 / TICK_S) * state.speed;
     if (this.timeline.ticksLeft(now) <= fade + thinking) return true;
-    if (now - this.planStart < soonest) return false;
-    if (this.stops.next || this.route) return true;
-    if (this.bodyInTheWay) return true;
-    return this.personMoved || this.othersMoved;
+    if (now - this.planStart >= soonest && this.personMoved) return true;
+    if (now - this.planStart < kept) return false;
+    return Boolean(this.stops.next || this.route || this.bodyInTheWay || this.othersMoved);
   }
 
   // Whether the person has moved noticeably since the animal made its plan.
