@@ -15,6 +15,7 @@ from pipeline.data.clips import Clip
 from pipeline.data.templates import SkinTable
 from pipeline.geometry import cameras, subsampling
 from pipeline.geometry.meshes import Mesh, RayCaster
+from pipeline.geometry.size import body_length_m
 from pipeline.localization import localizer as localizers
 from pipeline.localization.patches import Patches, PatchSampling, Target
 from stages.train_localizer import described_views, networks, views
@@ -29,13 +30,14 @@ PCA_AXES = 64
 """Principal components of the descriptors; more do not help on the built-in cat."""
 SCENE_SAMPLING = PatchSampling("scene", 120.0, 0, 8, (6, 18))
 """Resized to a focal length of 120 px, a patch every 8 px (4 degrees), radii of 6 and 18 px."""
-AGENT_SAMPLING = PatchSampling("agent", 110.0, 104, 4, (6, 14))
-"""110 px per meter, crops of 0.95 m, a patch every 4 px (4 cm), radii of 6 and 14 px."""
+AGENT_SAMPLING = PatchSampling("agent", 66.0, 104, 4, (6, 14))
+"""For an animal of 1 m: 66 px per body length, crops of 1.58 lengths, which a long tail fits into, a patch
+every 4 px, radii of 6 and 14 px."""
 SOLVERS: dict[Target, localizers.RansacSolver] = {
     "scene": localizers.RansacSolver(threshold_m=0.1, min_side_m=0.25, iterations=600, sectors=1),
-    "agent": localizers.RansacSolver(threshold_m=0.04, min_side_m=0.06, iterations=600, sectors=6),
+    "agent": localizers.RansacSolver(threshold_m=0.067, min_side_m=0.1, iterations=600, sectors=6),
 }
-"""Inlier thresholds of a patch's size; RANSAC samples wider than a few patches."""
+"""Inlier thresholds of a patch's size; RANSAC samples wider than a few patches; of an animal of 1 m."""
 RENDER_SCALE = 2
 """Resolution of rendered agent views relative to that of the crop."""
 VIEW_MARGIN, MIN_DISTANCE_M, VIEW_PX = 2.4, 0.3, (64, 240)
@@ -48,6 +50,7 @@ class TrainingViews:
 
     target: Target
     sampling: PatchSampling
+    solver: localizers.RansacSolver
     pictures: list[RenderedView]
     draw: Callable[[np.random.Generator], RenderedView]
     """Render a random training view."""
@@ -97,7 +100,7 @@ def scene_views(
         for frame in subsampling.evenly(len(clip), config.frames)
     ]
     sampling = replace(SCENE_SAMPLING, focal_px=config.focal_px)
-    return TrainingViews("scene", sampling, pictures, draw, draw_query, config.held_out)
+    return TrainingViews("scene", sampling, SOLVERS["scene"], pictures, draw, draw_query, config.held_out)
 
 
 def agent_views(
@@ -108,7 +111,11 @@ def agent_views(
     pose = None if skin is None else views.postures(mesh, skin, config.posture_deg)
     center = (mesh.vertices.min(0) + mesh.vertices.max(0)).astype(float) / 2
     radius = float(np.linalg.norm(mesh.vertices - center, axis=1).max())
-    focal = RENDER_SCALE * AGENT_SAMPLING.focal_px
+    length_m, solver = body_length_m(mesh), SOLVERS["agent"]
+    sampling = replace(AGENT_SAMPLING, focal_px=AGENT_SAMPLING.focal_px / length_m)
+    threshold_m, min_side_m = solver.threshold_m * length_m, solver.min_side_m * length_m
+    solver = replace(solver, threshold_m=threshold_m, min_side_m=min_side_m)
+    focal = RENDER_SCALE * sampling.focal_px
 
     def draw(rng: np.random.Generator) -> RenderedView:
         camera = views.agent_camera(center, config.distance_m, rng)
@@ -122,7 +129,7 @@ def agent_views(
         return views.with_depth_noise(draw(rng), rng)
 
     pictures = [draw(rng) for _ in track(range(config.views), "rendering views")]
-    return TrainingViews("agent", AGENT_SAMPLING, pictures, draw, draw_query, config.held_out)
+    return TrainingViews("agent", sampling, solver, pictures, draw, draw_query, config.held_out)
 
 
 def train(
@@ -145,7 +152,7 @@ def train(
         described.basis,
         model,
         localizers.Calibration(0.0, 0.0),
-        SOLVERS[data.target],
+        data.solver,
         describer,
         describe,
     )

@@ -7,8 +7,10 @@ import trimesh
 from pipeline.backends.descriptors import Describer
 from pipeline.core.errors import InputError
 from pipeline.data.templates import SkinTable
+from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh, RayCaster
-from stages.train_localizer import training, views
+from pipeline.localization.patches import Patches
+from stages.train_localizer import described_views, training, views
 from stages.train_localizer.config import AgentConfig, Config, SceneConfig
 from tests.pipeline.fields.test_limbs import chain
 from tests.stages.textured_room import MemoryClip, noise_color, textured_room, walk
@@ -31,6 +33,28 @@ def test_agent_is_localized_from_all_directions():
     assert held.good.mean() > 0.6, "share within 15 degrees and 8 cm"
     assert np.nanmedian(held.rotation_deg) < 8, "degrees"
     assert localizer.calibration.slope > 0
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_crops_scale_with_the_animal(factor):
+    """Larger and from farther away, its patches are the same, and tolerances are larger."""
+    mesh = trimesh.creation.capsule(0.3, 0.1, count=(32, 32))
+    colors = noise_color(8 * mesh.vertices, 1)
+
+    def shown(factor: float) -> tuple[training.TrainingViews, Patches]:
+        body = Mesh((factor * mesh.vertices).astype(np.float32), mesh.faces.astype(np.int32), colors)
+        data = training.agent_views(body, AgentConfig(views=0), np.random.default_rng(0))
+        camera = rigid.look_at(factor * np.array([1.2, 0.5, 0.2]), np.zeros(3), np.array([0, 1.0, 0]))
+        lens = np.array([[220.0, 0, 120], [0, 220, 120], [0, 0, 1]])
+        view = views.render(RayCaster(body), camera, lens, (240, 240), np.random.default_rng(0))
+        return data, described_views.describe_view(view, data.sampling, None)
+
+    (unit, patches), (data, others) = shown(1.0), shown(factor)
+    np.testing.assert_array_equal(others.cell, patches.cell)
+    np.testing.assert_allclose(others.points_camera, factor * patches.points_camera, rtol=1e-4)
+    np.testing.assert_allclose(others.descriptors, patches.descriptors, atol=0.02)
+    assert data.solver.threshold_m == pytest.approx(factor * unit.solver.threshold_m)
+    assert data.solver.min_side_m == pytest.approx(factor * unit.solver.min_side_m)
 
 
 def test_map_that_fills_no_view_is_refused(tmp_path, monkeypatch):
