@@ -1,7 +1,7 @@
 """Fit the animal's canonical surface rigidly to the depth inside its mask, from many headings at once.
 
 `observe` back-projects the masked depth to the world, `fit_coarse` and `fit_fine` run robust point-to-plane
-ICP from all initial poses in one batch, `cost` scores poses.
+ICP from all initial poses in one batch, `cost` scores poses. Distances of the body are in body lengths.
 """
 
 from dataclasses import dataclass
@@ -14,40 +14,41 @@ from scipy.spatial import KDTree
 from pipeline.data.clips import Clip
 from pipeline.geometry import cameras, contact, rigid, subsampling
 from pipeline.geometry.meshes import Mesh, RayCaster
+from pipeline.geometry.size import body_length_m
 
 UP = np.array([0.0, 1.0, 0.0])
 POINTS, MODEL_POINTS = 220, 700
 """Depth points per frame, and vertices sampled from the template; more do not improve the fit."""
 LEAF_POINTS = 32
 """Leaf size of the k-d tree, the fastest here."""
-COARSE_ROUNDS, FIRST_REACH_M, REACH_M = 5, 0.18, 0.07
-"""Gauss-Newton steps from every initial pose, and initial and final width of the robust kernel, meters, which
-rejects moving legs and tail."""
+COARSE_ROUNDS, FIRST_REACH, REACH = 5, 0.3, 0.117
+"""Gauss-Newton steps from every initial pose, and initial and final width of the robust kernel, body lengths,
+which rejects moving legs and tail."""
 TILT_SIGMA_RAD, UPRIGHT_SIGMA_RAD = float(np.deg2rad(15.0)), 1e-4
 """Prior standard deviation of the root's tilt, if it may tilt and if it must stay upright, radians."""
-STAND_POINTS, STAND_REACH_M, STAND_COST_M = 40.0, 0.12, 0.012
+STAND_POINTS, STAND_REACH, STAND_COST = 40.0, 0.2, 0.02
 """Prior that the animal stands on the surface below: equivalent depth points, width of its robust
-kernel (animals jump and lie down), and largest cost, meters."""
-COLOR_WEIGHT_M, OUTSIDE_WEIGHT_M, TRUNCATION = 0.06, 0.05, 1.5
-"""Cost of a full-scale color difference, and of a template wholly outside the mask, meters; truncation of
-distances, in reaches."""
+kernel (animals jump and lie down), and largest cost, body lengths."""
+COLOR_WEIGHT, OUTSIDE_WEIGHT, TRUNCATION = 0.1, 0.0833, 1.5
+"""Cost of a full-scale color difference, and of a template wholly outside the mask, body lengths; truncation
+of distances, in reaches."""
 POINT_WEIGHT = 0.15
 """Weight of the point-to-point term relative to point-to-plane; prevents sliding."""
-PRIOR_POINTS, POINT_SIGMA_M, DAMPING = 20, 0.03, 1e-6
-"""Equivalent points of the upright prior, their noise (meters), and damping of a step."""
-PREDICTED_POINTS, DEPARTURE_COST_M = 40, 0.002
-"""Equivalent points of a predicted pose, and cost of a deviation by one sigma, meters."""
+PRIOR_POINTS, POINT_SIGMA, DAMPING = 20, 0.05, 1e-6
+"""Equivalent points of the upright prior, their noise (body lengths, by posture), and damping of a step."""
+PREDICTED_POINTS, DEPARTURE_COST = 40, 0.00333
+"""Equivalent points of a predicted pose, and cost of a deviation by one sigma, body lengths."""
 MIN_POINTS, MIN_ERODED_PX, MIN_DEPTH_M = 25, 60, 0.1
 """Least depth points of an observation, least pixels of the eroded mask, least valid depth (meters)."""
-RADIUS, FULL_VIEW, DEPTH_SHARE = 0.75, 0.3, 0.1
+RADIUS, FULL_VIEW, DEPTH_SHARE = 0.912, 0.44, 0.122
 """In body lengths: largest distance of points from their median, silhouette area in full view (squared), and
 distance from the visible side to the center."""
 BACK_QUANTILE = 0.8
 """Quantile of the template's heights that is its back's; head and tail may be higher."""
 STANDING_STEP = 8
 """Stride of the points below which the surface height is measured."""
-BEHIND_M = 0.05
-"""Depth farther than the template by this is behind it, meters."""
+BEHIND = 0.0833
+"""Depth farther than the template by this is behind it, body lengths."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class AgentModel:
     """0..1"""
     tree: KDTree
     length_m: float
-    """Horizontal length."""
+    """`body_length_m` of the template."""
     stand_m: float
     """Height of the root above the paws."""
 
@@ -102,9 +103,8 @@ def make_model(mesh: Mesh, rng: np.random.Generator) -> AgentModel:
     chosen = np.sort(rng.choice(len(mesh.vertices), count, replace=False, p=weight / weight.sum()))
     points = mesh.vertices[chosen].astype(float)
     color = np.full((len(chosen), 3), 0.5) if mesh.color is None else mesh.color[chosen] / 255.0
-    extent = np.ptp(points[:, [0, 2]], axis=0)
     stand_m, normals = float(-np.quantile(points[:, 1], 0.01)), mesh.vertex_normals()[chosen]
-    return AgentModel(points, normals, color, KDTree(points, LEAF_POINTS), float(extent.max()), stand_m)
+    return AgentModel(points, normals, color, KDTree(points, LEAF_POINTS), body_length_m(mesh), stand_m)
 
 
 def observe(
@@ -196,7 +196,7 @@ def fit_coarse(
     observation: AgentObservation, model: AgentModel, world_from_agent: Float[np.ndarray, "pose 4 4"]
 ) -> Float[np.ndarray, "pose 4 4"]:
     """Fit upright from every pose with a narrowing robust kernel."""
-    reach = np.geomspace(FIRST_REACH_M, REACH_M, COARSE_ROUNDS)
+    reach = np.geomspace(FIRST_REACH, REACH, COARSE_ROUNDS)
     return _fit(observation, model, world_from_agent, reach, UPRIGHT_SIGMA_RAD)
 
 
@@ -212,7 +212,7 @@ def fit_fine(
 
     With ``tilt`` the root may tilt.
     """
-    reach, prior = np.full(rounds, REACH_M), TILT_SIGMA_RAD if tilt else UPRIGHT_SIGMA_RAD
+    reach, prior = np.full(rounds, REACH), TILT_SIGMA_RAD if tilt else UPRIGHT_SIGMA_RAD
     standing, free = (
         _fit(observation, model, world_from_agent, reach, prior, stands=stands) for stands in (True, False)
     )
@@ -238,9 +238,10 @@ class PosePrior:
         hessian: Float[np.ndarray, "pose 6 6"],
         gradient: Float[np.ndarray, "pose 6"],
         world_from_agent: Float[np.ndarray, "pose 4 4"],
+        length_m: float,
     ) -> tuple[Float[np.ndarray, "pose 6 6"], Float[np.ndarray, "pose 6"]]:
-        """Add the prior to normal equations, to first order in the twist."""
-        precision = PREDICTED_POINTS * POINT_SIGMA_M**2 / np.repeat(self.sigma, 3)
+        """Add the prior to normal equations of an animal of this length, to first order in the twist."""
+        precision = PREDICTED_POINTS * (POINT_SIGMA * length_m) ** 2 / np.repeat(self.sigma, 3)
         hessian[:, range(6), range(6)] += precision / np.repeat(self.sigma, 3)
         return hessian, gradient + precision * self.twist(world_from_agent)
 
@@ -250,40 +251,43 @@ class PriorFit:
     """A pose fitted under a prior."""
 
     world_from_agent: Float[np.ndarray, "4 4"]
-    cost_m: float
-    """`cost` of the pose, meters."""
-    total_m: float
-    """The same plus the cost of deviation from the prediction, meters."""
+    cost: float
+    """`cost` of the pose, body lengths."""
+    total: float
+    """The same plus the cost of deviation from the prediction, body lengths."""
 
 
 def fit_near(observation: AgentObservation, model: AgentModel, prior: PosePrior, *, rounds: int) -> PriorFit:
     """Fit from a predicted pose with and without the standing prior, and return the lower total cost."""
-    reach, start = np.full(rounds, REACH_M), prior.world_from_agent[None]
+    reach, start = np.full(rounds, REACH), prior.world_from_agent[None]
     fits = (
         _fit(observation, model, start, reach, TILT_SIGMA_RAD, stands=stands, near=prior)
         for stands in (True, False)
     )
     poses = np.concatenate(list(fits))
     own = cost(observation, model, poses)
-    total = own + DEPARTURE_COST_M * (prior.twist(poses) ** 2).sum(-1)
+    total = own + DEPARTURE_COST * (prior.twist(poses) ** 2).sum(-1)
     best = int(total.argmin())
     return PriorFit(poses[best], float(own[best]), float(total[best]))
 
 
 def _fit(observation, model, world_from_agent, reaches, prior, *, stands=True, near=None):
-    """Run robust point-to-plane ICP with a weak point-to-point term."""
-    poses = np.array(world_from_agent, float)
-    for reach in reaches:
+    """Run robust point-to-plane ICP with a weak point-to-point term; ``reaches`` in body lengths."""
+    poses, length_m = np.array(world_from_agent, float), model.length_m
+    for reach in length_m * reaches:
         local = rigid.apply(rigid.inverse(poses), observation.points_world[None])
         distance, nearest = model.tree.query(local)
         target, normal = model.points_agent[nearest], model.normals_agent[nearest]
         weight = (reach**2 / (reach**2 + distance**2)) ** 2
         gradient, hessian = _normal_equations(local, target, normal, weight)
-        hessian, gradient = _add_upright_prior(poses, hessian, gradient, prior)
+        hessian, gradient = _add_upright_prior(poses, hessian, gradient, prior, length_m)
         if near is not None:
-            hessian, gradient = near.add(hessian, gradient, poses)
+            hessian, gradient = near.add(hessian, gradient, poses, length_m)
         if stands and np.isfinite(observation.standing_m):
-            hessian, gradient = _add_standing_prior(poses, hessian, gradient, observation.standing_m)
+            height_m = poses[:, 1, 3] - observation.standing_m
+            hessian, gradient = _add_standing_prior(
+                poses, hessian, gradient, height_m, STAND_REACH * length_m
+            )
         poses = poses @ rigid.exp(np.linalg.solve(hessian, -gradient[..., None])[..., 0])
     return poses
 
@@ -304,10 +308,10 @@ def _normal_equations(local, target, normal, weight):
     return gradient - np.stack([*torque, *(share * gap).sum(1).T], axis=-1), hessian
 
 
-def _add_upright_prior(poses, hessian, gradient, prior_rad):
+def _add_upright_prior(poses, hessian, gradient, prior_rad, length_m):
     """Add the prior that the tilt about the body's x and z axes is small."""
     up_agent = np.einsum("sji,j->si", poses[:, :3, :3], UP)
-    precision = PRIOR_POINTS * (POINT_SIGMA_M / prior_rad) ** 2
+    precision = PRIOR_POINTS * (POINT_SIGMA * length_m / prior_rad) ** 2
     tilt = np.cross(UP, up_agent)
     for axis in (0, 2):
         hessian[:, axis, axis] += precision
@@ -316,29 +320,28 @@ def _add_upright_prior(poses, hessian, gradient, prior_rad):
     return hessian, gradient
 
 
-def _add_standing_prior(poses, hessian, gradient, standing_m):
-    """Add the robust prior that the animal stands on the surface below."""
-    height = poses[:, 1, 3] - standing_m
-    weight = STAND_POINTS * (STAND_REACH_M**2 / (STAND_REACH_M**2 + height**2)) ** 2
+def _add_standing_prior(poses, hessian, gradient, height_m, reach_m):
+    """Add the robust prior that the animal stands on the surface below, which it is above by a height."""
+    weight = STAND_POINTS * (reach_m**2 / (reach_m**2 + height_m**2)) ** 2
     direction = poses[:, 1, :3]
     hessian[:, 3:, 3:] += weight[:, None, None] * direction[:, :, None] * direction[:, None, :]
-    gradient[:, 3:] += (weight * height)[:, None] * direction
+    gradient[:, 3:] += (weight * height_m)[:, None] * direction
     return hessian, gradient
 
 
 def cost(
     observation: AgentObservation, model: AgentModel, world_from_agent: Float[np.ndarray, "pose 4 4"]
 ) -> Float[np.ndarray, "pose"]:
-    """Return each pose's cost, meters: truncated distance, standing, color, template outside mask."""
+    """Return each pose's cost, body lengths: truncated distance, standing, color, template outside mask."""
     local = rigid.apply(rigid.inverse(world_from_agent), observation.points_world[None])
     distance, nearest = model.tree.query(local)
     seen, expected = observation.color - observation.color.mean(0), model.color[nearest]
     color_error = np.abs(seen - (expected - expected.mean(1, keepdims=True))).mean((1, 2))
-    height = np.nan_to_num(world_from_agent[:, 1, 3] - observation.standing_m)
-    standing_error = height**2 / (height**2 + STAND_REACH_M**2)
-    geometry = np.minimum(distance, TRUNCATION * REACH_M).mean(1) + STAND_COST_M * standing_error
+    height = np.nan_to_num(world_from_agent[:, 1, 3] - observation.standing_m) / model.length_m
+    standing_error = height**2 / (height**2 + STAND_REACH**2)
+    geometry = np.minimum(distance / model.length_m, TRUNCATION * REACH).mean(1) + STAND_COST * standing_error
     outside = _outside_share(observation, model, world_from_agent)
-    return geometry + COLOR_WEIGHT_M * color_error + OUTSIDE_WEIGHT_M * outside
+    return geometry + COLOR_WEIGHT * color_error + OUTSIDE_WEIGHT * outside
 
 
 def _outside_share(observation, model, world_from_agent):
@@ -353,6 +356,6 @@ def _outside_share(observation, model, world_from_agent):
     column = np.clip(pixel[..., 0], 0, width - 1).astype(int)
     row = np.clip(pixel[..., 1], 0, height - 1).astype(int)
     scale = np.array(observation.depth.shape) / (height, width)
-    behind = observation.depth[(row * scale[0]).astype(int), (column * scale[1]).astype(int)] > z + BEHIND_M
-    wrong = facing & inside & ~observation.mask[row, column] & behind
+    behind_m = observation.depth[(row * scale[0]).astype(int), (column * scale[1]).astype(int)] - z
+    wrong = facing & inside & ~observation.mask[row, column] & (behind_m > BEHIND * model.length_m)
     return wrong.sum(1) / np.maximum(facing.sum(1), 1)

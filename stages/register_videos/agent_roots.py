@@ -23,8 +23,8 @@ from stages.register_videos.headings import RootHypotheses
 
 MAX_HYPOTHESES, MIN_HEADING_DIFFERENCE_DEG = 5, 25.0
 """Largest number of hypotheses per frame, and least difference of their headings, degrees."""
-COST_SCALE_M = 0.004
-"""Fit cost that counts as one unit of the Viterbi cost, meters."""
+COST_SCALE = 0.00667
+"""Fit cost that counts as one unit of the Viterbi cost, body lengths."""
 FINE_ROUNDS = 12
 """Gauss-Newton steps of the remaining hypotheses."""
 LOCALIZER_EVERY_FRAMES, LOCALIZER_WEIGHT = 2, 8.0
@@ -33,10 +33,10 @@ MAX_LOCALIZED, LOCALIZER_SIGMA_RAD = 2, float(np.deg2rad(30.0))
 """Localizer poses that become hypotheses, and width of their bonus in heading, radians."""
 SMOOTHING_PASSES, SMOOTHING_REACH = 2, 3
 """Passes of the smoothing, and its reach in time constants."""
-OUTLIER_SCALE = (0.35, 0.1)
-"""Residual (radians, meters) at which a neighbor's weight is halved."""
-MIN_SHARE, COST_DECAY_M, SLOPE_RIDGE_S2 = 0.05, 0.02, 1e-4
-"""Least weight by visibility, cost scale of weights (meters), ridge on the slope (s^2)."""
+OUTLIER_SCALE = (0.35, 0.167)
+"""Residual (radians, body lengths) at which a neighbor's weight is halved."""
+MIN_SHARE, COST_DECAY, SLOPE_RIDGE_S2 = 0.05, 0.0333, 1e-4
+"""Least weight by visibility, cost scale of weights (body lengths), ridge on the slope (s^2)."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class Roots:
 
     world_from_agent: Float[np.ndarray, "frame 4 4"]
     visible: Bool[np.ndarray, "frame"]
-    cost_m: Float[np.ndarray, "frame"]
-    """Cost of the pose (`agent_fit.cost`), meters; NaN where not visible."""
+    cost: Float[np.ndarray, "frame"]
+    """Cost of the pose (`agent_fit.cost`), body lengths; NaN where not visible."""
     share: Float[np.ndarray, "frame"]
     """Visible share, 0..1 (`AgentObservation.share`)."""
 
@@ -69,7 +69,7 @@ def find_roots(
 ) -> Roots:
     """Estimate the animal's root pose in every frame that shows it."""
     model, roots = agent_fit.make_model(mesh, rng), Roots.unseen(len(clip))
-    poses, cost, share = roots.world_from_agent, roots.cost_m, roots.share
+    poses, cost, share = roots.world_from_agent, roots.cost, roots.share
 
     def observe(frame: int) -> AgentObservation | None:
         return agent_fit.observe(clip, masks[frame], frame, world_from_camera[frame], model, standing)
@@ -90,7 +90,7 @@ def find_roots(
             assert_never(config.initialization)
     if not hypotheses:
         return roots
-    path = headings.choose_hypotheses(clip.timestamp_s, hypotheses)
+    path = headings.choose_hypotheses(clip.timestamp_s, hypotheses, model.length_m)
     for each, chosen in track(list(zip(hypotheses, path, strict=True)), "refining the animal"):
         frame, observation = each.frame, observe(each.frame)
         assert observation is not None, frame
@@ -99,7 +99,7 @@ def find_roots(
         poses[frame], share[frame] = pose[0], observation.share
         cost[frame] = agent_fit.cost(observation, model, pose)[0]
     poses, cost = Tracker(clip.timestamp_s, poses, cost, share, observe, model).track()
-    smoothed = smooth(clip.timestamp_s, poses, cost, share, config.smooth_s)
+    smoothed = smooth(clip.timestamp_s, poses, cost, share, config.smooth_s, model.length_m)
     return Roots(smoothed, np.isfinite(cost), cost, share)
 
 
@@ -125,7 +125,7 @@ def _hypotheses(
     poses = agent_fit.fit_fine(
         observation, model, poses[distinct[:MAX_HYPOTHESES]], rounds=FINE_ROUNDS, tilt=False
     )
-    cost = agent_fit.cost(observation, model, poses) / COST_SCALE_M
+    cost = agent_fit.cost(observation, model, poses) / COST_SCALE
     bonus = np.zeros(len(poses))
     for world_from_agent, probability in localized:
         turn = rigid.wrap(rigid.yaw(poses) - rigid.yaw(world_from_agent))
@@ -159,16 +159,18 @@ def upright(world_from_agent: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 
 def smooth(
     timestamp_s: Float[np.ndarray, "frame"],
     world_from_agent: Float[np.ndarray, "frame 4 4"],
-    cost_m: Float[np.ndarray, "frame"],
+    cost: Float[np.ndarray, "frame"],
     share: Float[np.ndarray, "frame"],
     smooth_s: float,
+    length_m: float,
 ) -> Float[np.ndarray, "frame 4 4"]:
     """Smooth visible roots by robust local linear regression on SE(3).
 
-    Weights depend on time difference (``smooth_s``, seconds), cost (meters), visibility and residual.
+    Weights depend on time difference (``smooth_s``, seconds), cost, visibility and residual, for an animal of
+    ``length_m``.
     """
-    known = np.flatnonzero(np.isfinite(cost_m))
-    result, time, best = world_from_agent.copy(), timestamp_s[known], np.nanmin(cost_m, initial=np.inf)
+    known, scale = np.flatnonzero(np.isfinite(cost)), np.repeat(OUTLIER_SCALE, 3) * ([1] * 3 + [length_m] * 3)
+    result, time, best = world_from_agent.copy(), timestamp_s[known], np.nanmin(cost, initial=np.inf)
     low = np.searchsorted(time, time - SMOOTHING_REACH * smooth_s, side="right")
     high = np.searchsorted(time, time + SMOOTHING_REACH * smooth_s)
     for _ in range(SMOOTHING_PASSES):
@@ -177,12 +179,12 @@ def smooth(
             index = known[low[row] : high[row]]
             gap = timestamp_s[index] - timestamp_s[frame]
             offset = rigid.log(rigid.inverse(previous[frame]) @ world_from_agent[index])
-            outlier = np.linalg.norm(offset / np.repeat(OUTLIER_SCALE, 3), axis=1)
+            outlier = np.linalg.norm(offset / scale, axis=1)
             weight = (
                 np.exp(-0.5 * (gap / smooth_s) ** 2)
                 * (MIN_SHARE + share[index])
                 / (1 + outlier**2)
-                * np.exp(-(cost_m[index] - best) / COST_DECAY_M)
+                * np.exp(-(cost[index] - best) / COST_DECAY)
             )
             total, first = weight.sum(), (weight * gap).sum()
             second = (weight * gap**2).sum() + SLOPE_RIDGE_S2 * total

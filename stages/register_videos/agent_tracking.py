@@ -13,31 +13,32 @@ from pipeline.geometry import rigid
 from stages.register_videos import agent_fit
 from stages.register_videos.agent_fit import AgentModel, AgentObservation, PosePrior, PriorFit
 
-RELIABLE_SHARE, TYPICAL_QUANTILE, MAX_EXCESS_M = 0.25, 0.3, 0.012
+RELIABLE_SHARE, TYPICAL_QUANTILE, MAX_EXCESS = 0.25, 0.3, 0.02
 """A frame is reliable if its visible share is at least the lower of this and the median, and its cost exceeds
-the typical one (a quantile over the recording) by at most this, meters."""
-MIN_SHARE, LOST_EXCESS_M = 0.03, 0.036
-"""A track ends at a smaller visible share or a larger excess over the typical cost, meters."""
+the typical one (a quantile over the recording) by at most this, body
+lengths."""
+MIN_SHARE, LOST_EXCESS = 0.03, 0.06
+"""A track ends at a smaller visible share or a larger excess over the typical cost, body lengths."""
 MAX_GAP_S = 1.0
 """Longest gap between frames that is bridged by prediction, seconds."""
-PREDICTION_SIGMA, MIN_SPEED = (float(np.deg2rad(5.0)), 0.01), (float(np.deg2rad(100.0)), 0.4)
-"""Standard deviation of a prediction (radians, meters), and its least growth per second, that of a walking
-cat; faster animals raise it."""
+PREDICTION_SIGMA, MIN_SPEED = (float(np.deg2rad(5.0)), 0.0167), (float(np.deg2rad(100.0)), 0.667)
+"""Standard deviation of a prediction (radians, body lengths), and its least growth per second, that of a slow
+walk; faster animals raise it."""
 ROUNDS = 12
 """Gauss-Newton steps."""
 
 
-def excess_cost(cost_m: Float[np.ndarray, "frame"]) -> Float[np.ndarray, "frame"]:
-    """Return the excess of each cost over the typical one, meters; infinite where unknown."""
-    known = np.isfinite(cost_m)
+def excess_cost(cost: Float[np.ndarray, "frame"]) -> Float[np.ndarray, "frame"]:
+    """Return the excess of each cost over the typical one; infinite where unknown."""
+    known = np.isfinite(cost)
     if not known.any():
-        return np.full(len(cost_m), np.inf)
-    return np.where(known, np.maximum(np.nan_to_num(cost_m) - typical_cost(cost_m), 0), np.inf)
+        return np.full(len(cost), np.inf)
+    return np.where(known, np.maximum(np.nan_to_num(cost) - typical_cost(cost), 0), np.inf)
 
 
-def typical_cost(cost_m: Float[np.ndarray, "frame"]) -> float:
-    """Return the typical cost of a good fit in this recording, meters."""
-    return float(np.nanquantile(cost_m, TYPICAL_QUANTILE))
+def typical_cost(cost: Float[np.ndarray, "frame"]) -> float:
+    """Return the typical cost of a good fit in this recording."""
+    return float(np.nanquantile(cost, TYPICAL_QUANTILE))
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Tracker:
 
     timestamp_s: Float[np.ndarray, "frame"]
     world_from_agent: Float[np.ndarray, "frame 4 4"]
-    cost_m: Float[np.ndarray, "frame"]
+    cost: Float[np.ndarray, "frame"]
     """`agent_fit.cost`; NaN where the animal is not visible."""
     share: Float[np.ndarray, "frame"]
     """Visible share (`AgentObservation.share`)."""
@@ -57,24 +58,24 @@ class Tracker:
         """Track through unreliable frames, forward and backward.
 
         Returns roots and their costs, NaN where not placed. The fit of lower cost replaces the frame's own
-        pose, unless that is better by more than `MAX_EXCESS_M`. Frames that neither reaches are not placed.
+        pose, unless that is better by more than `MAX_EXCESS`. Frames that neither reaches are not placed.
         """
-        seen = np.flatnonzero(np.isfinite(self.cost_m))
+        seen = np.flatnonzero(np.isfinite(self.cost))
         if not len(seen):
-            return self.world_from_agent, self.cost_m
+            return self.world_from_agent, self.cost
         enough = min(RELIABLE_SHARE, float(np.median(self.share[seen])))
-        reliable = (self.share >= enough) & (excess_cost(self.cost_m) <= MAX_EXCESS_M)
+        reliable = (self.share >= enough) & (excess_cost(self.cost) <= MAX_EXCESS)
         fits: dict[int, PriorFit] = {}
         for order in (seen, seen[::-1]):
             for frame, fit in self._sweep(order, reliable):
-                if frame not in fits or fit.total_m < fits[frame].total_m:
+                if frame not in fits or fit.total < fits[frame].total:
                     fits[frame] = fit
-        poses, costs = self.world_from_agent.copy(), self.cost_m.copy()
+        poses, costs = self.world_from_agent.copy(), self.cost.copy()
         poses[~reliable], costs[~reliable] = np.nan, np.nan
         for frame, fit in fits.items():
-            keep_own = fit.cost_m >= self.cost_m[frame] + MAX_EXCESS_M
+            keep_own = fit.cost >= self.cost[frame] + MAX_EXCESS
             poses[frame] = self.world_from_agent[frame] if keep_own else fit.world_from_agent
-            costs[frame] = self.cost_m[frame] if keep_own else fit.cost_m
+            costs[frame] = self.cost[frame] if keep_own else fit.cost
         return poses, costs
 
     def _sweep(
@@ -82,7 +83,7 @@ class Tracker:
     ) -> Iterator[tuple[int, PriorFit]]:
         """Fit each unreliable frame from its predecessor in ``order``; yield (frame, fit)."""
         previous, pose, speed = 0, None, self._typical_speed(reliable)
-        max_cost_m = typical_cost(self.cost_m) + LOST_EXCESS_M
+        max_cost = typical_cost(self.cost) + LOST_EXCESS
         for frame in order.tolist():
             elapsed = abs(float(self.timestamp_s[frame] - self.timestamp_s[previous]))
             previous = frame
@@ -93,9 +94,10 @@ class Tracker:
             if observation is None or pose is None:
                 pose = None
                 continue
-            sigma = (PREDICTION_SIGMA[0] + speed[0] * elapsed, PREDICTION_SIGMA[1] + speed[1] * elapsed)
+            sigma_m = self.model.length_m * PREDICTION_SIGMA[1] + speed[1] * elapsed
+            sigma = (PREDICTION_SIGMA[0] + speed[0] * elapsed, sigma_m)
             fit = agent_fit.fit_near(observation, self.model, PosePrior(pose, sigma), rounds=ROUNDS)
-            if fit.cost_m > max_cost_m or self.share[frame] < MIN_SHARE:
+            if fit.cost > max_cost or self.share[frame] < MIN_SHARE:
                 pose = None
                 continue
             pose = fit.world_from_agent
@@ -104,10 +106,11 @@ class Tracker:
     def _typical_speed(self, reliable: Bool[np.ndarray, "frame"]) -> tuple[float, float]:
         """Return median speeds (rad/s, m/s) between reliable neighbors, at least `MIN_SPEED`."""
         first = np.flatnonzero(reliable[:-1] & reliable[1:])
+        slowest = MIN_SPEED[0], self.model.length_m * MIN_SPEED[1]
         if not len(first):
-            return MIN_SPEED
+            return slowest
         elapsed = np.diff(self.timestamp_s)[first, None]
         moved = rigid.log(rigid.inverse(self.world_from_agent[first]) @ self.world_from_agent[first + 1])
         speeds = (np.linalg.norm(part / elapsed, axis=1) for part in np.split(moved, 2, axis=1))
         turning, walking = (float(np.median(speed)) for speed in speeds)
-        return max(MIN_SPEED[0], turning), max(MIN_SPEED[1], walking)
+        return max(slowest[0], turning), max(slowest[1], walking)

@@ -32,8 +32,8 @@ MIN_SCORED = 20
 """Least number of scored frames, for short recordings."""
 DRAWS = 400
 """Monte Carlo samples of a pose's covariance."""
-COST_SCALE_M, ENOUGH_SHARE = 0.012, 0.15
-"""Roots: standard deviation of the excess cost (meters), and visible share of full confidence."""
+COST_SCALE, ENOUGH_SHARE = 0.02, 0.15
+"""Roots: standard deviation of the excess cost (body lengths), and visible share of full confidence."""
 
 
 @dataclass(frozen=True)
@@ -147,5 +147,5 @@ def kernel_mean(
 
 def agent_confidence(roots: Roots) -> Float[np.ndarray, "frame"]:
     """Score each root 0..1 by excess cost and visible share; 0 where not visible."""
-    worse = excess_cost(roots.cost_m) / COST_SCALE_M
+    worse = excess_cost(roots.cost) / COST_SCALE
     return np.where(roots.visible, np.exp(-0.5 * worse**2) * np.minimum(roots.share / ENOUGH_SHARE, 1.0), 0.0)

@@ -17,9 +17,9 @@ HEADINGS = 36
 """Number of grid headings: steps of 10 degrees."""
 HEADING_SIGMA_DEG, MAX_FRAME_COST = 20.0, 12.0
 """Heading difference between hypothesis and grid that costs one unit, and largest cost of one frame."""
-MOTION_WEIGHT, WALKING_M_S = 4.0, (0.25, 0.6)
-"""Cost of walking tail first, ramping up between these speeds, m/s: the center of visible points also moves
-when an animal turns on the spot."""
+MOTION_WEIGHT, WALKING = 4.0, (0.417, 1)
+"""Cost of walking tail first, ramping up between these speeds, body lengths per second: the center of visible
+points also moves when an animal turns on the spot."""
 REVERSED_SHARE = 0.6
 """The template's head and tail are swapped if that saves this share of the cost of always walking tail first,
 and more than `FLIP_COST`."""
@@ -61,22 +61,24 @@ class MotionCues:
     """0..1: how much new a frame shows; errors of repeated views are correlated."""
 
 
-def choose_hypotheses(timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypotheses]) -> list[int]:
+def choose_hypotheses(
+    timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypotheses], length_m: float
+) -> list[int]:
     """Choose the hypothesis of least cost per frame, including its difference from the decoded heading."""
-    decoded = decode_headings(timestamp_s, candidates)
+    decoded = decode_headings(timestamp_s, candidates, length_m)
     return [int(_heading_cost(each, angle).argmin()) for each, angle in zip(candidates, decoded, strict=True)]
 
 
 def decode_headings(
-    timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypotheses]
+    timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypotheses], length_m: float
 ) -> Float[np.ndarray, "observation"]:
     """Return the most likely heading of each observation, radians, by Viterbi decoding.
 
-    Decodes once for an animal that walks along its template's +z and once for -z.
+    Decodes once for an animal of ``length_m`` that walks along its template's +z and once for -z.
     """
     grid = 2 * np.pi * np.arange(HEADINGS) / HEADINGS - np.pi
     cues, weight = motion_cues(timestamp_s, candidates), weights(candidates)
-    slow, fast = WALKING_M_S
+    slow, fast = length_m * np.array(WALKING)
     walks = np.clip((np.hypot(*cues.velocity[:, [0, 2]].T) - slow) / (fast - slow), 0, 1)
     walking = MOTION_WEIGHT * weight * walks
     visual = [_visual_cost(each, grid, cues.novelty[index]) for index, each in enumerate(candidates)]

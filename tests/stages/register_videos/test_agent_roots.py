@@ -64,6 +64,41 @@ def test_root_is_found_from_all_initial_headings(yaw_deg):
     assert best[1, 1] > 1 - 1e-4, "upright"
 
 
+def moved(poses: np.ndarray, factor: float) -> np.ndarray:
+    """Scale the positions of poses."""
+    return rigid.make(poses[..., :3, :3], factor * poses[..., :3, 3])
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_fits_scale_with_the_animal(factor):
+    """Everything larger, seen from farther away: the same rotations and costs, larger distances."""
+    truth = rigid.make(rigid.rotation_from_vector(UP * 0.6), np.array([0.1, 0.22, -0.05]))
+    seen = replace(observation_of(animal(), truth), standing_m=0.25)
+
+    def fits(factor: float) -> tuple[np.ndarray, list]:
+        mesh = replace(animal(), vertices=factor * animal().vertices)
+        model = agent_fit.make_model(mesh, np.random.default_rng(0))
+        points, depth = factor * seen.points_world, factor * seen.depth
+        camera, standing_m = moved(seen.world_from_camera, factor), factor * seen.standing_m
+        observation = replace(
+            seen, points_world=points, depth=depth, world_from_camera=camera, standing_m=standing_m
+        )
+        start = agent_fit.initial_poses(observation, model, 12)
+        coarse = agent_fit.fit_coarse(observation, model, start)
+        fine = agent_fit.fit_fine(observation, model, coarse, rounds=4, tilt=True)
+        prior = agent_fit.PosePrior(coarse[0], (0.1, 0.05 * factor))
+        near = agent_fit.fit_near(observation, model, prior, rounds=4)
+        cost, share = agent_fit.cost(observation, model, fine), np.ones(12)
+        smooth = roots.smooth(0.1 * np.arange(12), fine, cost, share, 0.15, model.length_m)
+        poses = [start, coarse, fine, smooth, near.world_from_agent[None]]
+        costs = [*agent_fit.cost(observation, model, start), *cost, near.total]
+        return np.concatenate([moved(each, 1 / factor) for each in poses]), costs
+
+    (poses, costs), (others, other_costs) = fits(1.0), fits(factor)
+    np.testing.assert_allclose(others, poses, atol=1e-3)
+    np.testing.assert_allclose(other_costs, costs, atol=1e-4)
+
+
 def test_tilt_is_estimated_if_enabled():
     mesh = animal()
     model = agent_fit.make_model(mesh, np.random.default_rng(0))
@@ -85,7 +120,7 @@ def test_smoothing_keeps_gaps_and_reduces_noise():
     noisy = truth @ rigid.exp(rng.normal(0, 1, (50, 6)) * ([0.08] * 3 + [0.02] * 3))
     cost, share = np.full(50, 0.03), np.ones(50)
     noisy[20:25], cost[20:25] = np.nan, np.nan
-    smooth = roots.smooth(time, noisy, cost, share, 0.15)
+    smooth = roots.smooth(time, noisy, cost, share, 0.15, 0.6)
     assert np.isnan(smooth[20:25]).all()
     known = np.isfinite(cost)
     before, after = (
@@ -159,4 +194,4 @@ def test_localizer_poses_are_the_roots_as_they_are(tmp_path):
     assert found.visible.tolist() == [True, True, False, True] and not answers
     placed = found.world_from_agent[found.visible]
     np.testing.assert_allclose(placed, predicted[found.visible], atol=1e-9)
-    assert (found.share[found.visible] > 0).all() and np.isfinite(found.cost_m[found.visible]).all()
+    assert (found.share[found.visible] > 0).all() and np.isfinite(found.cost[found.visible]).all()

@@ -8,6 +8,7 @@ from stages.register_videos import headings
 from stages.register_videos.headings import RootHypotheses
 
 UP = np.array([0.0, 1.0, 0.0])
+LENGTH_M = 0.6
 
 
 def seen(
@@ -29,7 +30,7 @@ def seen(
 
 
 def chosen(sights: list[RootHypotheses]) -> list[int]:
-    return headings.choose_hypotheses(np.arange(len(sights)) * 0.1, sights)
+    return headings.choose_hypotheses(np.arange(len(sights)) * 0.1, sights, LENGTH_M)
 
 
 def test_walking_direction_determines_the_heading():
@@ -68,7 +69,7 @@ def test_noise_does_not_flip_the_heading():
         for frame in range(60)
     ]
     assert chosen(sights) == [0] * 60
-    faced = headings.decode_headings(np.arange(60) * 0.1, sights)
+    faced = headings.decode_headings(np.arange(60) * 0.1, sights, LENGTH_M)
     assert np.abs(np.rad2deg(rigid.wrap(faced - np.deg2rad(1.5 * np.arange(60))))).mean() < 15, (
         "degrees, of 20 in single frames"
     )
