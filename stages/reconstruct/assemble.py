@@ -18,6 +18,7 @@ from pipeline.fields.fused_depth import FusedGeometry
 from pipeline.fields.limbs import KinematicTree
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
+from pipeline.geometry.size import body_length_m
 from stages.reconstruct.config import FieldSizes
 from stages.reconstruct.problem import (
     Joints,
@@ -34,8 +35,8 @@ MIN_CONFIDENCE = 0.1
 """frames whose camera is less certain give no rays"""
 DOUBTFUL_ROOT = 0.4
 """roots with lower confidence may be replaced as outliers"""
-OUTLIER_ROOT_M = 0.3
-"""if they are farther than this from the interpolation between confident ones"""
+OUTLIER_ROOT = 0.5
+"""if they are farther than this, body lengths, from the interpolation between confident ones"""
 OUTLIER_GAP_S = 3.0
 """and those are at most this far away in time: over longer gaps interpolation is no better"""
 OUTLIER_MASK_WEIGHT = 0.05
@@ -52,8 +53,8 @@ KNOT_FRAMES = 10
 """frames between the knots of camera corrections: registration leaves slow drift, not jitter"""
 SCENE_TRUNCATION_M = 0.08
 """the signed distance of a scene learned at measured depth saturates here"""
-SCENE_MARGIN_M, AGENT_MARGIN_M = 0.2, 0.12
-"""space around all that was measured, and around the agent template"""
+SCENE_MARGIN_M, AGENT_MARGIN = 0.2, 0.2
+"""space around all that was measured, meters, and around the agent template, body lengths"""
 SOLID_START_M, FREE_START_M = -0.03, 0.1
 """initial signed distance: the scene starts solid and is carved, the agent starts as free space"""
 BOX_QUANTILE = 0.002
@@ -127,13 +128,14 @@ def build(
     store = join((usable_rays(video) for video in videos), scratch, (height, width))
     lengths = [len(video.timestamp_s) for video in videos]
     camera = [interpolated(video.timestamp_s, video.world_from_camera) for video in videos]
-    roots, inliers = zip(*(replace_outliers(video) for video in videos), strict=True)
+    length_m = body_length_m(template.mesh)
+    roots, inliers = zip(*(replace_outliers(video, length_m) for video in videos), strict=True)
     root = [interpolated(video.timestamp_s, root) for video, root in zip(videos, roots, strict=True)]
     camera, root = (torch.from_numpy(np.concatenate(poses)) for poses in (camera, root))
     has_root = torch.from_numpy(np.isfinite(np.concatenate(roots)).all((1, 2)))
     trust = torch.from_numpy(np.where(np.concatenate(inliers), 1.0, OUTLIER_MASK_WEIGHT)).float()
-    vertices = template.mesh.vertices
-    low, high = corner(vertices.min(0) - AGENT_MARGIN_M), corner(vertices.max(0) + AGENT_MARGIN_M)
+    vertices, margin_m = template.mesh.vertices, AGENT_MARGIN * length_m
+    low, high = corner(vertices.min(0) - margin_m), corner(vertices.max(0) + margin_m)
     fine = sizes.agent_voxel_m
     agent_shape = FieldShape(low, high, fine, GRID_CHANNELS, sizes.width, encoding=sizes.encoding)
     rest = torch.from_numpy(template.agent_from_bone_rest).float()
@@ -216,9 +218,9 @@ def usable_rays(video: RegisteredVideo) -> RayStore:
 
 
 def replace_outliers(
-    video: RegisteredVideo,
+    video: RegisteredVideo, length_m: float
 ) -> tuple[Float[np.ndarray, "frame 4 4"], Bool[np.ndarray, "frame"]]:
-    """Replace low-confidence roots that are far from the interpolation between confident ones.
+    """Replace low-confidence roots of an animal of ``length_m`` far from the interpolation of confident ones.
 
     Returns:
         The roots, world from agent (NaN where unknown), and which frames are inliers.
@@ -233,7 +235,7 @@ def replace_outliers(
         return root, inlier
     doubtful = np.flatnonzero(known & ~certain & (gaps_s(time, certain) <= OUTLIER_GAP_S))
     between = rigid.interpolate(time[certain], root[certain], time[doubtful])
-    far = np.linalg.norm(root[doubtful, :3, 3] - between[:, :3, 3], axis=1) > OUTLIER_ROOT_M
+    far = np.linalg.norm(root[doubtful, :3, 3] - between[:, :3, 3], axis=1) > OUTLIER_ROOT * length_m
     root[doubtful[far]], inlier[doubtful[far]] = between[far], False
     return root, inlier
 

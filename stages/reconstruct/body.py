@@ -19,38 +19,40 @@ from stages.reconstruct.problem import Problem, pick
 from stages.reconstruct.rays import AGENT, THUMBNAIL, Rays
 from stages.reconstruct.scene import Terms
 
-DECIMETER = 0.1
-"""unit of most losses of the posed surface, meters"""
-REACH_M = 0.05
-"""signed distances on the agent are truncated here"""
-OUTLIER_M = 0.1
-"""measured points this far from the agent have half the weight; none is dropped, or it hides in the scene"""
-ROOT_M, ROOT_RAD = 0.05, 0.05
-"""standard deviation of registered roots"""
+UNIT = 0.167
+"""unit of most losses of the posed surface, body lengths (`TemplateSurface.length_m`)"""
+REACH = 0.0833
+"""signed distances on the agent are truncated here, body lengths"""
+OUTLIER = 0.167
+"""measured points this far from the agent, body lengths, have half the weight; none is dropped, or it hides
+in the scene"""
+ROOT, ROOT_RAD = 0.0833, 0.05
+"""standard deviation of registered roots, body lengths and radians"""
 EDGE_M = 0.01
 """tolerance at the masks' edges"""
 STILL = 0.01
-"""smoothing of the L1 norm of bone and root steps, radians and decimeters"""
-TOUCH_M, STRIDE_M = 0.02, 0.06
-"""distance at which soles are in contact; motion between frames beyond which they are not held"""
-COVER_M = 0.015
-"""a masked pixel is covered when a sample of the posed surface is seen this near to it"""
+"""smoothing of the L1 norm of bone and root steps, radians and `UNIT`"""
+TOUCH_M, STRIDE = 0.02, 0.1
+"""distance at which soles are in contact (the map's noise); motion between frames, body lengths, beyond which
+they are not held"""
+COVER = 0.025
+"""a masked pixel is covered when a sample of the posed surface is seen this near to it, body lengths"""
 MARGIN_M = 0.03
 """tolerance by which the posed surface may be in front of the measured depth"""
 NEAREST_M = 0.1
 """points nearer to the camera than this are not in view"""
 OUTSIDE_WEIGHT, UNCOVERED_WEIGHT, FREE_WEIGHT, PENETRATION_WEIGHT = 2.0, 2.0, 0.5, 2.0
-"""weights per decimeter: posed surface outside the mask, uncovered masked pixels, surface in free space,
+"""weights per `UNIT`: posed surface outside the mask, uncovered masked pixels, surface in free space,
 penetration of the scene. Tuned on the built-in cat; all are multiplied by `LossWeights.posed_surface`"""
 RIGIDITY_WEIGHT, REST_WEIGHT, SMOOTH_WEIGHT, STILL_WEIGHT = 5.0, 0.05, 0.3, 0.1
-"""weights of gaps at joints (per decimeter), twists from rest, accelerations, and the L1 norm of steps: an
+"""weights of gaps at joints (per `UNIT`), twists from rest, accelerations, and the L1 norm of steps: an
 animal mostly rests. All are multiplied by `LossWeights.motion_prior`"""
 COMMON_REST = 20.0
 """additional weight of the mean twist of all bones: the root has to explain it"""
 ROOT_SMOOTH, ROOT_STILL = 4.0, 0.5
 """the same weights for the root, relative to those of bones"""
 ROOT_WEIGHT = 0.005
-"""the agent's root stays near the registered one, per `ROOT_M` and `ROOT_RAD`, squared"""
+"""the agent's root stays near the registered one, per `ROOT` and `ROOT_RAD`, squared"""
 FLOOR_EVERY = 4
 """one in so many surface points is tested for penetration, which costs most"""
 
@@ -87,8 +89,8 @@ def measured_terms(
     problem: Problem, pose: Pose, rays: Rays, weights: LossWeights, generator: Generator, near: int = 2
 ) -> Terms:
     """Return the losses at measured depth of rays ``[frame * ray]``, warped back to the rest shape."""
-    frames, number = len(pose.frame), len(rays) // len(pose.frame)
-    offset = (torch.rand(len(rays), near, generator=generator).to(problem.device) * 2 - 1) * REACH_M
+    frames, number, length_m = len(pose.frame), len(rays) // len(pose.frame), problem.surface.length_m
+    offset = (torch.rand(len(rays), near, generator=generator).to(problem.device) * 2 - 1) * REACH * length_m
     depth = torch.cat([rays.depth[:, None], rays.depth[:, None] + offset], dim=1)
     points_camera = (rays.direction[:, None] * depth[..., None]).view(frames, -1, 3)
     points = rigid_torch.apply(pose.agent_from_camera, points_camera)
@@ -98,8 +100,8 @@ def measured_terms(
     target = (rays.depth[:, None] - depth) * rays.slope[:, None]
     color, feature = problem.agent.color_and_feature(encoded.view(len(rays), 1 + near, -1)[:, 0])
     good = (rays.label == AGENT) & (rays.depth > 0)
-    trust = problem.trust[rays.frame] / (1 + distance[:, 0].detach().abs() / OUTLIER_M)
-    distance_loss = trust[:, None] * losses.truncated_distance(distance, target, REACH_M)
+    trust = problem.trust[rays.frame] / (1 + distance[:, 0].detach().abs() / (OUTLIER * length_m))
+    distance_loss = trust[:, None] * losses.truncated_distance(distance, target, REACH * length_m)
     terms = {
         "agent distance": (weights.agent_distance, distance_loss[good]),
         "agent color": (weights.color, (trust * losses.color(color, rays.color / 255))[good]),
@@ -110,7 +112,10 @@ def measured_terms(
     if weights.cycle:
         at_depth, at_rest = (each.view(frames, number, 1 + near, 3)[:, :, 0] for each in (points, rest))
         back = problem.body.pose(at_rest, pose.agent_from_bone)
-        terms["cycle"] = (weights.cycle, ((back - at_depth).square().sum(-1).view(-1) / DECIMETER**2)[good])
+        terms["cycle"] = (
+            weights.cycle,
+            ((back - at_depth).square().sum(-1).view(-1) / (UNIT * length_m) ** 2)[good],
+        )
     return terms
 
 
@@ -126,8 +131,9 @@ def surface_terms(
 
     Rays ``masked`` ``[frame * ray]`` on the mask, with or without depth, must be covered by the surface.
     """
-    views, chosen = problem.store.views, pick(len(problem.surface.points), number, generator, problem.device)
-    posed = problem.body.pose(problem.surface.points[chosen], pose.agent_from_bone)
+    views, surface = problem.store.views, problem.surface
+    chosen, unit_m = pick(len(surface.points), number, generator, problem.device), UNIT * surface.length_m
+    posed = problem.body.pose(surface.points[chosen], pose.agent_from_bone)
     points = rigid_torch.apply(rigid_torch.inverse(pose.agent_from_camera), posed)
     pixel, depth = cameras.project(points, views.intrinsics[pose.frame][:, None])
     size_px = views.size_px[pose.frame]
@@ -144,20 +150,22 @@ def surface_terms(
         occluded = (nearest > 0) & (nearest < depth - MARGIN_M)
     focal_px = views.intrinsics[pose.frame, 0, 0][:, None]
     outside_m = functional.relu(outside_px * depth.detach() / focal_px - EDGE_M)
-    in_front_m = functional.relu(measured - MARGIN_M - depth).clamp_max(2 * DECIMETER)
+    in_front_m = functional.relu(measured - MARGIN_M - depth).clamp_max(2 * unit_m)
     trust = problem.trust[pose.frame, None]
     on_mask = outside_px.detach() < THUMBNAIL
-    in_front = (trust * in_front_m / DECIMETER)[in_view & on_mask & (measured > 0)]
+    in_front = (trust * in_front_m / unit_m)[in_view & on_mask & (measured > 0)]
     terms = {
-        "outside": (OUTSIDE_WEIGHT, (trust * outside_m / DECIMETER)[in_view & ~occluded]),
+        "outside": (OUTSIDE_WEIGHT, (trust * outside_m / unit_m)[in_view & ~occluded]),
         "in front": (FREE_WEIGHT, in_front),
     }
     if problem.scene.fused:
         depth_m = penetration_depth_m(problem, pose, posed[:, ::FLOOR_EVERY])
         with_scene = problem.has_scene[pose.frame]
-        terms["penetration"] = PENETRATION_WEIGHT, (trust * depth_m / DECIMETER)[with_scene]
+        terms["penetration"] = PENETRATION_WEIGHT, (trust * depth_m / unit_m)[with_scene]
     if masked is not None:
-        terms["uncovered"] = UNCOVERED_WEIGHT, trust * silhouette_residual_m(points, masked) / DECIMETER
+        gap_m = silhouette_gap_m(points, masked) - COVER * surface.length_m
+        residual_m = functional.relu(gap_m).clamp_max(2 * unit_m)
+        terms["uncovered"] = UNCOVERED_WEIGHT, trust * residual_m / unit_m
     return {name: (weights.posed_surface * weight, values) for name, (weight, values) in terms.items()}
 
 
@@ -181,10 +189,10 @@ def height_m(
     return torch.minimum(outside, world[..., 1] - problem.floor_m)
 
 
-def silhouette_residual_m(
+def silhouette_gap_m(
     points_camera: Float[Tensor, "frame point 3"], masked: Rays
 ) -> Float[Tensor, "frame ray"]:
-    """Return the distance of each masked ray to the nearest projected point, meters beyond `COVER_M`."""
+    """Return the distance of each masked ray to the nearest projected point, meters."""
     target = masked.direction[:, :2].view(len(points_camera), -1, 2)
     depth = points_camera[..., 2:].clamp_min(NEAREST_M)
     image_point = points_camera[..., :2] / depth
@@ -192,23 +200,23 @@ def silhouette_residual_m(
         squared = image_point.square().sum(-1)[:, None]  # without |target|^2, which is the same for all
         near = torch.baddbmm(squared, target, image_point.mT, alpha=-2).argmin(-1, keepdim=True)
     gap = image_point.gather(1, near.expand(-1, -1, 2)) - target
-    gap_m = gap.norm(dim=-1) * depth.gather(1, near)[..., 0].detach()
-    return functional.relu(gap_m - COVER_M).clamp_max(2 * DECIMETER)
+    return gap.norm(dim=-1) * depth.gather(1, near)[..., 0].detach()
 
 
 def prior_terms(
     problem: Problem, pose: Pose, twist: Float[Tensor, "frame bone 6"], run: int, weights: LossWeights
 ) -> Terms:
     """Return the priors: joints closed, bones near rest, motion smooth and sparse in time, soles planted."""
-    rest, joints = problem.body.agent_from_bone_rest, problem.joints
+    rest, joints, unit_m = problem.body.agent_from_bone_rest, problem.joints, UNIT * problem.surface.length_m
     motion = pose.agent_from_bone @ rigid_torch.inverse(rest)
 
     def moved(bone: Int[Tensor, "joint"]) -> Float[Tensor, "frame joint 3"]:
         return (motion[:, bone, :3, :3] @ joints.place[..., None])[..., 0] + motion[:, bone, :3, 3]
 
-    joint_gap = (moved(joints.first) - moved(joints.second)) / DECIMETER
+    joint_gap = (moved(joints.first) - moved(joints.second)) / unit_m
     root = rigid_torch.inverse(pose.world_from_initial) @ pose.world_from_agent
-    root_error = (root[:, :3, 3] / ROOT_M).square().sum(-1) + _squared_angle(root) / ROOT_RAD**2
+    root_m = ROOT * problem.surface.length_m
+    root_error = (root[:, :3, 3] / root_m).square().sum(-1) + _squared_angle(root) / ROOT_RAD**2
     common = twist.mean(1, keepdim=True).square().sum(-1)
     terms = {
         "rigidity": (RIGIDITY_WEIGHT, joint_gap.square().sum(-1)),
@@ -218,7 +226,7 @@ def prior_terms(
         change, roots = twist.view(-1, run, *twist.shape[1:]), pose.world_from_agent.reshape(-1, run, 4, 4)
         acceleration = torch.diff(roots[:, :, :3].flatten(2), n=2, dim=1)
         step = rigid_torch.inverse(roots[:, :-1]) @ roots[:, 1:]
-        root_step = (step[..., :3, 3] / DECIMETER).square().sum(-1) + _squared_angle(step)
+        root_step = (step[..., :3, 3] / unit_m).square().sum(-1) + _squared_angle(step)
         bone_step = torch.diff(change, dim=1).square().sum(-1)
         terms["smoothness"] = SMOOTH_WEIGHT, torch.diff(change, n=2, dim=1).square().sum(-1)
         terms["root smoothness"] = ROOT_SMOOTH * SMOOTH_WEIGHT, acceleration.square().sum(-1)
@@ -232,7 +240,7 @@ def prior_terms(
 
 
 def foot_skate(problem: Problem, pose: Pose, run: int) -> Float[Tensor, "run step sole"]:
-    """Return the skate of soles in contact between frames: 0 at rest, saturating at 1 beyond `STRIDE_M`.
+    """Return the skate of soles in contact between frames: 0 at rest, saturating at 1 beyond `STRIDE`.
 
     Without it, occluded legs would follow the body. Soles in the air give 0.
     """
@@ -243,7 +251,11 @@ def foot_skate(problem: Problem, pose: Pose, run: int) -> Float[Tensor, "run ste
         near = near * problem.has_scene[pose.frame, None]
     contact = near.view(-1, run, near.shape[1])
     squared = torch.diff(world.view(-1, run, *world.shape[1:]), dim=1).square().sum(-1)
-    return torch.minimum(contact[:, 1:], contact[:, :-1]) * squared / (squared + STRIDE_M**2)
+    return (
+        torch.minimum(contact[:, 1:], contact[:, :-1])
+        * squared
+        / (squared + (STRIDE * problem.surface.length_m) ** 2)
+    )
 
 
 def _squared_angle(motion: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch"]:

@@ -201,11 +201,12 @@ def field_terms(problem: Problem, weights: LossWeights, generator: Generator) ->
     neighbors = points + EIKONAL_STEP_M * torch.eye(3, device=problem.device)[:, None]
     encoded = field.encode(torch.cat([points[None], neighbors]).view(-1, 3))
     distance, *shifted = field.distance(encoded).view(4, -1)
-    close = surface.distance[index].abs() < body.REACH_M
+    reach_m = body.REACH * surface.length_m
+    close = surface.distance[index].abs() < reach_m
     color = field.color_and_feature(encoded[: len(index)][close])[0]
     return {
         "agent eikonal": (weights.eikonal, losses.eikonal(distance, torch.stack(shifted), EIKONAL_STEP_M)),
-        "template": (weights.template, losses.distance(distance, surface.distance[index], body.REACH_M)),
+        "template": (weights.template, losses.distance(distance, surface.distance[index], reach_m)),
         "template color": (
             weights.template * weights.color,
             losses.color(color, surface.color[index][close]),
@@ -222,11 +223,11 @@ class TemplateLoss:
     def __call__(self, step: int, generator: Generator) -> dict[str, Tensor]:
         surface, field = self.problem.surface, self.problem.agent
         index = pick(len(surface.around), TEMPLATE_POINTS, generator, self.problem.device)
-        values = field(surface.around[index])
-        close = surface.distance[index].abs() < body.REACH_M
+        values, reach_m = field(surface.around[index]), body.REACH * surface.length_m
+        close = surface.distance[index].abs() < reach_m
         return losses.weighted(
             {
-                "distance": (1.0, ((values.signed_distance - surface.distance[index]) / body.REACH_M).abs()),
+                "distance": (1.0, ((values.signed_distance - surface.distance[index]) / reach_m).abs()),
                 "color": (TEMPLATE_COLOR, losses.color(values.color, surface.color[index])[close]),
                 "feature": (TEMPLATE_FEATURE, losses.feature(values.feature, surface.feature[index])[close]),
             },

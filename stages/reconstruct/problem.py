@@ -14,6 +14,7 @@ from pipeline.data.motion import MotionTable
 from pipeline.fields.fields import ArticulatedBody, Field
 from pipeline.fields.limbs import KinematicTree, joined, shared_skin
 from pipeline.geometry.meshes import Mesh
+from pipeline.geometry.size import body_length_m
 from stages.reconstruct.rays import RayStore
 
 TRUSTED = 0.1
@@ -29,8 +30,8 @@ SOLE, SOLES = 0.07, 32
 """soles lie below this share of the animal's height; number of sole points"""
 ON_SURFACE, AROUND = 4000, 40000
 """samples of the template's surface and of the space around it"""
-AROUND_MARGIN_M = 0.25
-"""margin around the template within which space is sampled"""
+AROUND_MARGIN = 0.417
+"""margin around the template within which space is sampled, body lengths"""
 NOISE_M = (0.01, 0.04)
 """half of the samples around the template lie this far from its surface, standard deviations"""
 
@@ -161,6 +162,8 @@ class TemplateSurface:
     feature: Float[Tensor, "sample 16"]
     sole: Float[Tensor, "sole 3"]
     """some of the lowest of ``points``"""
+    length_m: float
+    """the unit of distances that depend on the body"""
 
     @classmethod
     def of(
@@ -173,7 +176,9 @@ class TemplateSurface:
         barycentric = rng.dirichlet(np.ones(3), len(face))
         points = np.einsum("pk,pkd->pd", barycentric, corner[face])
         normal = mesh.face_normals()[face]
-        low, high = mesh.vertices.min(0) - AROUND_MARGIN_M, mesh.vertices.max(0) + AROUND_MARGIN_M
+        length_m = body_length_m(mesh)
+        margin_m = AROUND_MARGIN * length_m
+        low, high = mesh.vertices.min(0) - margin_m, mesh.vertices.max(0) + margin_m
         half = AROUND // 2
         noise = rng.choice(NOISE_M, half)[:, None]
         near = points[rng.integers(len(points), size=half)] + rng.normal(size=(half, 3)) * noise
@@ -190,7 +195,7 @@ class TemplateSurface:
         height = points[:, 1] - points[:, 1].min()
         sole = points[height < SOLE * height.max()][:SOLES]
         parts = (points, normal, around, distance, color, features, sole)
-        return cls(*(torch.from_numpy(array).float() for array in parts))
+        return cls(*(torch.from_numpy(array).float() for array in parts), length_m)
 
 
 def prior_precision(motion: MotionTable, confidence: Float[np.ndarray, "frame"]) -> Float[Tensor, "knot"]:

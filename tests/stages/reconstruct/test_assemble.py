@@ -31,21 +31,22 @@ def doubted(confidence: np.ndarray, leap_m: float = 2.0) -> assemble.RegisteredV
 def test_jumps_near_certain_roots_are_dropped():
     confidence = np.ones(12)
     confidence[[3, 4, 11]] = 0.1
-    root, kept = assemble.replace_outliers(doubted(confidence))
+    root, kept = assemble.replace_outliers(doubted(confidence), 0.6)
     np.testing.assert_allclose(
         root[:11], rigid.make(np.eye(3), np.arange(11)[:, None] * np.array([0.03, 0, 0])), atol=1e-9
     )
     assert np.flatnonzero(~kept).tolist() == [3, 4] and root[11, 1, 3] == 2.0, (
         "nothing certain comes after frame 11"
     )
-    assert assemble.replace_outliers(doubted(confidence, 0.2))[1].all(), (
+    assert assemble.replace_outliers(doubted(confidence, 0.2), 0.6)[1].all(), (
         "doubtful, but where the agent may be"
     )
+    assert not assemble.replace_outliers(doubted(confidence, 0.2), 0.3)[1][3], "too far for a smaller animal"
     confidence[2:9] = 0.1
-    assert assemble.replace_outliers(doubted(confidence))[1].all(), "the certain ones are 4 s apart"
+    assert assemble.replace_outliers(doubted(confidence), 0.6)[1].all(), "the certain ones are 4 s apart"
     unknown = doubted(np.zeros(4))
     unknown.world_from_agent[:] = np.nan
-    assert np.isnan(assemble.replace_outliers(unknown)[0]).all()
+    assert np.isnan(assemble.replace_outliers(unknown, 0.6)[0]).all()
 
 
 def test_joined_videos_survive_saving(tmp_path):

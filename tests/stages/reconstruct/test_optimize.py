@@ -183,7 +183,7 @@ def test_true_distance_field_has_no_loss():
             return torch.zeros(len(points), 3), torch.zeros(len(points), 16)
 
     terms = joint.field_terms(replace(found, agent=Ball()), LossWeights(), torch.Generator().manual_seed(0))
-    assert found.surface.distance.max() > 4 * body.REACH_M
+    assert found.surface.distance.max() > 4 * body.REACH * found.surface.length_m
     assert terms["template"][1].mean() < 0.01 and terms["agent eikonal"][1].max() < 0.01
 
 
@@ -347,7 +347,7 @@ def test_foot_skate_is_penalized_only_in_slow_contact():
         )
 
     step_m = torch.tensor([0.01, 1.0])
-    expected = step_m.square() / (step_m.square() + body.STRIDE_M**2)
+    expected = step_m.square() / (step_m.square() + (body.STRIDE * found.surface.length_m) ** 2)
     found_there = foot_skate(rolling)
     torch.testing.assert_close(found_there, expected.view(1, 2, 1).expand_as(found_there), atol=1e-3, rtol=0)
     found_there.mean().backward()
