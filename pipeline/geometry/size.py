@@ -11,10 +11,9 @@ TAIL = 0.025
 def body_length_m(template: Mesh) -> float:
     """Return the longer horizontal extent of the central 95 % of a template's surface, agent frame."""
     area = np.bincount(template.faces.ravel(), np.repeat(template.face_areas(), 3), len(template.vertices))
-
-    def extent(place: np.ndarray) -> float:
+    extents = []
+    for place in template.vertices[:, [0, 2]].T:
         order = np.argsort(place)
-        share = np.cumsum(area[order]) / area.sum()
-        return float(np.ptp(np.interp([TAIL, 1 - TAIL], share, place[order])))
-
-    return max(extent(template.vertices[:, axis]) for axis in (0, 2))
+        ends = np.interp([TAIL, 1 - TAIL], np.cumsum(area[order]) / area.sum(), place[order])
+        extents.append(float(np.ptp(ends)))
+    return max(extents)

@@ -24,8 +24,7 @@ UNIT = 0.167
 REACH = 0.0833
 """signed distances on the agent are truncated here, body lengths"""
 OUTLIER = 0.167
-"""measured points this far from the agent, body lengths, have half the weight; none is dropped, or it hides
-in the scene"""
+"""measured points this far off have half the weight, body lengths; none is dropped, or the scene hides it"""
 ROOT, ROOT_RAD = 0.0833, 0.05
 """standard deviation of registered roots, body lengths and radians"""
 EDGE_M = 0.01
@@ -33,8 +32,7 @@ EDGE_M = 0.01
 STILL = 0.01
 """smoothing of the L1 norm of bone and root steps, radians and `UNIT`"""
 TOUCH_M, STRIDE = 0.02, 0.1
-"""distance at which soles are in contact (the map's noise); motion between frames, body lengths, beyond which
-they are not held"""
+"""distance at which soles touch; motion between frames beyond which they are not held, body lengths"""
 COVER = 0.025
 """a masked pixel is covered when a sample of the posed surface is seen this near to it, body lengths"""
 MARGIN_M = 0.03
@@ -112,10 +110,8 @@ def measured_terms(
     if weights.cycle:
         at_depth, at_rest = (each.view(frames, number, 1 + near, 3)[:, :, 0] for each in (points, rest))
         back = problem.body.pose(at_rest, pose.agent_from_bone)
-        terms["cycle"] = (
-            weights.cycle,
-            ((back - at_depth).square().sum(-1).view(-1) / (UNIT * length_m) ** 2)[good],
-        )
+        squared = ((back - at_depth) / (UNIT * length_m)).square().sum(-1).view(-1)
+        terms["cycle"] = weights.cycle, squared[good]
     return terms
 
 
@@ -163,8 +159,7 @@ def surface_terms(
         with_scene = problem.has_scene[pose.frame]
         terms["penetration"] = PENETRATION_WEIGHT, (trust * depth_m / unit_m)[with_scene]
     if masked is not None:
-        gap_m = silhouette_gap_m(points, masked) - COVER * surface.length_m
-        residual_m = functional.relu(gap_m).clamp_max(2 * unit_m)
+        residual_m = silhouette_residual_m(points, masked, COVER * surface.length_m).clamp_max(2 * unit_m)
         terms["uncovered"] = UNCOVERED_WEIGHT, trust * residual_m / unit_m
     return {name: (weights.posed_surface * weight, values) for name, (weight, values) in terms.items()}
 
@@ -189,10 +184,10 @@ def height_m(
     return torch.minimum(outside, world[..., 1] - problem.floor_m)
 
 
-def silhouette_gap_m(
-    points_camera: Float[Tensor, "frame point 3"], masked: Rays
+def silhouette_residual_m(
+    points_camera: Float[Tensor, "frame point 3"], masked: Rays, cover_m: float
 ) -> Float[Tensor, "frame ray"]:
-    """Return the distance of each masked ray to the nearest projected point, meters."""
+    """Return the distance of each masked ray to the nearest projected point, meters beyond ``cover_m``."""
     target = masked.direction[:, :2].view(len(points_camera), -1, 2)
     depth = points_camera[..., 2:].clamp_min(NEAREST_M)
     image_point = points_camera[..., :2] / depth
@@ -200,7 +195,7 @@ def silhouette_gap_m(
         squared = image_point.square().sum(-1)[:, None]  # without |target|^2, which is the same for all
         near = torch.baddbmm(squared, target, image_point.mT, alpha=-2).argmin(-1, keepdim=True)
     gap = image_point.gather(1, near.expand(-1, -1, 2)) - target
-    return gap.norm(dim=-1) * depth.gather(1, near)[..., 0].detach()
+    return functional.relu(gap.norm(dim=-1) * depth.gather(1, near)[..., 0].detach() - cover_m)
 
 
 def prior_terms(
@@ -215,8 +210,8 @@ def prior_terms(
 
     joint_gap = (moved(joints.first) - moved(joints.second)) / unit_m
     root = rigid_torch.inverse(pose.world_from_initial) @ pose.world_from_agent
-    root_m = ROOT * problem.surface.length_m
-    root_error = (root[:, :3, 3] / root_m).square().sum(-1) + _squared_angle(root) / ROOT_RAD**2
+    offset = root[:, :3, 3] / (ROOT * problem.surface.length_m)
+    root_error = offset.square().sum(-1) + _squared_angle(root) / ROOT_RAD**2
     common = twist.mean(1, keepdim=True).square().sum(-1)
     terms = {
         "rigidity": (RIGIDITY_WEIGHT, joint_gap.square().sum(-1)),
@@ -250,12 +245,9 @@ def foot_skate(problem: Problem, pose: Pose, run: int) -> Float[Tensor, "run ste
         near = torch.exp(-(height_m(problem, pose, world).clamp_min(0) / TOUCH_M).square())
         near = near * problem.has_scene[pose.frame, None]
     contact = near.view(-1, run, near.shape[1])
-    squared = torch.diff(world.view(-1, run, *world.shape[1:]), dim=1).square().sum(-1)
-    return (
-        torch.minimum(contact[:, 1:], contact[:, :-1])
-        * squared
-        / (squared + (STRIDE * problem.surface.length_m) ** 2)
-    )
+    strides = world.view(-1, run, *world.shape[1:]) / (STRIDE * problem.surface.length_m)
+    squared = torch.diff(strides, dim=1).square().sum(-1)
+    return torch.minimum(contact[:, 1:], contact[:, :-1]) * squared / (squared + 1)
 
 
 def _squared_angle(motion: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch"]:

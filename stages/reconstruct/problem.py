@@ -176,8 +176,7 @@ class TemplateSurface:
         barycentric = rng.dirichlet(np.ones(3), len(face))
         points = np.einsum("pk,pkd->pd", barycentric, corner[face])
         normal = mesh.face_normals()[face]
-        length_m = body_length_m(mesh)
-        margin_m = AROUND_MARGIN * length_m
+        margin_m = AROUND_MARGIN * body_length_m(mesh)
         low, high = mesh.vertices.min(0) - margin_m, mesh.vertices.max(0) + margin_m
         half = AROUND // 2
         noise = rng.choice(NOISE_M, half)[:, None]
@@ -195,7 +194,7 @@ class TemplateSurface:
         height = points[:, 1] - points[:, 1].min()
         sole = points[height < SOLE * height.max()][:SOLES]
         parts = (points, normal, around, distance, color, features, sole)
-        return cls(*(torch.from_numpy(array).float() for array in parts), length_m)
+        return cls(*(torch.from_numpy(array).float() for array in parts), body_length_m(mesh))
 
 
 def prior_precision(motion: MotionTable, confidence: Float[np.ndarray, "frame"]) -> Float[Tensor, "knot"]:

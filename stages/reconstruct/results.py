@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -15,7 +15,7 @@ from pipeline.data.motion import FEATURE_VOLUME, INTERPOLATED, TRACKS, Motion, g
 from pipeline.data.templates import SkinTable
 from pipeline.fields import fields, marching_cubes
 from pipeline.fields.fields import Reconstruction
-from pipeline.geometry import cameras, rigid
+from pipeline.geometry import cameras, rigid, subsampling
 from pipeline.geometry.meshes import Mesh
 from stages.reconstruct.assemble import RegisteredVideo, scene_first
 from stages.reconstruct.body import NEAREST_M
@@ -32,6 +32,8 @@ SEEN_WITHIN_M = 0.045
 """the scene's surface is removed where no measured point is this near: backs of thin shells, rims"""
 SMOOTHING_S = 0.7
 """window of the filter of motion, longer than a stride"""
+TRACK_POINTS = 200
+"""vertices of the agent that are followed, by farthest-point sampling"""
 MAX_POINTS, MAX_FRAMES = 3_000_000, 300
 """approximate limits of measured points, and of frames tested for free space, after subsampling"""
 
@@ -159,18 +161,6 @@ def skin_weights(problem: Problem, mesh: Mesh) -> Float[np.ndarray, "vertex bone
     return problem.body.weights(torch.from_numpy(mesh.vertices).to(problem.device)).cpu().numpy()
 
 
-def track_points(
-    mesh: Mesh, number: int = 200
-) -> tuple[Int[np.ndarray, "point"], Float[np.ndarray, "point 3"]]:
-    """Choose vertices of the agent by farthest-point sampling: their indices and rest positions, meters."""
-    chosen = [int(np.argmax(mesh.vertices[:, 2]))]
-    distance = np.linalg.norm(mesh.vertices - mesh.vertices[chosen[0]], axis=-1)
-    for _ in range(min(number, len(mesh.vertices)) - 1):
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(mesh.vertices - mesh.vertices[chosen[-1]], axis=-1))
-    return np.array(chosen), mesh.vertices[chosen]
-
-
 def write(
     folder: Path,
     problem: Problem,
@@ -195,5 +185,5 @@ def write(
     FEATURE_VOLUME.save(
         folder / "feature_volume.npz", compress=True, voxel_m=np.asarray(VOXEL_M, np.float64), **vars(volume)
     )
-    index, rest = track_points(agent)
-    TRACKS.save(folder / "tracks.npz", vertex_index=index, rest_agent=rest)
+    index = subsampling.farthest_points(agent.vertices, TRACK_POINTS, int(agent.vertices[:, 2].argmax()))
+    TRACKS.save(folder / "tracks.npz", vertex_index=index, rest_agent=agent.vertices[index])

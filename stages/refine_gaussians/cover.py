@@ -239,7 +239,10 @@ def subsample(
     visits = seen.weight / max(seen.weight.mean(), 1e-9)
     density = np.where(absent, 0, gradient * np.sqrt(visits))
     uniform = UNIFORM_SHARE * ~absent / (~absent).sum()
-    share = _capped(number * (uniform + (1 - UNIFORM_SHARE) * density / max(density.sum(), 1e-9)), 1.0)
+    share = number * (uniform + (1 - UNIFORM_SHARE) * density / max(density.sum(), 1e-9))
+    total = share.sum()
+    for _ in range(8):  # redistribute what exceeds one
+        share = np.minimum(share * total / share.sum(), 1.0)
     order = np.argsort(_morton_codes(points))
     steps = np.cumsum(share[order]) + rng.random()
     chosen = order[np.flatnonzero(np.diff(np.floor(steps), prepend=np.floor(steps[0] - share[order[0]])) > 0)]
@@ -260,11 +263,3 @@ def _morton_codes(points: Float[np.ndarray, "point 3"]) -> np.ndarray:
         for axis in range(3):
             code |= ((cell[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
     return code
-
-
-def _capped(share: np.ndarray, most: float) -> np.ndarray:
-    """Clip shares to ``most`` and redistribute the excess."""
-    total = share.sum()
-    for _ in range(8):
-        share = np.minimum(share * total / share.sum(), most)
-    return share

@@ -233,18 +233,6 @@ class PosePrior:
         offset = rigid.log(rigid.inverse(self.world_from_agent) @ world_from_agent)
         return offset / np.repeat(self.sigma, 3)
 
-    def add(
-        self,
-        hessian: Float[np.ndarray, "pose 6 6"],
-        gradient: Float[np.ndarray, "pose 6"],
-        world_from_agent: Float[np.ndarray, "pose 4 4"],
-        length_m: float,
-    ) -> tuple[Float[np.ndarray, "pose 6 6"], Float[np.ndarray, "pose 6"]]:
-        """Add the prior to normal equations of an animal of this length, to first order in the twist."""
-        precision = PREDICTED_POINTS * (POINT_SIGMA * length_m) ** 2 / np.repeat(self.sigma, 3)
-        hessian[:, range(6), range(6)] += precision / np.repeat(self.sigma, 3)
-        return hessian, gradient + precision * self.twist(world_from_agent)
-
 
 @dataclass(frozen=True)
 class PriorFit:
@@ -282,12 +270,10 @@ def _fit(observation, model, world_from_agent, reaches, prior, *, stands=True, n
         gradient, hessian = _normal_equations(local, target, normal, weight)
         hessian, gradient = _add_upright_prior(poses, hessian, gradient, prior, length_m)
         if near is not None:
-            hessian, gradient = near.add(hessian, gradient, poses, length_m)
+            hessian, gradient = _add_pose_prior(poses, hessian, gradient, near, length_m)
         if stands and np.isfinite(observation.standing_m):
-            height_m = poses[:, 1, 3] - observation.standing_m
-            hessian, gradient = _add_standing_prior(
-                poses, hessian, gradient, height_m, STAND_REACH * length_m
-            )
+            standing = observation.standing_m, length_m
+            hessian, gradient = _add_standing_prior(poses, hessian, gradient, *standing)
         poses = poses @ rigid.exp(np.linalg.solve(hessian, -gradient[..., None])[..., 0])
     return poses
 
@@ -320,12 +306,20 @@ def _add_upright_prior(poses, hessian, gradient, prior_rad, length_m):
     return hessian, gradient
 
 
-def _add_standing_prior(poses, hessian, gradient, height_m, reach_m):
-    """Add the robust prior that the animal stands on the surface below, which it is above by a height."""
-    weight = STAND_POINTS * (reach_m**2 / (reach_m**2 + height_m**2)) ** 2
+def _add_pose_prior(poses, hessian, gradient, near, length_m):
+    """Add the prior around a predicted pose, to first order in the twist."""
+    precision = PREDICTED_POINTS * (POINT_SIGMA * length_m) ** 2 / np.repeat(near.sigma, 3)
+    hessian[:, range(6), range(6)] += precision / np.repeat(near.sigma, 3)
+    return hessian, gradient + precision * near.twist(poses)
+
+
+def _add_standing_prior(poses, hessian, gradient, standing_m, length_m):
+    """Add the robust prior that the animal stands on the surface below."""
+    height, reach_m = poses[:, 1, 3] - standing_m, STAND_REACH * length_m
+    weight = STAND_POINTS * (reach_m**2 / (reach_m**2 + height**2)) ** 2
     direction = poses[:, 1, :3]
     hessian[:, 3:, 3:] += weight[:, None, None] * direction[:, :, None] * direction[:, None, :]
-    gradient[:, 3:] += (weight * height_m)[:, None] * direction
+    gradient[:, 3:] += (weight * height)[:, None] * direction
     return hessian, gradient
 
 

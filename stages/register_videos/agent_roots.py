@@ -115,7 +115,9 @@ def _hypotheses(
     start, localized = agent_fit.initial_poses(observation, model, config.headings), []
     if index % LOCALIZER_EVERY_FRAMES == 0:
         localized = _localized(clip, observation, localizer)
-    start = np.concatenate([start, *(upright(pose)[None] for pose, _ in localized[:MAX_LOCALIZED])])
+    for pose, _ in localized[:MAX_LOCALIZED]:
+        upright = rigid.make(rigid.rotation_from_yaw(rigid.yaw(pose)), pose[:3, 3])
+        start = np.concatenate([start, upright[None]])
     poses = agent_fit.fit_coarse(observation, model, start)
     distinct: list[int] = []
     for candidate in np.argsort(agent_fit.cost(observation, model, poses), kind="stable"):
@@ -151,11 +153,6 @@ def _localized(
     return [(camera @ rigid.inverse(each.map_from_camera), each.probability) for each in estimates]
 
 
-def upright(world_from_agent: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Remove the tilt, keeping heading and position."""
-    return rigid.make(rigid.rotation_from_yaw(rigid.yaw(world_from_agent)), world_from_agent[:3, 3])
-
-
 def smooth(
     timestamp_s: Float[np.ndarray, "frame"],
     world_from_agent: Float[np.ndarray, "frame 4 4"],
@@ -166,8 +163,7 @@ def smooth(
 ) -> Float[np.ndarray, "frame 4 4"]:
     """Smooth visible roots by robust local linear regression on SE(3).
 
-    Weights depend on time difference (``smooth_s``, seconds), cost, visibility and residual, for an animal of
-    ``length_m``.
+    Weights depend on time difference (``smooth_s``, seconds), cost, visibility, and residual in ``length_m``.
     """
     known, scale = np.flatnonzero(np.isfinite(cost)), np.repeat(OUTLIER_SCALE, 3) * ([1] * 3 + [length_m] * 3)
     result, time, best = world_from_agent.copy(), timestamp_s[known], np.nanmin(cost, initial=np.inf)

@@ -15,8 +15,7 @@ from stages.register_videos.agent_fit import AgentModel, AgentObservation, PoseP
 
 RELIABLE_SHARE, TYPICAL_QUANTILE, MAX_EXCESS = 0.25, 0.3, 0.02
 """A frame is reliable if its visible share is at least the lower of this and the median, and its cost exceeds
-the typical one (a quantile over the recording) by at most this, body
-lengths."""
+the typical one (a quantile over the recording) by at most this, body lengths."""
 MIN_SHARE, LOST_EXCESS = 0.03, 0.06
 """A track ends at a smaller visible share or a larger excess over the typical cost, body lengths."""
 MAX_GAP_S = 1.0

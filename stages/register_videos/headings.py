@@ -51,16 +51,6 @@ class RootHypotheses:
     eye_world: Float[np.ndarray, "3"]
 
 
-@dataclass(frozen=True)
-class MotionCues:
-    """Motion around each observation."""
-
-    velocity: Float[np.ndarray, "observation 3"]
-    """Horizontal velocity of the visible points' median, m/s; zero across gaps."""
-    novelty: Float[np.ndarray, "observation"]
-    """0..1: how much new a frame shows; errors of repeated views are correlated."""
-
-
 def choose_hypotheses(
     timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypotheses], length_m: float
 ) -> list[int]:
@@ -77,11 +67,12 @@ def decode_headings(
     Decodes once for an animal of ``length_m`` that walks along its template's +z and once for -z.
     """
     grid = 2 * np.pi * np.arange(HEADINGS) / HEADINGS - np.pi
-    cues, weight = motion_cues(timestamp_s, candidates), weights(candidates)
+    (velocity, novelty), weight = motion_cues(timestamp_s, candidates), weights(candidates)
     slow, fast = length_m * np.array(WALKING)
-    walks = np.clip((np.hypot(*cues.velocity[:, [0, 2]].T) - slow) / (fast - slow), 0, 1)
+    walks = np.clip((np.hypot(*velocity[:, [0, 2]].T) - slow) / (fast - slow), 0, 1)
     walking = MOTION_WEIGHT * weight * walks
-    visual = [_visual_cost(each, grid, cues.novelty[index]) for index, each in enumerate(candidates)]
+    visual = np.stack([_heading_cost(each, grid[:, None]).min(1) for each in candidates])
+    visual = novelty[:, None] * np.minimum(visual - visual.min(1, keepdims=True), MAX_FRAME_COST)
     turn = (rigid.wrap(grid[:, None] - grid[None]) / np.deg2rad(TURN_DEG)) ** 2
 
     def turn_cost(index: int) -> Float[np.ndarray, "before after"]:
@@ -90,7 +81,7 @@ def decode_headings(
         return np.minimum(turn / tenths, FLIP_COST / np.sqrt(tenths))
 
     def decoded(direction: float) -> tuple[Float[np.ndarray, "observation"], float]:
-        opposition = 1 - direction * np.cos(grid - np.arctan2(*cues.velocity[:, [0, 2]].T)[:, None])
+        opposition = 1 - direction * np.cos(grid - np.arctan2(*velocity[:, [0, 2]].T)[:, None])
         unary = weight[:, None] * visual + walking[:, None] * opposition / 2
         state = viterbi.viterbi_decode(unary, turn_cost)
         turns = sum(turn_cost(index)[state[index - 1], state[index]] for index in range(1, len(state)))
@@ -110,8 +101,14 @@ def weights(candidates: list[RootHypotheses]) -> Float[np.ndarray, "observation"
     return np.minimum(share / ENOUGH_SHARE, 1.0) / (1 + excess**2)
 
 
-def motion_cues(timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypotheses]) -> MotionCues:
-    """Measure motion between the third observations before and after each one."""
+def motion_cues(
+    timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypotheses]
+) -> tuple[Float[np.ndarray, "observation 3"], Float[np.ndarray, "observation"]]:
+    """Measure motion between the third observations before and after each one.
+
+    Returns the horizontal velocity of the visible points' median, m/s, zero across gaps, and how much new a
+    frame shows, 0..1: errors of repeated views are correlated.
+    """
     center = np.stack([each.center_world for each in candidates]) * (1, 0, 1)
     camera = np.stack([each.eye_world for each in candidates])
     time = timestamp_s[[each.frame for each in candidates]]
@@ -123,16 +120,10 @@ def motion_cues(timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHy
         (camera[after] - camera[before]) / elapsed_s, axis=1
     )
     velocity[(elapsed_s[:, 0] > MAX_SPAN_S) | (elapsed_s[:, 0] < MIN_SPAN_S)] = 0
-    return MotionCues(velocity, STILL_WEIGHT + (1 - STILL_WEIGHT) * np.minimum(moved / NEW_VIEW_M_S, 1.0))
+    return velocity, STILL_WEIGHT + (1 - STILL_WEIGHT) * np.minimum(moved / NEW_VIEW_M_S, 1.0)
 
 
 def _heading_cost(candidates, angle):
     """Return the cost of each hypothesis given the heading ``angle``, radians."""
     turned = rigid.wrap(angle - rigid.yaw(candidates.world_from_agent)) / np.deg2rad(HEADING_SIGMA_DEG)
     return candidates.cost + np.minimum(turned**2, FLIP_COST)
-
-
-def _visual_cost(candidates, grid, novelty):
-    """Return one frame's cost of each grid heading, by appearance and shape alone."""
-    cost = _heading_cost(candidates, grid[:, None]).min(1)
-    return novelty * np.minimum(cost - cost.min(), MAX_FRAME_COST)
