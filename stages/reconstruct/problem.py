@@ -194,7 +194,7 @@ class TemplateSurface:
         height = points[:, 1] - points[:, 1].min()
         sole = points[height < SOLE * height.max()][:SOLES]
         parts = (points, normal, around, distance, color, features, sole)
-        return cls(*(torch.from_numpy(array).float() for array in parts), body_length_m(mesh))
+        return cls(*(torch.from_numpy(array).float() for array in parts), length_m=body_length_m(mesh))
 
 
 def prior_precision(motion: MotionTable, confidence: Float[np.ndarray, "frame"]) -> Float[Tensor, "knot"]:
