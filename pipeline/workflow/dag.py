@@ -155,10 +155,11 @@ FLOW: tuple[Node, ...] = (
          seconds_per_frame=0.3),
     Node("masks", "segment_agent", ("frames", "flow", "home_masks"),
          roles=AGENT, sidecars=("prompt",), begins_animal=True, seconds_per_frame=0.11),
+    Node("recognizer", "train_recognizer", (WALK, *merging("frames", "masks", roles=("turnaround",))),
+         resumable=True, on_demand=True),
     Node("estimated_frames", "estimate_depth",
          ("pictures", Need("frames", roles=("walkthrough",)), "scene_template",
-          *(Need(name, roles=("turnaround",), option=option, readers=("session",), alone=True)
-            for name, option in (("frames", "turnaround"), ("masks", "portraits")))),
+          Need("recognizer", readers=("session",), alone=True)),
          roles=AGENT, mapped=True, stands_in_for="frames", seconds_per_frame=0.5),
     Node("agent_template", "build_agent_template",
          merging("frames", "masks", "features", roles=("turnaround",))),

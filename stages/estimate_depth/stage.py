@@ -14,11 +14,12 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import log, track
 from pipeline.core.videos import Video, role_of_animal
 from pipeline.data import ply
-from pipeline.data.clips import Clip, Masks, Pictures
+from pipeline.data.clips import Clip, Pictures
 from pipeline.data.templates import SceneCameras
 from pipeline.geometry import cameras
 from pipeline.geometry.meshes import RayCaster
 from pipeline.mapping.sift import Keypoints
+from pipeline.segmentation.recognizer import load
 from stages.estimate_depth import depth, foreground, landmarks, lens, recognition, tracking, views, writing
 from stages.estimate_depth.config import Config
 from stages.estimate_depth.foreground import ColorView
@@ -39,10 +40,8 @@ class Inputs:
     """The walk-through of the map, by recording id."""
     scene_template: Path
     """The map."""
-    turnaround: Mapping[str, Path] | None = None
-    """For a session, the frames of the animal's turnaround."""
-    portraits: Mapping[str, Path] | None = None
-    """Their masks; with both, the animal is recognized instead of any foreground."""
+    recognizer: Path | None = None
+    """The artifact `recognizer`; with it, a session's animal is recognized instead of any foreground."""
 
 
 def run(
@@ -76,7 +75,7 @@ def run(
         case "session":
             time_s = pictures.timestamp_s[placed]
             depth_net = None if network is None else _depth_net(network, pictures, placed, found)
-            nets = depth_net, _animal_of(inputs, walk, config.seed)
+            nets = depth_net, _animal_of(inputs.recognizer, config.seed)
             depths = depth.of_session(shown, time_s, room, walk_views, config.length_m, *nets)
         case role:
             assert_never(role)
@@ -118,16 +117,10 @@ def _placed(
     return Lens(tracked.lens.focal_px / scale, found.radial, pictures.color_size), tracked
 
 
-def _animal_of(inputs: Inputs, walk: Clip, seed: int) -> depth.AnimalOf | None:
-    """Learn the turnaround's animal against the room of the walk-through; None without a turnaround."""
-    portraits = []
-    for id, folder in (inputs.turnaround or {}).items():
-        masks = Masks.open((inputs.portraits or {})[id])
-        portraits += recognition.portraits_of(Clip.open(folder), masks)
-    if not portraits:
+def _animal_of(recognizer: Path | None, seed: int) -> depth.AnimalOf | None:
+    if recognizer is None:
         return None
-    rng = np.random.default_rng(seed)
-    network = recognition.learn(portraits, recognition.rooms_of(walk), rng)
+    network, rng = load(recognizer), np.random.default_rng(seed)
     return lambda target, in_front: recognition.recognize(network, target, in_front, rng)
 
 

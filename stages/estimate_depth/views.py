@@ -12,10 +12,9 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.geometry import cameras, rigid
 from pipeline.geometry.meshes import RayCaster, render_view
+from pipeline.segmentation.recognizer import small
 from stages.estimate_depth.landmarks import Matches
 
-SHORTER_PX = 240
-"""Shorter side of small pictures, pixels: optical flow is fast and still sub-pixel."""
 STRIDE_PX, MARGIN_PX = 8, 5
 """Stride of matched pixels, and margin of the picture without matches."""
 MAX_FLOW_PX = 20.0
@@ -38,13 +37,6 @@ class View:
     world_from_camera: Float[np.ndarray, "4 4"]
     depth: Float[np.ndarray, "height width"]
     """Of the surface, meters; 0 where there is none."""
-
-
-def small(picture: UInt8[np.ndarray, "height width *channel"]) -> UInt8[np.ndarray, "row column *channel"]:
-    """Reduce a picture to `SHORTER_PX` on the shorter side; smaller ones stay as they are."""
-    scale = min(1.0, SHORTER_PX / min(picture.shape[:2]))
-    size = round(picture.shape[1] * scale), round(picture.shape[0] * scale)
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
 
 def small_gray(color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "small_height small_width"]:

@@ -1,0 +1,1 @@
+"""Train the network that recognizes the turnaround's animal in sessions without depth."""

@@ -1,0 +1,147 @@
+"""The turnaround's animal is recognized in a session: not its shadow, and also where nothing differs."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from pipeline.core.errors import InputError
+from pipeline.data import images, npz
+from pipeline.segmentation import recognizer
+from pipeline.segmentation.appearance import Example, fold_batch_norms
+from stages.estimate_depth import recognition
+from stages.estimate_depth.foreground import color_view
+from stages.estimate_depth.views import View
+from stages.train_recognizer import stage, training
+from stages.train_recognizer.config import Config
+
+SIZE = (240, 180)
+
+
+def texture(rng, base):
+    noise = cv2.resize(rng.normal(0, 25, (30, 24)).astype(np.float32), SIZE[::-1])
+    return np.clip(np.array(base) + noise[..., None], 0, 255)
+
+
+def with_animal(room, center, radius, shadow=0.0):
+    """Return a picture of a striped animal with a shadow at its lower right, and both masks."""
+    rows, columns = np.mgrid[: SIZE[0], : SIZE[1]]
+    inside = np.hypot(rows - center[0], (columns - center[1]) / 1.5) < radius
+    stripes = np.where(columns // 4 % 2, 200, 110)[..., None] * np.array([1, 0.7, 0.4])
+    dark = np.hypot(rows - center[0] - radius, (columns - center[1] - radius) / 1.5) < 0.8 * radius
+    shaded = room * (1 - shadow * dark)[..., None]
+    return np.where(inside[..., None], stripes, shaded).astype(np.uint8), inside, dark & ~inside
+
+
+def portraits_and_rooms():
+    rng = np.random.default_rng(0)
+    portraits, rooms = [], [texture(rng, (110, 110, 120)).astype(np.uint8) for _ in range(8)]
+    for _ in range(8):
+        color, inside, _ = with_animal(texture(rng, (60, 120, 60)), rng.uniform(80, 140, 2), 40)
+        portraits.append(Example(color, np.where(inside, 255, 0).astype(np.uint8)))
+    return portraits, rooms
+
+
+@pytest.fixture(scope="module")
+def network():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "BATCH", 4)
+        return fold_batch_norms(training.train(*portraits_and_rooms(), Config(steps=60))[0])
+
+
+def seen(color):
+    gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
+    return color_view(color, View(gray, np.eye(3), np.eye(4), np.ones(gray.shape)))
+
+
+def test_animal_is_recognized_without_its_shadow(network):
+    rng = np.random.default_rng(1)
+    color, inside, dark = with_animal(texture(rng, (110, 110, 120)), (150, 70), 18, shadow=0.5)
+    found = recognition.recognize(network, seen(color), inside | dark, rng)
+    assert (found & inside).sum() / (found | inside).sum() > 0.7
+    assert (found & dark).sum() < 0.2 * dark.sum()
+
+
+def test_animal_is_completed_where_the_foreground_misses_it(network):
+    rng = np.random.default_rng(2)
+    color, inside, _ = with_animal(texture(rng, (110, 110, 120)), (150, 70), 18)
+    lower = inside & (np.arange(SIZE[0])[:, None] > 150)
+    found = recognition.recognize(network, seen(color), lower, rng)
+    assert (found & inside).sum() / (found | inside).sum() > 0.7
+
+
+def test_nothing_is_recognized_away_from_foreground_or_in_a_shadow(network):
+    rng = np.random.default_rng(3)
+    color, inside, dark = with_animal(texture(rng, (110, 110, 120)), (150, 70), 18, shadow=0.5)
+    nowhere = np.zeros(SIZE, bool)
+    assert not recognition.recognize(network, seen(color), nowhere, rng).any()
+    room = texture(rng, (110, 110, 120))
+    shaded = np.where((inside | dark)[..., None], 0.5 * room, room).astype(np.uint8)
+    assert recognition.recognize(network, seen(shaded), inside | dark, rng).sum() < 0.2 * inside.sum()
+
+
+def write_recording(folder, pictures, masks=()):
+    """Write `frames` of pictures, and `masks`."""
+    for name in ("color", "depth", "masks"):
+        (folder / name).mkdir(parents=True)
+    for frame, picture in enumerate(pictures):
+        images.write_color(folder / f"color/{frame:06d}.jpg", picture, 95)
+    images.write_depth(folder / "depth/000000.exr", np.zeros((24, 18)))
+    for frame, labels in enumerate(masks):
+        images.write_gray(folder / f"masks/{frame:06d}.png", labels)
+    each, eye = np.ones(len(pictures), np.float32), np.tile(np.eye(3), (len(pictures), 1, 1))
+    npz.save(
+        folder / "frames.npz",
+        timestamp_s=np.arange(len(pictures)) / 10,
+        intrinsics=eye,
+        depth_intrinsics=eye,
+        gravity_known=np.array(True),
+        quality=each,
+    )
+    visible = np.array([(labels == 255).any() for labels in masks], bool)
+    npz.save(folder / "masks/masks.npz", visible=visible, confidence=each[: len(masks)])
+    return {"v000": folder}
+
+
+def stage_inputs(folder, portraits):
+    walk = write_recording(folder / "walk", portraits_and_rooms()[1])
+    labels = [each.labels for each in portraits]
+    turnaround = write_recording(folder / "turnaround", [each.color for each in portraits], labels)
+    (folder / "out").mkdir()
+    return stage.Inputs(walk, turnaround, {"v000": turnaround["v000"] / "masks"})
+
+
+def test_stage_writes_a_network_and_how_good_it_is(tmp_path):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "BATCH", 4)
+        patch.setattr(stage, "PORTRAITS", 6)
+        patch.setattr(stage, "ROOMS", 6)
+        portraits = portraits_and_rooms()[0]
+        trained = stage.run(stage_inputs(tmp_path, portraits), Config(steps=60), tmp_path / "out")
+    read = recognizer.load(tmp_path / "out")
+    color = portraits[0].color
+    np.testing.assert_allclose(read.log_odds(color), trained.log_odds(color), atol=1e-3)
+    assert len(npz.load(tmp_path / "out/losses.npz")["loss"]) == 60
+    overlap, mistaken = json.loads((tmp_path / "out/qa.json").read_text())["checks"]
+    assert overlap["value"] > 0.6 and mistaken["value"] < 2
+
+
+def test_turnaround_without_masks_is_refused(tmp_path):
+    empty = [Example(each.color, np.zeros(SIZE, np.uint8)) for each in portraits_and_rooms()[0]]
+    with pytest.raises(InputError, match="MSK-008"):
+        stage.run(stage_inputs(tmp_path, empty), Config(steps=2), tmp_path / "out")
+
+
+def test_interrupted_training_continues_to_the_same_weights(tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "BATCH", 1)
+    monkeypatch.setattr(training, "SAVE_EVERY", 2)
+    whole, _ = training.train(*portraits_and_rooms(), Config(steps=6), tmp_path / "whole")
+    (tmp_path / "again").mkdir()
+    shutil.copy(tmp_path / "whole/step000000004.pt", tmp_path / "again")
+    again, record = training.train(*portraits_and_rooms(), Config(steps=6), tmp_path / "again")
+    assert len(record.total()) == 6
+    for name, value in whole.state_dict().items():
+        assert torch.equal(value, again.state_dict()[name]), name
