@@ -58,6 +58,8 @@ class Need:
     """Roles of the recordings whose jobs read it; None: all."""
     alone: bool = False
     """Read only in homes of one animal."""
+    mapped: bool = False
+    """Read only by jobs of recordings whose depth comes from the map."""
     homes: Literal["any", "own", "other"] = "any"
     """If the table names `homes`, other builds of the animal: its own artifact, or theirs in `build/`."""
 
@@ -153,13 +155,14 @@ FLOW: tuple[Node, ...] = (
     Node("home_masks", "segment_agent", ("frames", "flow", "identities"),
          roles=("session",), sidecars=("prompt",), table="segment_agent", of_several=True,
          seconds_per_frame=0.3),
-    Node("masks", "segment_agent", ("frames", "flow", "home_masks"),
+    Node("masks", "segment_agent",
+         ("frames", "flow", "home_masks", Need("recognizer", readers=("session",), alone=True, mapped=True)),
          roles=AGENT, sidecars=("prompt",), begins_animal=True, seconds_per_frame=0.11),
     Node("recognizer", "train_recognizer", (WALK, *merging("frames", "masks", roles=("turnaround",))),
          resumable=True, on_demand=True),
     Node("estimated_frames", "estimate_depth",
          ("pictures", Need("frames", roles=("walkthrough",)), "scene_template",
-          Need("recognizer", readers=("session",), alone=True)),
+          Need("recognizer", readers=("session",), alone=True, mapped=True)),
          roles=AGENT, mapped=True, stands_in_for="frames", seconds_per_frame=0.5),
     Node("agent_template", "build_agent_template",
          merging("frames", "masks", "features", roles=("turnaround",))),

@@ -305,6 +305,8 @@ def _read_by(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[I
             continue
         if (need.alone and plan.others) or (video and need.readers and video.role not in need.readers):
             continue
+        if need.mapped and not (video and video.mapped):
+            continue
         if need.homes != "any" and not plan.tables[node.artifact].get(HOMES):
             continue
         if need.artifact in dag.BUILTIN.values() and not plan.builtin:

@@ -81,6 +81,14 @@ def motion_evidence(references: References) -> EvidenceOf:
     return evidence_of
 
 
+def room_evidence(frame: int, window: Window, sphere: Sphere) -> Evidence:
+    """Evidence of geometry that is not the animal's own: only against what is outside its sphere."""
+    away_m = np.linalg.norm(window.points_world - sphere.center_world, axis=-1)
+    outside, none = away_m >= sphere.radius_m, np.zeros(away_m.shape, bool)
+    log_odds, certainty = np.where(outside, -ROOM, 0.0), np.where(outside, 1.0, UNKNOWN)
+    return Evidence(log_odds, certainty, none, none, outside)
+
+
 def prefer_first(first: EvidenceOf, second: EvidenceOf) -> EvidenceOf:
     """Combine evidence: the first where it favors the animal, elsewhere the second."""
 

@@ -15,7 +15,7 @@ from pipeline.geometry import subsampling
 from pipeline.segmentation.appearance import Appearance, Example, learn
 from stages.segment_agent import free_space, movers, people, prompts
 from stages.segment_agent.config import Config
-from stages.segment_agent.evidence import motion_evidence, prefer_first
+from stages.segment_agent.evidence import motion_evidence, prefer_first, room_evidence
 from stages.segment_agent.follow import follow
 from stages.segment_agent.footage import Footage
 from stages.segment_agent.free_space import References
@@ -24,6 +24,7 @@ from stages.segment_agent.movers import PlacedPrompt
 from stages.segment_agent.overlap import Subject
 from stages.segment_agent.people import People
 from stages.segment_agent.prompts import Prompt
+from stages.segment_agent.refine import Edges
 from stages.segment_agent.resting import find_resting, is_resting
 from stages.segment_agent.segmenter import Mask, Segmenter, with_color_histogram
 from stages.segment_agent.trajectory import CameraPath, estimate_trajectory
@@ -42,6 +43,8 @@ PROBES = 12
 """number of frames for checks for which a few suffice"""
 ROOM_QUANTILE = 0.95
 """quantile of the room's log-odds that an animal near its track has to exceed to be recognized"""
+OUTLINE = Edges(unsure=0.0)
+"""outlines of what a recognizer finds: unknown where GrabCut disagrees"""
 DILATION = np.ones((5, 5), np.uint8)
 """dilation of what looks like the animal or moves, pixels or samples"""
 
@@ -71,10 +74,12 @@ def segment(
     prompt: Prompt | None,
     config: Config,
     rng: np.random.Generator,
+    recognizer: Appearance | None = None,
 ) -> Segmentation:
     """Return one mask per frame, generated lazily, with the camera poses used, and people.
 
     ``flow`` is the recording's flow folder. Without any depth, the prompt is propagated; there are no poses.
+    With a ``recognizer``, the animal of a session without prompt is what it recognizes.
 
     Raises:
         InputError: MSK-004 without depth and prompt; MSK-002, MSK-003 if prompt or cameras point at nothing.
@@ -96,7 +101,10 @@ def segment(
             return Segmentation(masks, path, references=references, shown="resting")
         case "session":
             references, persons = people.gather_without_people(clip, poses, config.references)
-            segmenter = _session_segmenter(clip, poses, references, placed, config, rng)
+            if recognizer is not None and placed is None:
+                segmenter = _recognized_segmenter(clip, poses, references, config, recognizer, rng)
+            else:
+                segmenter = _session_segmenter(clip, poses, references, placed, config, rng)
             masks = people.hide(segmenter.masks(range(len(clip))), persons, clip, poses)
             shown = "moving" if placed is None else "resting"
             return Segmentation(masks, path, persons, references=references, shown=shown)
@@ -142,6 +150,25 @@ def _session_segmenter(
     spheres = with_motion_radius(found, spheres)
     evidence_of = motion_evidence(room) if resting is None else prefer_first(resting, motion_evidence(room))
     return Segmenter(clip, poses, spheres, evidence_of, config.height_px, network)
+
+
+def _recognized_segmenter(
+    clip: Clip,
+    poses: Float[np.ndarray, "frame 4 4"],
+    references: References,
+    config: Config,
+    recognizer: Appearance,
+    rng: np.random.Generator,
+) -> Segmenter:
+    """Prepare the masks of a session whose depth comes from the map: tracked by motion, then recognized.
+
+    Its depth was inferred from the same recognition, so it is no evidence of its own.
+    """
+    spheres = find_mover(clip, poses, references, config.animal, None)
+    segmenter = Segmenter(clip, poses, spheres, room_evidence, config.height_px, recognizer, OUTLINE, rng)
+    room = free_space.masked(references, lambda frame: occlusion_mask(segmenter, frame, recognizer))
+    found = find_mover(clip, poses, room, config.animal, None, appearance_of(segmenter, recognizer))
+    return replace(segmenter, spheres=with_motion_radius(found, spheres) if tracked(spheres).any() else found)
 
 
 def with_motion_radius(spheres: list[Sphere | None], first: list[Sphere | None]) -> list[Sphere | None]:

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.data.clips import Clip
 from pipeline.segmentation.appearance import Appearance
+from pipeline.segmentation.grabcut import sharpened
 from stages.segment_agent import refine
 from stages.segment_agent.evidence import Evidence, EvidenceOf
 from stages.segment_agent.refine import ColorHistogram, Edges
@@ -70,6 +71,9 @@ class Segmenter:
     height_px: int
     appearance: ColorHistogram | Appearance = field(default_factory=ColorHistogram)
     edges: Edges = field(default_factory=Edges)
+    outline_rng: np.random.Generator | None = None
+    """if given, only the component with the most evidence is the animal, and GrabCut decides again near its
+    outline; what both disagree about is unknown"""
 
     def masks(self, frames: Iterable[int]) -> Iterator[Mask]:
         """Make one mask per frame, in order, at color resolution."""
@@ -105,6 +109,10 @@ class Segmenter:
             case Appearance() as network:
                 log_ratio = network.log_odds_within(color, window.rows, window.columns)
                 labels, sure = self._by_appearance(window, evidence, log_ratio)
+        if self.outline_rng is not None:
+            labels = refine.doubt_all_but_strongest(labels, log_ratio)
+            disagreed = sharpened(window.color, labels == 255, self.outline_rng) != (labels == 255)
+            labels = np.where(disagreed, np.uint8(128), labels)
         inside = labels == 255
         if sure[inside].sum() < (MIN_PRESUMED_PX if sphere.presumed else 1):
             return Mask(empty, False, ABSENT_PRESUMED if sphere.presumed else ABSENT_TRACKED)

@@ -14,6 +14,7 @@ from pipeline.core.progress import log
 from pipeline.core.videos import Video, role_of_animal
 from pipeline.data import qa
 from pipeline.data.clips import Clip
+from pipeline.segmentation.recognizer import load
 from stages.segment_agent import prompts, several, writing
 from stages.segment_agent.config import Config
 from stages.segment_agent.identity import Identities, load_portraits
@@ -36,6 +37,8 @@ class Inputs:
     """The artifact `identities`; then all animals of the home are segmented."""
     home_masks: Path | None = None
     """`home_masks/<id>`, the masks of all animals of the home."""
+    recognizer: Path | None = None
+    """The artifact `recognizer`, for a session whose depth comes from the map."""
 
 
 def run(
@@ -67,7 +70,8 @@ def run(
             if clip.odometry_from_camera is None:
                 log("no usable odometry: camera motion comes from depth and flow, which drifts more")
             rng = np.random.default_rng(config.seed)
-            found = segment(clip, inputs.flow, role, prompt, config, rng)
+            known = None if inputs.recognizer is None else load(inputs.recognizer)
+            found = segment(clip, inputs.flow, role, prompt, config, rng, known)
             if found.path is not None:
                 millimeters = MM * found.path.residual_m
                 log(f"poses: {found.path.alignments} depth alignments agree within {millimeters:.0f} mm")
