@@ -68,7 +68,9 @@ def composite(portrait: Example, rooms: Sequence[Picture], rng: np.random.Genera
     return pasted.astype(np.uint8), np.where(animal, 255, 0).astype(np.uint8)
 
 
-def augmented(crop: Crop, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+def augmented(
+    crop: Crop, rng: np.random.Generator
+) -> tuple[Float[Tensor, "3 side side"], UInt8[Tensor, "side side"]]:
     """Return a crop as colors -1..1, channels first, in other light, and its labels."""
     color, labels = crop
     if rng.random() < 0.5:

@@ -86,9 +86,7 @@ def _report_quality(out: Path, network: Appearance, crops: list[Crop], rooms: li
         good="the outline hugs the animal, small and large, and leaves its shadow out",
         bad="outlines around furniture or shadows, or only around parts of the animal",
         checks=(
-            qa.Check(
-                "IoU on unseen composites", float(overlaps.mean()), warn=0.75, fail=0.5, better="higher"
-            ),
+            qa.Check("IoU on unseen composites", float(overlaps.mean()), "", RIGHT_IOU, WRONG_IOU, "higher"),
             qa.Check("empty room taken for the animal", 100 * mistaken, "%", warn=1.0, fail=10.0),
         ),
         pictures=qa.captioned(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.core.training import FitRecord, fit
@@ -72,5 +72,4 @@ def overlaps(network: Appearance, crops: Sequence[Crop]) -> Float[np.ndarray, "c
 
 def mistaken_share(network: Appearance, rooms: Sequence[Picture]) -> float:
     """Return the share of pixels of the empty room in which the animal is recognized."""
-    inside: list[Bool[np.ndarray, "height width"]] = [network.log_odds(room) > 0 for room in rooms]
-    return float(np.mean([each.mean() for each in inside]))
+    return float(np.mean([(network.log_odds(room) > 0).mean() for room in rooms]))

@@ -486,9 +486,14 @@ def test_session_without_depth_is_read_with_estimated_depth(small_checkout):
     read = {name: {each["name"] for each in job["inputs"]} for name, job in jobs.items()}
     of_all = {"frames/v000", "scene_template"}
     assert of_all | {"pictures/v001"} == read["estimated_frames.v001"]
-    assert {"frames/v000", "estimated_frames/v001", "masks/v001"} == read["recognizer"], "once for all sessions"
+    assert {"frames/v000", "estimated_frames/v001", "masks/v001"} == read["recognizer"], (
+        "once for all sessions"
+    )
     assert of_all | {"recognizer", "pictures/v002"} == read["estimated_frames.v002"]
     assert "estimated_frames/v002" in read["masks.v002"] and "frames/v003" in read["masks.v003"]
+    assert {job for job, names in read.items() if "recognizer" in names} == {
+        "estimated_frames.v002", "masks.v002",
+    }  # fmt: skip
     assert not any(name.startswith("estimated") for name in read["feature_basis"]), "the map needs features"
     assert {"frames/v000", "estimated_frames/v001", "estimated_frames/v002"} <= read["reconstruction"]
 

@@ -1,0 +1,73 @@
+"""Masks of a session whose depth comes from the map: by the recognizer, since its depth proves nothing."""
+
+import numpy as np
+import pytest
+
+from pipeline.data import images
+from pipeline.data.clips import Clip
+from pipeline.segmentation.appearance import Appearance
+from stages.segment_agent import masks, refine
+from stages.segment_agent.config import Config, LearningConfig
+from tests.stages import room_with_animal as scenery
+
+SHORT = Config(learning=LearningConfig(examples=30, steps=60, batch=4, crop_px=96))
+POSTER = np.s_[2:14, 70:88]
+"""Part of the wall with the animal's color."""
+
+
+class KnownColor(Appearance):
+    """Recognizes the animal by its color."""
+
+    def log_odds(self, color):
+        """Return 4 where the color is the animal's, -4 elsewhere."""
+        away = np.linalg.norm(color.astype(np.float32) - scenery.ANIMAL_COLOR, axis=-1)
+        return np.where(away < 40, 4, -4).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """A session in which depth shows only the animal's upper half, and a block of floor beside it too."""
+    folder = tmp_path_factory.mktemp("recognized") / "frames"
+    poses, agent = scenery.session()
+    truth = scenery.record(folder, poses, agent, poses)
+    empty = scenery.record(folder.parent / "empty", poses, np.full_like(agent, np.nan), poses)
+    assert not empty.masks.any()
+    for frame, mask in enumerate(truth.masks):
+        depth = images.read_depth(folder / f"depth/{frame:06d}.exr")
+        room = images.read_depth(folder.parent / f"empty/depth/{frame:06d}.exr")
+        rows, columns = np.nonzero(mask)
+        if len(rows):
+            lower = mask & (np.arange(len(mask))[:, None] > rows.mean())
+            beside = np.s_[int(rows.mean()) : rows.max() + 1, columns.max() + 1 : columns.max() + 9]
+            wrong = np.where(lower, room, depth)
+            wrong[beside] = np.median(depth[mask])
+            images.write_depth(folder / f"depth/{frame:06d}.exr", wrong)
+        color = images.read_color(folder / f"color/{frame:06d}.jpg")
+        color[POSTER] = scenery.ANIMAL_COLOR
+        images.write_color(folder / f"color/{frame:06d}.jpg", color, 95)
+    return Clip.open(folder), truth.masks
+
+
+def overlaps(session, recognizer):
+    clip, truth = session
+    found = masks.segment(clip, clip.folder, "session", None, SHORT, np.random.default_rng(0), recognizer)
+    pairs = [(mask.labels, true) for mask, true in zip(found.masks, truth, strict=True) if true.any()]
+    assert not any((labels[POSTER] == 255).any() for labels, _ in pairs), "not the poster of the same color"
+    known = [((labels == 255) & true, ((labels == 255) | true) & (labels != 128)) for labels, true in pairs]
+    return np.array([both.sum() / either.sum() for both, either in known])
+
+
+@pytest.mark.slow
+def test_what_is_recognized_is_segmented_where_depth_is_wrong(session):
+    recognized, relearned = overlaps(session, KnownColor()), overlaps(session, None)
+    assert recognized.mean() > 0.78, "share of known pixels; the pictures are 90 pixels wide"
+    assert recognized.mean() > relearned.mean() + 0.1
+
+
+def test_only_the_strongest_component_is_the_animal():
+    labels, log_odds = np.zeros((20, 30), np.uint8), np.full((20, 30), -4.0)
+    labels[2:12, 2:10], log_odds[2:12, 2:10] = 255, 3.0
+    labels[5:18, 15:28], log_odds[5:18, 15:28] = 255, 0.5
+    found = refine.doubt_all_but_strongest(labels, log_odds)
+    assert (found[2:12, 2:10] == 255).all() and (found[5:18, 15:28] == 128).all()
+    assert not refine.doubt_all_but_strongest(np.zeros_like(labels), log_odds).any()
