@@ -1,6 +1,5 @@
 """The cat that policies meet in the end, and the windows that its model learns from."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 
 from benchmarks import approach_animal
 from benchmarks.approach_animal import TrueCats
-from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData
+from pipeline.behavior.trajectories import TRAIN, BehaviorData
 from pipeline.core.videos import Video
 from pipeline.data import npz
 from stages.slice_behavior import stage as slicing
@@ -72,26 +71,3 @@ def test_true_cats_start_where_the_window_ends(data):
     cats = TrueCats(data)
     cats.begin(context, np.random.default_rng(0))
     np.testing.assert_allclose(cats.past_world[:, -1], context.world_from_agent[:, -1, :3, 3], atol=1e-6)
-
-
-def test_windows_in_which_a_standing_person_moves_later_are_left_out(data):
-    left = approach_animal.without_surprises(data)
-    assert 0 < len(left.start) < len(data.start)
-    context, _ = left.windows(np.arange(len(left.start)))
-    person, cat = context.observer_world[..., [0, 2]], context.world_from_agent[:, -1, [0, 2], 3]
-    stands = np.linalg.norm(person[:, -1] - person[:, -4], axis=-1) < 0.06
-    assert stands.any()
-    track = left.trajectories["home0-0"].world_from_camera[:, [0, 2], 3]
-    later = track[left.start[:, None] + left.past + np.arange(left.future)]
-    ratio = np.linalg.norm(later - person[:, -1:], axis=-1).max(1) / np.linalg.norm(
-        cat - person[:, -1], axis=-1
-    )
-    assert ratio[stands].max() < 0.25 < ratio[~stands].max()
-
-
-def test_windows_for_testing_are_all_kept(data):
-    split = np.where(np.arange(len(data.split)) % 2, TEST, TRAIN).astype(data.split.dtype)
-    halved = replace(data, split=split)
-    left = approach_animal.without_surprises(halved)
-    assert len(left.indices(TEST)) == len(halved.indices(TEST))
-    assert len(left.indices(TRAIN)) < len(halved.indices(TRAIN))
