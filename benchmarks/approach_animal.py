@@ -66,6 +66,8 @@ STEPS = round(1 / (RATE_HZ * STEP_S))
 """Steps of the cat per step of the environment."""
 PERCH_M = 0.1
 """Height of the ground above which the cat is on one of its high places."""
+CALM_S = 0.8
+"""How long the person has stood when an episode begins."""
 
 
 def home_of(number: int, session_number: int) -> tuple[Room, np.random.Generator]:
