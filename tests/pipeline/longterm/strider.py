@@ -3,17 +3,23 @@ skate.
 """
 
 import numpy as np
+import torch
 
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
 from pipeline.longterm.bodies import SkinnedBody
-from pipeline.longterm.examples import MotionDataset
+from pipeline.longterm.config import LongTermSizes
+from pipeline.longterm.contacts import find_contact_vertices
+from pipeline.longterm.examples import MotionDataset, fit_pose_space
+from pipeline.longterm.motion_synthesis import LongTerm, measure_motion_prior
+from pipeline.longterm.networks import PoseNet, RouteNet, StaticBody
 from pipeline.longterm.short_motions import RATE_HZ, BodyMotion
 from pipeline.longterm.surroundings import MotionScene
 
 HIP_M = 0.2
 FEET = np.array([[0.06, -HIP_M, 0.12], [-0.06, -HIP_M, 0.12], [0.06, -HIP_M, -0.12], [-0.06, -HIP_M, -0.12]])
 STRIDE_S = 0.6
+SIZES = LongTermSizes(pose=12, latent=4, scene=16, hidden=8, width=16, points=32)
 
 
 def box(low, high, outward=True) -> Mesh:
@@ -85,6 +91,17 @@ def dataset(seed: int = 0, count: int = 3, seconds: float = 8.0) -> MotionDatase
         )
     scene = MotionScene(room(), np.array([-2.1, -0.2, -2.1]), np.array([2.1, 0.8, 2.1]), voxel_m=0.05)
     return MotionDataset(body(), tuple(walks), (0,) * count, (scene,))
+
+
+def untrained_model(data: MotionDataset) -> LongTerm:
+    """Return networks of `SIZES` with random weights, and what is measured on the data."""
+    torch.manual_seed(0)
+    walks = list(data.stretches)
+    poses = fit_pose_space(data.stretches, data.body.agent_from_bone_rest, SIZES.pose)
+    contacts = find_contact_vertices(data.body, walks, data.distances)
+    motion_prior = measure_motion_prior(walks, list(data.scenes) * len(walks))
+    nets = (net.eval() for net in (StaticBody(SIZES), RouteNet(SIZES), PoseNet(SIZES)))
+    return LongTerm(SIZES, poses, contacts, motion_prior, *nets)
 
 
 def _along(way: np.ndarray, time_s: np.ndarray, seconds: float) -> np.ndarray:

@@ -8,9 +8,7 @@ from pipeline.baselines import longterm_networks
 from pipeline.core.errors import InputError
 from pipeline.longterm import simulated_lives
 from pipeline.longterm.clip_channels import decode_clip, encode_clips, encode_places
-from pipeline.longterm.config import LongTermSizes
-from pipeline.longterm.contacts import find_contact_vertices
-from pipeline.longterm.examples import encode_selection, fit_pose_space, sample_static_bodies, select_clips
+from pipeline.longterm.examples import encode_selection, sample_static_bodies, select_clips
 from pipeline.longterm.local_scene import (
     MAX_DISTANCE_M,
     MIN_DISTANCE_M,
@@ -18,13 +16,12 @@ from pipeline.longterm.local_scene import (
     LocalScene,
     read_distances,
 )
-from pipeline.longterm.motion_synthesis import LongTerm, measure_motion_prior
-from pipeline.longterm.networks import GaitPhase, PointNet, PoseNet, RouteNet, StaticBody, gait_progress
+from pipeline.longterm.motion_synthesis import LongTerm
+from pipeline.longterm.networks import GaitPhase, PointNet, gait_progress
 from pipeline.longterm.short_motions import STEPS
 from pipeline.longterm.subgoals import Subgoal, WalkableFloor, plan_waypoints, sample_visited_subgoals
 from tests.pipeline.longterm import strider
-
-SIZES = LongTermSizes(pose=12, latent=4, scene=16, hidden=8, width=16, points=32)
+from tests.pipeline.longterm.strider import SIZES
 
 
 @pytest.fixture(scope="module")
@@ -34,14 +31,7 @@ def dataset():
 
 @pytest.fixture(scope="module")
 def model(dataset):
-    torch.manual_seed(0)
-    poses = fit_pose_space(dataset.stretches, dataset.body.agent_from_bone_rest, SIZES.pose)
-    contacts = find_contact_vertices(dataset.body, list(dataset.stretches), dataset.distances)
-    motion_prior = measure_motion_prior(
-        list(dataset.stretches), list(dataset.scenes) * len(dataset.stretches)
-    )
-    nets = (StaticBody(SIZES), RouteNet(SIZES), PoseNet(SIZES))
-    return LongTerm(SIZES, poses, contacts, motion_prior, *(net.eval() for net in nets))
+    return strider.untrained_model(dataset)
 
 
 @pytest.fixture(scope="module")

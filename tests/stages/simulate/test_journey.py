@@ -2,38 +2,24 @@ import json
 
 import numpy as np
 import pytest
-import torch
 
 from pipeline.core.errors import InputError
 from pipeline.data import npz
 from pipeline.longterm import journeys
-from pipeline.longterm.config import LongTermSizes, MotionOptimizationConfig
-from pipeline.longterm.contacts import find_contact_vertices
-from pipeline.longterm.examples import fit_pose_space
-from pipeline.longterm.motion_synthesis import LongTerm, measure_motion_prior
-from pipeline.longterm.networks import PoseNet, RouteNet, StaticBody
+from pipeline.longterm.config import MotionOptimizationConfig
+from pipeline.longterm.motion_synthesis import LongTerm
 from pipeline.longterm.short_motions import BodyMotion
 from pipeline.longterm.subgoals import Subgoal
 from stages.simulate import journey_files, subgoal_file
 from tests.pipeline.longterm import strider
 
-SIZES = LongTermSizes(pose=12, latent=4, scene=16, hidden=8, width=16, points=32)
 SETTINGS = MotionOptimizationConfig(steps=15, vertices=30)
 
 
 @pytest.fixture(scope="module")
 def world():
     dataset = strider.dataset()
-    torch.manual_seed(0)
-    poses = fit_pose_space(dataset.stretches, dataset.body.agent_from_bone_rest, SIZES.pose)
-    contacts = find_contact_vertices(dataset.body, list(dataset.stretches), dataset.distances)
-    motion_prior = measure_motion_prior(
-        list(dataset.stretches), list(dataset.scenes) * len(dataset.stretches)
-    )
-    nets = (net.eval() for net in (StaticBody(SIZES), RouteNet(SIZES), PoseNet(SIZES)))
-    return journeys.LongTermWorld(
-        LongTerm(SIZES, poses, contacts, motion_prior, *nets), dataset.body, dataset.scenes[0]
-    )
+    return journeys.LongTermWorld(strider.untrained_model(dataset), dataset.body, dataset.scenes[0])
 
 
 def read(path, text):

@@ -6,19 +6,14 @@ import torch
 
 from pipeline.baselines import longterm_networks
 from pipeline.longterm.clip_channels import Clips
-from pipeline.longterm.config import LongTermSizes, MotionOptimizationConfig
-from pipeline.longterm.contacts import find_contact_vertices
-from pipeline.longterm.examples import DatasetSplit, encode_selection, fit_pose_space, select_clips
-from pipeline.longterm.motion_synthesis import LongTerm, measure_motion_prior
-from pipeline.longterm.networks import PoseNet, RouteNet, StaticBody
+from pipeline.longterm.config import MotionOptimizationConfig
+from pipeline.longterm.examples import DatasetSplit, encode_selection, select_clips
 from pipeline.longterm.short_motions import BodyMotion
 from stages.tabulate_longterm import bars, comparison, lengths, methods, scores, tables
 from stages.tabulate_longterm.config import Config
 from stages.tabulate_longterm.reading import MotionSource
 from tests.pipeline.longterm import strider
-
-SIZES = LongTermSizes(pose=12, latent=4, scene=16, hidden=8, width=16, points=32)
-
+from tests.pipeline.longterm.strider import SIZES
 
 SMALL = Config(clips=6, optimized_clips=4, optimization=MotionOptimizationConfig(steps=5, vertices=30))
 
@@ -26,19 +21,9 @@ SMALL = Config(clips=6, optimized_clips=4, optimization=MotionOptimizationConfig
 @pytest.fixture(scope="module")
 def source():
     train, held = strider.dataset(count=2), strider.dataset(seed=7, count=2)
-    torch.manual_seed(0)
-    poses = fit_pose_space(train.stretches, train.body.agent_from_bone_rest, SIZES.pose)
-    contacts = find_contact_vertices(train.body, list(train.stretches), train.distances)
-    motion_prior = measure_motion_prior(list(train.stretches), list(train.scenes) * len(train.stretches))
-    model = LongTerm(
-        SIZES,
-        poses,
-        contacts,
-        motion_prior,
-        *(net.eval() for net in (StaticBody(SIZES), RouteNet(SIZES), PoseNet(SIZES))),
-    )
-    rng = np.random.default_rng(0)
-    bank = encode_selection(train, select_clips(train, rng, stride=20, resting=0.0), poses, SIZES.points, rng)
+    model, rng = strider.untrained_model(train), np.random.default_rng(0)
+    traveled = select_clips(train, rng, stride=20, resting=0.0)
+    bank = encode_selection(train, traveled, model.poses, SIZES.points, rng)
     ablated = {
         name: longterm_networks.build(kind, SIZES).eval()
         for name, kind in longterm_networks.ABLATIONS.items()
