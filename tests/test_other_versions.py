@@ -12,8 +12,7 @@ from pipeline.behavior import model as behavior
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import BehaviorNets
 from pipeline.core.errors import InputError
-from pipeline.data import glb, npz
-from pipeline.environments.config import EnvironmentConfig
+from pipeline.data import glb
 from pipeline.environments.world import AnimalWorld
 from pipeline.longterm.motion_synthesis import LongTerm
 from pipeline.workflow import artifact
@@ -22,23 +21,16 @@ from stages.simulate import takes
 from stages.simulate.config import Config
 from stages.simulate.inputs import Inputs
 from stages.train_behavior.export import write_contract
-from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, scaling, wandering
+from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, scaling
+from tests.pipeline.environments.small_world import QUICK, write_build
 from tests.stages.export import moving_tube
-
-QUICK = EnvironmentConfig(goal_steps=2, sequence_steps=2, candidates=1, start_m=(0.8, 1.5))
 
 
 @pytest.fixture
 def build(tmp_path):
     """Model, data and glTF of an animal, as this version writes them."""
-    for name in ("behavior", "behavior_data", "simulator"):
-        (tmp_path / name).mkdir()
-    wandering().save(tmp_path / "behavior_data")
-    volume = room()
-    known = {"allowed": (volume.occupancy == 0).astype(np.uint8), "stands_m": np.full((2, 2), np.nan)}
-    npz.save(tmp_path / "behavior_data/volume.npz", **vars(volume), **known)
-    nets = BehaviorNets(ARCHITECTURE)
-    write_contract(tmp_path / "behavior", nets, ARCHITECTURE, scaling(), Schedule(), REST)
+    write_build(tmp_path)
+    (tmp_path / "simulator").mkdir()
     data, _ = moving_tube.model()
     (tmp_path / "simulator/agent.glb").write_bytes(data)
     mesh, _, _ = glb.read_skinned(data)

@@ -232,11 +232,13 @@ def test_guidance_of_one_companion_changes_nothing_of_another(sampler):
     np.testing.assert_allclose(goals((0.3, 0.0), alone), goals((0.3, 1.0), alone), atol=1e-6)
 
 
-def test_simulated_animals_perceive_and_avoid_each_other(sampler):
-    volume = room()
-    scenes = Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int))
+def animals_in(scenes, sampler):
     sampling = PlanSamplingConfig(goal_steps=4, sequence_steps=2)
-    animals = AnimalBatch(sampler, scenes, REST, "yaw", sampling=sampling, chaining=ReplanningConfig())
+    return AnimalBatch(sampler, scenes, REST, "yaw", sampling=sampling, chaining=ReplanningConfig())
+
+
+def test_simulated_animals_perceive_and_avoid_each_other(sampler):
+    animals = animals_in(Scenes.of(room()), sampler)
     context, _ = wandering().windows(np.array([0, 40, 0, 40]))
     context = replace(context, video=None)
     far = np.full((4, 3), ABSENT_M)
@@ -255,10 +257,7 @@ def test_simulated_animals_perceive_and_avoid_each_other(sampler):
 
 
 def test_external_companions_are_perceived_and_avoided(sampler):
-    volume = room()
-    scenes = Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int))
-    sampling = PlanSamplingConfig(goal_steps=4, sequence_steps=2)
-    animals = AnimalBatch(sampler, scenes, REST, "yaw", sampling=sampling, chaining=ReplanningConfig())
+    animals = animals_in(Scenes.of(room()), sampler)
     context, _ = wandering().windows(np.array([0]))
     context = replace(context, video=None, observer_world=np.full((1, PAST, 3), ABSENT_M))
     here, far = context.world_from_agent[:, -1, :3, 3], np.full((1, 3), ABSENT_M)
@@ -289,8 +288,7 @@ def beside_a_companion(sampler):
     """One animal and a companion at its goal in an empty room; the function moves the companion."""
     volume = room()
     scenes = Scenes((volume,), (np.ones_like(volume.occupancy, bool),), np.zeros(1, int))
-    sampling = PlanSamplingConfig(goal_steps=4, sequence_steps=2)
-    animals = AnimalBatch(sampler, scenes, REST, "yaw", sampling=sampling, chaining=ReplanningConfig())
+    animals = animals_in(scenes, sampler)
     context, _ = wandering().windows(np.array([0]))
     context = replace(context, video=None, observer_world=np.full((1, PAST, 3), ABSENT_M))
     goal = context.world_from_agent[0, -1, :3, 3] + np.array([1.0, 0.0, 0.0])

@@ -95,11 +95,10 @@ def scaling() -> Scaling:
 
 def untrained_simulator(goal_steps: int, candidates: int) -> Simulator:
     """Return a simulator of untrained networks in `room`."""
-    volume = room()
     return Simulator(
         Sampler(TorchNetworks(BehaviorNets(ARCHITECTURE)), Schedule(), scaling()),
         wandering(),
-        Scenes((volume,), (volume.occupancy == 0,), np.zeros(1, int)),
+        Scenes.of(room()),
         "yaw",
         sampling=PlanSamplingConfig(goal_steps=goal_steps, sequence_steps=2),
         chaining=ReplanningConfig(candidates=candidates),

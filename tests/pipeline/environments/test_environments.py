@@ -9,17 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.behavior.diffusion import Schedule
-from pipeline.behavior.model import BehaviorNets
 from pipeline.behavior.perception import FeatureVolume
 from pipeline.core.errors import InputError
 from pipeline.environments import NAME
 from pipeline.environments.floor import PersonFloor, to_local, to_world
 from pipeline.environments.rewards import REWARDS, StepOutcome
 from pipeline.environments.world import AnimalWorld
-from stages.train_behavior.export import write_contract
-from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, scaling, wandering
-from tests.pipeline.environments.small_world import QUICK, small_world
+from tests.pipeline.behavior.wandering import wandering
+from tests.pipeline.environments.small_world import QUICK, small_world, write_build
 from tests.pipeline.environments.test_other_home import write
 
 gymnasium = pytest.importorskip("gymnasium")
@@ -29,18 +26,7 @@ pytest.importorskip("pettingzoo")
 @pytest.fixture(scope="module")
 def build(tmp_path_factory):
     """Build with an untrained model in a room of 4 m."""
-    from pipeline.data import npz
-
-    folder = tmp_path_factory.mktemp("build")
-    for name in ("behavior", "behavior_data"):
-        (folder / name).mkdir()
-    wandering().save(folder / "behavior_data")
-    volume = room()
-    known = {"allowed": (volume.occupancy == 0).astype(np.uint8), "stands_m": np.full((2, 2), np.nan)}
-    npz.save(folder / "behavior_data/volume.npz", **vars(volume), **known)
-    nets = BehaviorNets(ARCHITECTURE)
-    write_contract(folder / "behavior", nets, ARCHITECTURE, scaling(), Schedule(), REST)
-    return folder
+    return write_build(tmp_path_factory.mktemp("build"))
 
 
 @pytest.mark.parametrize("embodiment", ["person", "robot"])
@@ -76,12 +62,7 @@ def test_pettingzoo_checks_pass():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         parallel_api_test(PersonAnimalEnv(world), num_cycles=60)
-        parallel_seed_test(lambda: PersonAnimalEnv(small_world_like(world)), num_cycles=40)
-
-
-def small_world_like(world):
-    """Return another world with the same networks."""
-    return AnimalWorld(world.residents, world.config)
+        parallel_seed_test(lambda: PersonAnimalEnv(AnimalWorld(world.residents, QUICK)), num_cycles=40)
 
 
 def test_vectorized_episodes_restart_and_are_seeded(build):

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline.behavior.diffusion import Schedule
-from pipeline.behavior.model import BehaviorNets
 from pipeline.core.errors import InputError
 from pipeline.data import npz, ply
 from pipeline.environments import NAME
@@ -19,13 +17,12 @@ from pipeline.environments.world import AnimalWorld
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
 from pipeline.longterm.bodies import SkinnedBody
-from stages.train_behavior.export import write_contract
-from tests.pipeline.behavior.wandering import ARCHITECTURE, BONES, REST, scaling, wandering
+from tests.pipeline.behavior.wandering import BONES, REST, wandering
+from tests.pipeline.environments.small_world import QUICK, write_animal
 from tests.pipeline.environments.test_other_home import write
 
 gymnasium = pytest.importorskip("gymnasium")
 
-QUICK = EnvironmentConfig(goal_steps=2, sequence_steps=2, candidates=1, start_m=(0.8, 1.5))
 RED, BLUE = (200, 30, 30), (30, 30, 200)
 
 
@@ -55,9 +52,7 @@ def builds(tmp_path_factory):
     """Two homes: the first with an untrained model and surfaces, the second with surfaces only."""
     folder = tmp_path_factory.mktemp("builds")
     own, other = write(folder / "own"), write(folder / "other")
-    (own / "behavior").mkdir()
-    write_contract(own / "behavior", BehaviorNets(ARCHITECTURE), ARCHITECTURE, scaling(), Schedule(), REST)
-    wandering().save(own / "behavior_data")
+    write_animal(own)
     for build in (own, other):
         write_surfaces(build)
     return own, other

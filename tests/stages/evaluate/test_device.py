@@ -8,12 +8,12 @@ import torch
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import BehaviorNets, Scaling
 from pipeline.behavior.trajectories import BehaviorData
-from pipeline.data import npz
 from pipeline.metrics.metrics import Metrics
 from stages.evaluate import stage
 from stages.evaluate.config import Config
 from stages.train_behavior.export import write_contract
 from tests.pipeline.behavior import wandering
+from tests.pipeline.environments.small_world import write_volume
 from tests.simulated_device import DEVICE, simulated_device
 from tests.stages.export_simulator import small_world
 
@@ -38,9 +38,7 @@ def test_behavior_is_evaluated_on_another_device(tmp_path):
     tracks = {f"v{2 + k:03d}": small_world.trajectory(70, k) for k in range(2)}
     one_each = np.arange(2, dtype=np.int32), np.zeros(2, np.int32), np.array([0, 1], np.uint8)
     BehaviorData(tracks, small_world.rest(), *one_each, tuple(tracks)).save(data)
-    volume = wandering.room()
-    allowed, stands_m = volume.occupancy == 0, np.full((2, 2), np.nan)
-    npz.save(data / "volume.npz", **vars(volume), allowed=allowed.astype(np.uint8), stands_m=stands_m)
+    write_volume(data / "volume.npz", wandering.room())
     torch.manual_seed(0)
     write_contract(
         behavior, BehaviorNets(ARCHITECTURE), ARCHITECTURE, _scaling(), Schedule(), small_world.rest()

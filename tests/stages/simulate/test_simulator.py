@@ -36,6 +36,7 @@ from tests.pipeline.behavior.wandering import (
     wandering,
 )
 from tests.pipeline.environments import test_other_home
+from tests.pipeline.environments.small_world import write_animal, write_volume
 
 
 @pytest.fixture(scope="module")
@@ -223,8 +224,7 @@ def homes(folder, seen=None, architecture=ARCHITECTURE):
     for number, name in enumerate(data.videos):
         bare = room()
         volume = replace(bare, origin=bare.origin + np.array([20.0 * number, 0, 0]))
-        known = {"allowed": (volume.occupancy == 0).astype(np.uint8), "stands_m": np.full((2, 2), np.nan)}
-        npz.save(folder / f"behavior_data/volumes/{name}.npz", **vars(volume), **known)
+        write_volume(folder / f"behavior_data/volumes/{name}.npz", volume)
     write_contract(folder / "behavior", BehaviorNets(architecture), architecture, scaling(), Schedule(), REST)
     return Inputs(behavior_data=folder / "behavior_data", behavior=folder / "behavior")
 
@@ -254,9 +254,7 @@ def test_models_without_chainable_plans_are_refused(tmp_path):
 
 def test_take_in_the_home_of_another_build(tmp_path):
     own, other = test_other_home.write(tmp_path / "own"), test_other_home.write(tmp_path / "other")
-    (own / "behavior").mkdir()
-    wandering().save(own / "behavior_data")
-    write_contract(own / "behavior", BehaviorNets(ARCHITECTURE), ARCHITECTURE, scaling(), Schedule(), REST)
+    write_animal(own)
     artifacts = ("behavior_data", "behavior", "feature_basis", "scene_template")
     inputs = Inputs(**{name: own / name for name in artifacts}, home=other)
     settings = Config(seconds=1.0, goal_steps=4, sequence_steps=2)
