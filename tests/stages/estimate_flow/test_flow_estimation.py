@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from pipeline.backends import raft
-from pipeline.data import images, npz
+from pipeline.data import npz
 from stages.estimate_flow import stage
 from stages.estimate_flow.backends.raft import UPDATES, RaftEstimator
 from stages.estimate_flow.config import Config
 from stages.estimate_flow.estimation import Estimator, flows, grid_centers
+from tests.stages.written_frames import write_frames
 
 WORKING_SIDE_PX = 320
 
@@ -84,25 +85,9 @@ def test_pairs_are_ordered_and_few_frames_are_read_twice():
 
 
 def test_stage_writes_all_gaps_in_both_directions(tmp_path):
-    frames = tmp_path / "frames"
-    frames.mkdir()
-    for folder in [frames]:
-        for name in ("color", "depth"):
-            (folder / name).mkdir()
-        images.write_depth(folder / "depth" / "000000.exr", np.ones((8, 6)))
-        for i in range(10):
-            shifted = moved(texture(64, 48), np.array([[1, 0, i], [0, 1, 0.0]]))
-            images.write_color(folder / "color" / f"{i:06d}.jpg", shifted)
-        eye = np.tile(np.eye(3), (10, 1, 1))
-        npz.save(
-            folder / "frames.npz",
-            timestamp_s=np.arange(10) / 10,
-            intrinsics=eye,
-            depth_intrinsics=eye,
-            gravity_known=np.array(True),
-            quality=np.ones(10, np.float32),
-        )
-    out = tmp_path / "flow"
+    frames, out = tmp_path / "frames", tmp_path / "flow"
+    shifted = [moved(texture(64, 48), np.array([[1, 0, i], [0, 1, 0.0]])) for i in range(10)]
+    write_frames(frames, shifted, np.ones((8, 6)))
     out.mkdir()
     stage.run(stage.Inputs(frames=frames), Config(), out)
     for gap in (1, 2, 4, 8):

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from pipeline.core.videos import Video
-from pipeline.data import images, npz
 from pipeline.geometry import cameras
 from stages.evaluate import heldout, reading, real_phone, reconstruction
 from stages.evaluate.heldout import HeldoutShot, HeldoutView
 from stages.evaluate.reading import BuildFolders
+from tests.stages.written_frames import write_frames
 
 PHONE = Video("v002", "heldout.r3d", "heldout", "none", None, "v001", 0.35)
 
@@ -20,15 +20,7 @@ PHONE = Video("v002", "heldout.r3d", "heldout", "none", None, "v001", 0.35)
 def folders(tmp_path: Path) -> BuildFolders:
     """A session of 1 s and a phone that records 0.35 s longer, without a reconstruction."""
     for id in ("v001", "v002"):
-        frames, lens = tmp_path / "frames" / id, np.tile(np.eye(3), (11, 1, 1))
-        for kind in ("color", "depth", "confidence"):
-            (frames / kind).mkdir(parents=True)
-        for frame in range(11):
-            images.write_color(frames / "color" / f"{frame:06d}.jpg", np.full((9, 7, 3), 99, np.uint8))
-            images.write_depth(frames / "depth" / f"{frame:06d}.exr", np.full((9, 7), 2.0, np.float32))
-            images.write_gray(frames / "confidence" / f"{frame:06d}.png", np.full((9, 7), 2, np.uint8))
-        table = {"timestamp_s": 0.1 * np.arange(11), "intrinsics": lens, "depth_intrinsics": lens}
-        npz.save(frames / "frames.npz", **table, gravity_known=np.array(True), quality=np.ones(11))
+        write_frames(tmp_path / "frames" / id, [np.full((9, 7, 3), 99, np.uint8)] * 11, np.full((9, 7), 2.0))
     nowhere = {field.name: tmp_path for field in fields(BuildFolders)} | {
         "truth": None,
         "masks": {},

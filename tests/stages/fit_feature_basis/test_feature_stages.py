@@ -12,6 +12,7 @@ from pipeline.data import images, npz
 from pipeline.workflow import artifact, cli
 from stages.extract_features import stage as extract
 from stages.fit_feature_basis import stage as fit
+from tests.stages.written_frames import write_frames
 
 ROLES = ("walkthrough", "turnaround", "session", "session")
 
@@ -19,16 +20,9 @@ ROLES = ("walkthrough", "turnaround", "session", "session")
 def _write_clip(folder, seed):
     rng = np.random.default_rng(seed)
     with artifact.create(folder, stage="extract_frames", config={}, inputs={}, key=None) as inside:
-        (inside / "color").mkdir()
-        (inside / "depth").mkdir()
-        images.write_depth(inside / "depth" / "000000.exr", np.ones((8, 6)))
-        for i in range(3):
-            small = rng.integers(0, 255, (24, 18, 3), dtype=np.uint8)
-            picture = cv2.resize(small, (78, 101))  # not a multiple of the cell size
-            images.write_color(inside / "color" / f"{i:06d}.jpg", picture)
-        eye = np.tile(np.eye(3), (3, 1, 1))
-        table = dict(timestamp_s=np.arange(3) / 10, intrinsics=eye, depth_intrinsics=eye)
-        npz.save(inside / "frames.npz", **table, gravity_known=np.array(True), quality=np.ones(3, np.float32))
+        small = [rng.integers(0, 255, (24, 18, 3), dtype=np.uint8) for _ in range(3)]
+        pictures = [cv2.resize(each, (78, 101)) for each in small]  # not a multiple of the cell size
+        write_frames(inside, pictures, np.ones((8, 6)))
 
 
 @pytest.fixture

@@ -17,6 +17,7 @@ from stages.estimate_depth.foreground import color_view
 from stages.estimate_depth.views import View
 from stages.train_recognizer import stage, training
 from stages.train_recognizer.config import Config
+from tests.stages.written_frames import write_frames
 
 SIZE = (240, 180)
 
@@ -85,24 +86,12 @@ def test_nothing_is_recognized_away_from_foreground_or_in_a_shadow(network):
 
 def write_recording(folder, pictures, masks=()):
     """Write `frames` of pictures, and `masks`."""
-    for name in ("color", "depth", "masks"):
-        (folder / name).mkdir(parents=True)
-    for frame, picture in enumerate(pictures):
-        images.write_color(folder / f"color/{frame:06d}.jpg", picture, 95)
-    images.write_depth(folder / "depth/000000.exr", np.zeros((24, 18)))
+    write_frames(folder, pictures, np.zeros((24, 18)))
+    (folder / "masks").mkdir()
     for frame, labels in enumerate(masks):
         images.write_gray(folder / f"masks/{frame:06d}.png", labels)
-    each, eye = np.ones(len(pictures), np.float32), np.tile(np.eye(3), (len(pictures), 1, 1))
-    npz.save(
-        folder / "frames.npz",
-        timestamp_s=np.arange(len(pictures)) / 10,
-        intrinsics=eye,
-        depth_intrinsics=eye,
-        gravity_known=np.array(True),
-        quality=each,
-    )
     visible = np.array([(labels == 255).any() for labels in masks], bool)
-    npz.save(folder / "masks/masks.npz", visible=visible, confidence=each[: len(masks)])
+    npz.save(folder / "masks/masks.npz", visible=visible, confidence=np.ones(len(masks), np.float32))
     return {"v000": folder}
 
 
