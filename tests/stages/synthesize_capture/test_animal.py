@@ -4,7 +4,8 @@ import numpy as np
 
 from pipeline.geometry import rigid
 from stages.synthesize_capture import animal, gait, room
-from stages.synthesize_capture.session import AnimalCourse, simulate_session
+from stages.synthesize_capture.session import simulate_session
+from tests.stages.synthesize_capture.walks import straight
 
 CREATURE = animal.grow(np.random.default_rng(0), cell_m=0.02)
 FEET = [animal.INDEX[name] for name in gait.FEET]
@@ -18,7 +19,7 @@ def test_rest_pose_gives_the_rest_surface():
 
 def test_feet_in_stance_do_not_slide():
     for speed in (0.6, 1.2, 2.0):
-        course = _straight(speed)
+        course = straight(speed)
         times = np.linspace(1.0, 3.0, 400)
         feet = _feet(gait.poses(course, times))
         low = feet[..., 1] < animal.CAT.gait.sole_m + 0.0005
@@ -30,7 +31,7 @@ def test_feet_in_stance_do_not_slide():
 
 
 def test_bones_are_rigid_and_legs_keep_their_length():
-    motion = gait.poses(_straight(0.8, posture=(0.5, 0.0, 0.0)), np.linspace(0.5, 3.0, 60))
+    motion = gait.poses(straight(0.8, posture=(0.5, 0.0, 0.0)), np.linspace(0.5, 3.0, 60))
     rotation = motion.agent_from_bone[..., :3, :3]
     np.testing.assert_allclose(
         rotation @ np.swapaxes(rotation, -1, -2), np.broadcast_to(np.eye(3), rotation.shape), atol=1e-6
@@ -70,21 +71,6 @@ def test_normals_point_outwards():
     belly = (np.abs(CREATURE.vertices[:, 2]) < 0.05) & (CREATURE.vertices[:, 1] < -0.06)
     assert normals[top & (np.abs(CREATURE.vertices[:, 2]) < 0.05), 1].mean() > 0.5
     assert normals[belly, 1].mean() < -0.5
-
-
-def _straight(speed: float, posture: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> AnimalCourse:
-    times = np.arange(130) / 30
-    position = np.stack([0 * times, 0 * times, speed * times], axis=-1)
-    still = np.zeros(len(times))
-    return AnimalCourse(
-        times,
-        position,
-        still,
-        np.tile(posture, (len(times), 1)),
-        still,
-        position + np.array([0, 0.3, 2.0]),
-        still,
-    )
 
 
 def _feet(motion: gait.AnimalMotion) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 
 from stages.synthesize_capture import animal, gait, produce, room, script, session
 from stages.synthesize_capture.config import Config
-from stages.synthesize_capture.session import AnimalCourse
+from tests.stages.synthesize_capture.walks import straight
 
 HOME = room.furnish(np.random.default_rng(0))
 CAT = animal.grow(np.random.default_rng(0), cell_m=0.016)
@@ -46,13 +46,7 @@ def test_dog_follows_and_makes_way():
 
 
 def test_its_feet_stand_on_the_floor():
-    time = np.arange(0, 4, 1 / 30)
-    still = np.zeros(len(time))
-    position = np.stack([0 * time, 0 * time, 0.8 * time], axis=-1)
-    course = AnimalCourse(
-        time, position, still, np.zeros((len(time), 3)), still, position + np.array([0, 0.3, 1]), still
-    )
-    motion = gait.poses(course, np.linspace(1, 3, 30), animal.DOG)
+    motion = gait.poses(straight(0.8), np.linspace(1, 3, 30), animal.DOG)
     lowest = [
         animal.surface(DOG, world_from_agent @ bones)[:, 1].min()
         for world_from_agent, bones in zip(motion.world_from_agent, motion.agent_from_bone, strict=True)

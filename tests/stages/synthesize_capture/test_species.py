@@ -9,6 +9,7 @@ from pipeline.geometry import rigid
 from stages.synthesize_capture import animal, gait, stage
 from stages.synthesize_capture.config import Config
 from stages.synthesize_capture.session import AnimalCourse
+from tests.stages.synthesize_capture.walks import straight
 
 OTHERS = ("rabbit", "hen")
 SOLES = ("left toes", "right toes", "left hand", "right hand")
@@ -36,13 +37,13 @@ def test_bones_have_the_same_names(species):
 @pytest.mark.parametrize("species", OTHERS)
 @pytest.mark.parametrize("posture", [(0, 0, 0), (1, 0, 0), (0, 1, 0)])
 def test_it_rests_on_the_ground(species, posture):
-    lowest = [points[:, 1].min() for points, _ in _shown(species, _course(0.0, posture))]
+    lowest = [points[:, 1].min() for points, _ in _shown(species, straight(0.0, posture))]
     assert np.abs(lowest).max() < 0.015, "meters"
 
 
 @pytest.mark.parametrize(("species", "feet"), [("cat", 4), ("rabbit", 4), ("hen", 2)])
 def test_it_stands_on_its_feet(species, feet):
-    points, bone = _shown(species, _course(0.0))[0]
+    points, bone = _shown(species, straight(0.0))[0]
     lows = [points[bone == animal.INDEX[name], 1].min(initial=1.0) for name in SOLES]
     assert sum(low < 0.02 for low in lows) == feet, lows
     if feet == 2:
@@ -52,20 +53,20 @@ def test_it_stands_on_its_feet(species, feet):
 @pytest.mark.parametrize("species", OTHERS)
 @pytest.mark.parametrize("speed", [0.7, 1.5])
 def test_it_walks_on_the_ground(species, speed):
-    shown = _shown(species, _course(speed))
+    shown = _shown(species, straight(speed))
     assert np.isfinite([points for points, _ in shown]).all()
     assert np.abs([points[:, 1].min() for points, _ in shown]).max() < 0.03, "meters"
 
 
 def test_rabbit_hops_with_both_hind_feet():
-    motion = gait.poses(_course(1.0), np.linspace(1, 3, 200), animal.BODIES["rabbit"])
+    motion = gait.poses(straight(1.0), np.linspace(1, 3, 200), animal.BODIES["rabbit"])
     left, right = (_heights(motion, name) for name in ("left toes", "right toes"))
     assert np.corrcoef(left, right)[0, 1] > 0.9
     assert np.ptp(motion.world_from_agent[:, 1, 3]) > 0.03, "meters that the body rises and falls"
 
 
 def test_hen_moves_one_foot_at_a_time():
-    motion = gait.poses(_course(0.7), np.linspace(1, 3, 200), animal.BODIES["hen"])
+    motion = gait.poses(straight(0.7), np.linspace(1, 3, 200), animal.BODIES["hen"])
     left, right = (_heights(motion, name) for name in ("left toes", "right toes"))
     assert np.corrcoef(left, right)[0, 1] < -0.2
 
@@ -73,14 +74,6 @@ def test_hen_moves_one_foot_at_a_time():
 def test_two_of_a_species_are_refused(tmp_path):
     with pytest.raises(InputError, match="species"):
         stage.run(stage.Inputs(), Config(species="dog", companion="dog"), tmp_path)
-
-
-def _course(speed: float, posture: tuple[float, float, float] = (0, 0, 0)) -> AnimalCourse:
-    time = np.arange(130) / 30
-    still = np.zeros(len(time))
-    position = np.stack([still, still, speed * time], axis=-1)
-    postures = np.tile(np.array(posture, float), (len(time), 1))
-    return AnimalCourse(time, position, still, postures, still, position + np.array([0, 0.3, 2.0]), still)
 
 
 def _shown(species, course: AnimalCourse) -> list[tuple[np.ndarray, np.ndarray]]:
