@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
 NEEDS = "the extra is not installed (make extras)"
 SIDE = 64
@@ -11,15 +12,14 @@ SIDE = 64
 
 
 def library():
-    """Import transformers, or skip the test if the extra is not installed."""
-    return pytest.importorskip("transformers", reason=NEEDS)
+    """Import transformers and seed random weights, or skip the test if the extra is not installed."""
+    transformers = pytest.importorskip("transformers", reason=NEEDS)
+    torch.manual_seed(0)
+    return transformers
 
 
 def dinov2(folder: Path) -> Path:
     transformers = library()
-    import torch
-
-    torch.manual_seed(0)
     config = transformers.Dinov2Config(
         hidden_size=24, num_hidden_layers=2, num_attention_heads=2, patch_size=14, image_size=70
     )
@@ -33,9 +33,6 @@ def dinov2(folder: Path) -> Path:
 
 def sam2(folder: Path) -> Path:
     transformers = library()
-    import torch
-
-    torch.manual_seed(0)
     backbone = transformers.Sam2HieraDetConfig(
         hidden_size=8,
         image_size=[SIDE, SIDE],
@@ -83,9 +80,6 @@ def sam2(folder: Path) -> Path:
 
 def grounding_dino(folder: Path) -> Path:
     transformers = library()
-    import torch
-
-    torch.manual_seed(0)
     words = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "[MASK]", ".", "a", "cat", "dog"]
     (folder / "vocab.txt").write_text("\n".join(words))
     transformers.BertTokenizerFast(vocab={word: i for i, word in enumerate(words)}).save_pretrained(folder)
@@ -133,9 +127,6 @@ def grounding_dino(folder: Path) -> Path:
 def depth_anything(folder: Path, kind: str) -> Path:
     """Depth Anything V2 with inverse depth (`relative`) or metric depth (`metric`)."""
     transformers = library()
-    import torch
-
-    torch.manual_seed(0)
     backbone = transformers.Dinov2Config(
         hidden_size=24,
         num_hidden_layers=4,
@@ -162,9 +153,6 @@ def depth_anything(folder: Path, kind: str) -> Path:
 
 def depth_pro(folder: Path) -> Path:
     transformers = library()
-    import torch
-
-    torch.manual_seed(0)
     vit = transformers.Dinov2Config(
         hidden_size=16, num_hidden_layers=4, num_attention_heads=2, patch_size=4, image_size=32
     )

@@ -78,8 +78,19 @@ def data():
 
 
 @pytest.fixture(scope="module")
-def windows(data):
-    return windows_from_data(TrainingHomes.of_one(data, Scenes.of(room())), ARCHITECTURE)
+def homes(data):
+    return TrainingHomes.of_one(data, Scenes.of(room()))
+
+
+@pytest.fixture(scope="module")
+def windows(homes):
+    return windows_from_data(homes, ARCHITECTURE)
+
+
+@pytest.fixture(scope="module")
+def untrained(windows):
+    """Networks with random weights, which tests do not change."""
+    return initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0).eval()
 
 
 def drawn(windows, augmentation, seed=0):
@@ -235,17 +246,16 @@ def test_approaches_are_oversampled_and_perceived(windows, monkeypatch):
     ].oversampled.any()
 
 
-def test_conditions_are_dropped_together_with_the_given_probability(windows, monkeypatch):
+def test_conditions_are_dropped_together_with_the_given_probability(windows, untrained, monkeypatch):
     monkeypatch.setattr(objective, "CONDITION_DROPOUT", 0.0)
     batch, _ = drawn(windows, replace(PLAIN, approached=0.0))
-    nets = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0).eval()
     settings, generator = (
         ObjectiveConfig(code_dropout=0.0, joint_dropout=0.5),
         torch.Generator().manual_seed(0),
     )
     joint = joint_mask(batch, settings, generator)
     assert 0 < joint.mean() < 1
-    code = perceive(nets, batch, settings, generator, joint)
+    code = perceive(untrained, batch, settings, generator, joint)
     dropped = torch.isclose(code, code[joint[:, 0].argmin()], atol=1e-6).all(1)
     assert (dropped == (joint[:, 0] == 0)).all()
     assert (joint_mask(batch, ObjectiveConfig(), generator) == 1).all()
@@ -352,13 +362,10 @@ def test_high_frequency_errors_have_larger_weight():
     [(ARCHITECTURE, ("path", "body"), 1), (replace(ARCHITECTURE, scene="volume"), ("goal",), 0)],
     ids=["unets", "volume"],
 )
-def test_mixed_precision_is_accurate_and_keeps_float32_weights(data, shape, names, first):
+def test_mixed_precision_is_accurate_and_keeps_float32_weights(homes, shape, names, first):
     settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=3, goal_steps=1, batch=8))
     half = replace(settings, optimization=replace(settings.optimization, precision="bfloat16"))
-    exact, rough = (
-        train(TrainingHomes.of_one(data, Scenes.of(room())), shape, Schedule(), each, seed=3)
-        for each in (settings, half)
-    )
+    exact, rough = (train(homes, shape, Schedule(), each, seed=3) for each in (settings, half))
     for name in names:
         ours, theirs = rough.record.terms[name][first:], exact.record.terms[name][first:]
         np.testing.assert_allclose(ours, theirs, rtol=0.02)
@@ -378,21 +385,20 @@ def test_mixed_precision_is_accurate_and_keeps_float32_weights(data, shape, name
     ],
     ids=["concatenation", "companions", "paper"],
 )
-def test_models_of_other_architectures_are_written_and_read(data, tmp_path, shape):
+def test_models_of_other_architectures_are_written_and_read(homes, tmp_path, shape):
     settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=2, goal_steps=1, batch=8))
-    fitted = train(
-        TrainingHomes.of_one(data, Scenes.of(room())), shape, Schedule(course="rectified"), settings, seed=0
-    )
-    outcome.write_trained(tmp_path, fitted, shape, Schedule(course="rectified"), REST)
+    flow = Schedule(course="rectified")
+    fitted = train(homes, shape, flow, settings, seed=0)
+    outcome.write_trained(tmp_path, fitted, shape, flow, REST)
     architecture, nets, scaling, schedule, _ = model.load(tmp_path)
-    assert (architecture, schedule) == (shape, Schedule(course="rectified"))
+    assert (architecture, schedule) == (shape, flow)
     np.testing.assert_allclose(scaling.velocity_std, fitted.scaling.velocity_std)
     assert write_networks(tmp_path, nets.eval(), shape) < 5e-4
 
 
-def test_model_as_in_the_paper_is_trained_read_and_sampled(data, tmp_path):
+def test_model_as_in_the_paper_is_trained_read_and_sampled(data, homes, tmp_path):
     """Paths, goals and bodies are denoised as they are, and plans are what the networks predict."""
-    schedule, homes = Schedule(method="ddpm"), TrainingHomes.of_one(data, Scenes.of(room()))
+    schedule = Schedule(method="ddpm")
     objective = ObjectiveConfig(joint_dropout=0.1, weighting="noise", goal_draws=1, earlier_share=0.0)
     settings = BehaviorTrainingConfig(
         BehaviorOptimizerConfig(steps=3, goal_steps=0, batch=8, precision="bfloat16"), PLAIN, objective
@@ -415,10 +421,10 @@ def test_model_as_in_the_paper_is_trained_read_and_sampled(data, tmp_path):
 @pytest.mark.parametrize(
     "change", [{"family": "gaussian"}, {"family": "one_stage"}, {"control": "concatenation"}]
 )
-def test_baselines_and_ablations_of_positions_are_trained_and_sampled(data, change):
+def test_baselines_and_ablations_of_positions_are_trained_and_sampled(homes, change):
     shape = replace(PAPER, observed_past="positions", guided="observer", **change)
     settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=2, goal_steps=0, batch=4))
-    fitted = train(TrainingHomes.of_one(data, Scenes.of(room())), shape, Schedule(), settings, seed=0)
+    fitted = train(homes, shape, Schedule(), settings, seed=0)
     sampler = sampler_of(shape, TorchNetworks(fitted.nets), Schedule(), fitted.scaling)
     plan = sampler.plan(golden_observation(shape), PlanSamplingConfig(), np.random.default_rng(0), count=2)
     assert plan.path.shape == (2, 56, 3) and plan.body.shape == (2, 56, shape.body_channels)
@@ -426,9 +432,9 @@ def test_baselines_and_ablations_of_positions_are_trained_and_sampled(data, chan
 
 
 @pytest.mark.slow
-def test_training_reduces_the_loss_and_resumes_bit_exactly(data, tmp_path, monkeypatch):
+def test_training_reduces_the_loss_and_resumes_bit_exactly(homes, tmp_path, monkeypatch):
     settings = BehaviorTrainingConfig(BehaviorOptimizerConfig(steps=8, goal_steps=4, batch=8))
-    whole = train(TrainingHomes.of_one(data, Scenes.of(room())), ARCHITECTURE, Schedule(), settings, seed=3)
+    whole = train(homes, ARCHITECTURE, Schedule(), settings, seed=3)
     assert set(whole.record.terms) == {"goal", "path", "body"}
     learned = {
         name: np.flatnonzero(np.isfinite(values)).tolist() for name, values in whole.record.terms.items()
@@ -444,27 +450,13 @@ def test_training_reduces_the_loss_and_resumes_bit_exactly(data, tmp_path, monke
     with monkeypatch.context() as patch:
         patch.setattr(fit._Loop, "advance", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            train(
-                TrainingHomes.of_one(data, Scenes.of(room())),
-                ARCHITECTURE,
-                Schedule(),
-                settings,
-                seed=3,
-                resume=tmp_path,
-            )
-    resumed = train(
-        TrainingHomes.of_one(data, Scenes.of(room())),
-        ARCHITECTURE,
-        Schedule(),
-        settings,
-        seed=3,
-        resume=tmp_path,
-    )
+            train(homes, ARCHITECTURE, Schedule(), settings, seed=3, resume=tmp_path)
+    resumed = train(homes, ARCHITECTURE, Schedule(), settings, seed=3, resume=tmp_path)
     for name, value in whole.nets.state_dict().items():
         torch.testing.assert_close(resumed.nets.state_dict()[name], value, atol=0, rtol=0)
 
 
-def test_goals_and_paths_have_their_own_fraction_of_approaches(data, monkeypatch):
+def test_goals_and_paths_have_their_own_fraction_of_approaches(homes, monkeypatch):
     asked = []
 
     def watched(windows, scene, statistics, augmentation, *rest, **how):
@@ -476,17 +468,14 @@ def test_goals_and_paths_have_their_own_fraction_of_approaches(data, monkeypatch
         BehaviorOptimizerConfig(steps=3, goal_steps=2, batch=4, goal_batch=4),
         AugmentationConfig(approached=0.2, approached_paths=0.5),
     )
-    train(TrainingHomes.of_one(data, Scenes.of(room())), ARCHITECTURE, Schedule(), settings, seed=0)
+    train(homes, ARCHITECTURE, Schedule(), settings, seed=0)
     prior = len(asked) - 3
     assert asked == [0.5] * prior + [0.2, 0.2, 0.5] and prior > 0
 
 
-def test_contract_is_complete_and_round_trips(windows, tmp_path):
-    nets, scaling = (
-        initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0).eval(),
-        statistics_from_windows(windows, 0.0).scaling,
-    )
-    write_contract(tmp_path, nets, ARCHITECTURE, scaling, Schedule(), REST)
+def test_contract_is_complete_and_round_trips(windows, untrained, tmp_path):
+    scaling = statistics_from_windows(windows, 0.0).scaling
+    write_contract(tmp_path, untrained, ARCHITECTURE, scaling, Schedule(), REST)
     contract, golden = (
         json.loads((tmp_path / name).read_text()) for name in ("behavior.json", "golden.json")
     )
@@ -500,21 +489,17 @@ def test_contract_is_complete_and_round_trips(windows, tmp_path):
 
 
 @pytest.mark.slow
-def test_exported_network_is_exact_and_deterministic(windows, tmp_path):
-    goal = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0).eval().goal
+def test_exported_network_is_exact_and_deterministic(untrained, tmp_path):
     inputs, output = signature("goal", ARCHITECTURE)
     for name in ("first", "second"):
-        export_network(goal, tmp_path / f"{name}.onnx", inputs, output)
-    assert difference(goal, tmp_path / "first.onnx", inputs) < 1e-5
+        export_network(untrained.goal, tmp_path / f"{name}.onnx", inputs, output)
+    assert difference(untrained.goal, tmp_path / "first.onnx", inputs) < 1e-5
     assert (tmp_path / "first.onnx").read_bytes() == (tmp_path / "second.onnx").read_bytes()
 
 
-def test_golden_plan_uses_its_noise(windows):
-    nets, scaling = (
-        initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0).eval(),
-        statistics_from_windows(windows, 0.0).scaling,
-    )
-    sampler = Sampler(TorchNetworks(nets), Schedule(), scaling)
+def test_golden_plan_uses_its_noise(windows, untrained):
+    scaling = statistics_from_windows(windows, 0.0).scaling
+    sampler = Sampler(TorchNetworks(untrained), Schedule(), scaling)
     golden = golden_plan(sampler, ARCHITECTURE)
 
     class Noted:
@@ -532,12 +517,11 @@ def test_golden_plan_uses_its_noise(windows):
 
 
 @pytest.mark.slow
-def test_static_animal_is_exported(windows, tmp_path):
+def test_static_animal_is_exported(untrained, tmp_path):
     """All frames of the past are equal: the velocity is zero, and so is the base of its power."""
-    nets = initial_nets(ARCHITECTURE, Schedule(), statistics_from_windows(windows, 0.0), 0).eval()
     inputs, output = signature("perception", ARCHITECTURE)
-    export_network(nets.perception, tmp_path / "perception.onnx", inputs, output)
-    assert difference(nets.perception, tmp_path / "perception.onnx", inputs) < 1e-4
+    export_network(untrained.perception, tmp_path / "perception.onnx", inputs, output)
+    assert difference(untrained.perception, tmp_path / "perception.onnx", inputs) < 1e-4
 
 
 class Timid:
