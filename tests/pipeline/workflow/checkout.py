@@ -1,5 +1,6 @@
 """A small checkout for tests of the workflow: the real `pipeline` package, tiny stages, real recipes."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -105,6 +106,25 @@ class Checkout:
         """Run make."""
         command = ["make", "--no-print-directory", f"PYTHON={sys.executable}", *arguments]
         return subprocess.run(command, cwd=self.folder, capture_output=True, text=True)
+
+    def plan(self, home: str = "toy") -> subprocess.CompletedProcess[str]:
+        """Plan a home."""
+        return self.python("pipeline.workflow.plan", "plan", home)
+
+    def snakemake(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run Snakemake."""
+        command = [sys.executable, "-m", "snakemake", *arguments]
+        return subprocess.run(command, cwd=self.folder, capture_output=True, text=True)
+
+    def jobs(self) -> dict[str, dict]:
+        """Return the planned jobs of the toy by id."""
+        planned = json.loads((self.folder / "build/toy/plan/dag.json").read_text())
+        return {job["id"]: job for job in planned}
+
+    def record(self, *names: str) -> None:
+        """Write recordings of the toy; their content is their name."""
+        for name in names:
+            self.write(f"captures/toy/{name}", name)
 
     def write(self, name: str, text: str) -> None:
         """Write a file of the working copy."""

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -42,7 +41,7 @@ def test_invalid_table_of_homes_is_refused(tmp_path, text):
 
 
 def test_resources_grow_with_frames_and_attempts(small_checkout):
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    small_checkout.plan()
     node, home = dag.NODES["reconstruction"], SimpleNamespace(home="toy")
     unknown = engine.memory_mb(node, home, 1)
     for cached in (engine._frames, engine._frames_in):
@@ -61,21 +60,9 @@ def test_resources_grow_with_frames_and_attempts(small_checkout):
 @pytest.mark.slow
 def test_snakemake_builds_several_agents(small_checkout):
     shutil.copy(small_checkout.folder / "agents/toy.toml", small_checkout.folder / "agents/luna.toml")
-    command = [
-        sys.executable,
-        "-m",
-        "snakemake",
-        "--cores",
-        "2",
-        "--config",
-        "agents=[toy,luna]",
-        "--quiet",
-        "all",
-    ]
     targets = [f"build/{agent}/flow/v001/.ok" for agent in ("toy", "luna")]
-    made = subprocess.run(
-        [*command, "--", *targets], cwd=small_checkout.folder, capture_output=True, text=True
-    )
+    options = "--cores 2 --config agents=[toy,luna] --quiet all --".split()
+    made = small_checkout.snakemake(*options, *targets)
     assert made.returncode == 0, made.stderr
     assert all((small_checkout.folder / target).is_file() for target in targets)
     assert not (small_checkout.folder / "build/toy/masks").exists()
@@ -100,16 +87,11 @@ def test_jobs_run_in_the_given_container(small_checkout, monkeypatch):
         (small_checkout.folder / name).chmod(0o755)
     small_checkout.write("agent-to-sim.sif", "")
     monkeypatch.setenv("PATH", f"{small_checkout.folder}/bin:{os.environ['PATH']}")
-    command = [sys.executable, "-m", "snakemake", "--cores", "1", "--quiet", "all"]
-    command += [
-        "--software-deployment-method",
-        "apptainer",
-        "--config",
-        "agent=toy",
-        "container=agent-to-sim.sif",
-    ]
+    options = "--cores 1 --quiet all --software-deployment-method apptainer".split()
     target = "build/toy/frames/v001/.ok"
-    made = subprocess.run([*command, "--", target], cwd=small_checkout.folder, capture_output=True, text=True)
+    made = small_checkout.snakemake(
+        *options, "--config", "agent=toy", "container=agent-to-sim.sif", "--", target
+    )
     assert made.returncode == 0, made.stderr
     assert (small_checkout.folder / target).is_file()
     calls = (small_checkout.folder / "calls.txt").read_text().splitlines()

@@ -59,7 +59,7 @@ def test_ids_are_stable_and_never_reused():
 
 
 def test_damaged_plan_files_are_rewritten(small_checkout):
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    small_checkout.plan()
     sound = {
         name: small_checkout.folder / f"build/toy/plan/{name}"
         for name in ("ids.json", "cache.json", "rules.mk")
@@ -68,7 +68,7 @@ def test_damaged_plan_files_are_rewritten(small_checkout):
     for broken in ("[]", '{"a": 1}', '{"a": {"mark": [], "value": {}}}'):
         for name in ("ids.json", "cache.json"):
             sound[name].write_text(broken)
-        assert small_checkout.python("pipeline.workflow.plan", "plan", "toy").stderr == ""
+        assert small_checkout.plan().stderr == ""
         assert {name: path.read_bytes() for name, path in sound.items()} == before
 
 
@@ -120,13 +120,12 @@ def test_turnarounds_that_name_no_animals_of_their_own_are_refused(names):
         assigned(["walkthrough.r3d", *names, "a.r3d"])
 
 
-TWO = {f"captures/toy/{name}.r3d": name for name in ("walkthrough", "turnaround_cat", "turnaround_dog", "a")}
+TWO = ("walkthrough.r3d", "turnaround_cat.r3d", "turnaround_dog.r3d", "a.r3d")
 
 
 @pytest.mark.slow
 def test_animals_of_a_home_share_the_scene_artifacts(small_checkout):
-    for name, text in TWO.items():
-        small_checkout.write(name, text)
+    small_checkout.record(*TWO)
     made = small_checkout.make("-j2", "toy.behavior_data")
     assert made.returncode == 0, made.stderr
     for shared in ("frames/v000", "flow/v001", "features/v002", "scene_localizer", "identities"):
@@ -138,8 +137,7 @@ def test_animals_of_a_home_share_the_scene_artifacts(small_checkout):
         assert not (folder / "frames").exists(), "shared"
     page = small_checkout.make("-j2", "toy.home_simulator")
     assert page.returncode == 0, page.stderr
-    planned = json.loads((small_checkout.folder / "build/toy/plan/dag.json").read_text())
-    job = next(job for job in planned if job["id"] == "home_simulator")
+    job = small_checkout.jobs()["home_simulator"]
     assert sorted(each["name"] for each in job["inputs"]) == sorted(
         f"{name}/{part}"
         for name in ("cat", "dog")
@@ -163,19 +161,19 @@ def test_animals_of_a_home_share_the_scene_artifacts(small_checkout):
         assert re.search(
             code, small_checkout.python("pipeline.workflow.plan", "inputs", home, *asked).stderr
         ), code
-    refused = small_checkout.python("pipeline.workflow.plan", "plan", "toy/variants/other")
+    refused = small_checkout.plan("toy/variants/other")
     assert refused.returncode == 2
     assert "REC-008" in refused.stderr
 
 
-RECORDED = {f"captures/toy/{name}.r3d": name for name in ("walkthrough", "turnaround", "a")}
+RECORDED = ("walkthrough.r3d", "turnaround.r3d", "a.r3d")
+FILES = {f"captures/toy/{name}": name for name in RECORDED}
 HOSTILE = ["$(shell touch hacked).r3d", "`touch hacked`.r3d", "a b'\"\n;c.r3d", "-rf.r3d", "%.r3d", "#.r3d"]
 
 
 @pytest.mark.slow
 def test_file_names_are_never_executed(small_checkout):
-    for name in ["walkthrough.r3d", "turnaround.r3d", *HOSTILE]:
-        small_checkout.write(f"captures/toy/{name}", name)
+    small_checkout.record("walkthrough.r3d", "turnaround.r3d", *HOSTILE)
     made = small_checkout.make("-j2", "toy.frames")
     assert made.returncode == 0, made.stderr
     assert not (small_checkout.folder / "hacked").exists()
@@ -187,7 +185,7 @@ def test_unknown_agents_are_refused_with_a_reason(small_checkout):
     small_checkout.write("captures/toy/scan/inner/rgb.mp4", "")
     small_checkout.write("captures/toy/scan/inner/odometry.csv", "")
     (small_checkout.folder / "captures/toy/monday.r3d").symlink_to("/nowhere")
-    output = small_checkout.python("pipeline.workflow.plan", "plan", "toy").stderr
+    output = small_checkout.plan().stderr
     assert "'monday.r3d' (a link that leads nowhere), 'scan' (move 'inner' out of it: that is one)" in output
 
 
@@ -209,10 +207,10 @@ def test_unknown_agents_are_refused_with_a_reason(small_checkout):
         (["plan", "toy"], {"agents/toy.toml": "[segment_agent\n"}, "REC-003"),
         (["plan", "toy"], {"agents/toy.toml": "[videos.'other.r3d']\nsplit = 'test'\n"}, "REC-001"),
         (["plan", "toy"], {"agents/toy.toml": "[flow]\nbegins_at = ['x']\n"}, "REC-002"),
-        (["plan", "toy"], {**RECORDED, "captures/toy/a.r3d.toml": f"offset_s = {'9' * 400}\n"}, "REC-002"),
-        (["plan", "toy"], {**RECORDED, "captures/toy/a.r3d.toml": "offset_s = nan\n"}, "CAP-041"),
-        (["plan", "toy"], {**RECORDED, f"captures/toy/{'a' * 249}.r3d": "x"}, "CAP-041"),
-        (["plan", "toy"], {**RECORDED, "captures/toy/b\udcff.r3d": "x"}, "CAP-041"),
+        (["plan", "toy"], {**FILES, "captures/toy/a.r3d.toml": f"offset_s = {'9' * 400}\n"}, "REC-002"),
+        (["plan", "toy"], {**FILES, "captures/toy/a.r3d.toml": "offset_s = nan\n"}, "CAP-041"),
+        (["plan", "toy"], {**FILES, f"captures/toy/{'a' * 249}.r3d": "x"}, "CAP-041"),
+        (["plan", "toy"], {**FILES, "captures/toy/b\udcff.r3d": "x"}, "CAP-041"),
         (["new", "clean", "test", "clean"], {}, "REC-004"),
         (["plan", "toy"], {"captures/toy/session.heic": "x"}, "CAP-003"),
         (["plan", "toy"], {"captures/toy/.walkthrough.r3d.icloud": "x"}, "CAP-003"),
@@ -232,38 +230,35 @@ def test_refusals_have_no_side_effects(small_checkout, arguments, files, code):
 
 
 def test_control_characters_in_names_are_escaped(small_checkout):
-    for name, text in RECORDED.items():
-        small_checkout.write(name, text)
+    small_checkout.record(*RECORDED)
     small_checkout.write("captures/toy/\x1b[2Jnot\na recording", "")
     small_checkout.write("captures/toy/heldout\x1b[2J\n.r3d", "x")
     for _ in range(2):  # planned first, then from the cache
-        output = small_checkout.python("pipeline.workflow.plan", "plan", "toy").stdout
+        output = small_checkout.plan().stdout
         assert "\x1b" not in output and len(output.splitlines()) == 2
 
 
 def test_circular_links_are_not_followed(small_checkout):
-    for name, text in RECORDED.items():
-        small_checkout.write(name, text)
+    small_checkout.record(*RECORDED)
     small_checkout.write("captures/toy/scan/rgb.mp4", "x")
     small_checkout.write("captures/toy/scan/odometry.csv", "x")
     for link, target in (("scan/a", "."), ("scan/b", "."), ("c.r3d", "c.r3d"), ("elsewhere", "/nowhere")):
         (small_checkout.folder / "captures/toy" / link).symlink_to(target)
     for _ in range(2):
-        completed = small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+        completed = small_checkout.plan()
         assert completed.returncode == 0, completed.stderr
         assert "'c.r3d' (a link that leads nowhere)" in completed.stdout
 
 
 def test_changes_behind_a_linked_recording_are_detected(small_checkout):
-    for name, text in RECORDED.items():
-        small_checkout.write(name, text)
+    small_checkout.record(*RECORDED)
     small_checkout.write("phone/scan/rgb.mp4", "x")
     small_checkout.write("phone/scan/odometry.csv", "x")
     (small_checkout.folder / "captures/toy/scan").symlink_to(small_checkout.folder / "phone/scan")
     hashes = set()
     for text in "xy":
         small_checkout.write("phone/scan/rgb.mp4", text)
-        assert small_checkout.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
+        assert small_checkout.plan().returncode == 0
         videos = json.loads((small_checkout.folder / "build/toy/plan/videos.json").read_text())
         hashes.add(next(video["sha256"] for video in videos if video["file"] == "scan"))
     assert len(hashes) == 2
@@ -272,7 +267,7 @@ def test_changes_behind_a_linked_recording_are_detected(small_checkout):
 def test_variant_shares_unaffected_artifacts(small_checkout):
     small_checkout.write("agents/variants/other.toml", "[train_behavior]\nseed = 3\n")
     for home, own in (("toy", "build/toy"), ("toy/variants/other", "build/toy/variants/other")):
-        small_checkout.python("pipeline.workflow.plan", "plan", home)
+        small_checkout.plan(home)
         completed = small_checkout.python(
             "pipeline.workflow.plan", "inputs", home, "simulator", "behavior_data", "frames"
         )
@@ -297,35 +292,31 @@ def key_files(small_checkout):
     return {path.name: path.read_text() for path in folder.iterdir()}
 
 
+def changed_keys(small_checkout, before):
+    """Plan again, and return the names of files in `keys` that are new or differ."""
+    assert small_checkout.plan().returncode == 0
+    return {name for name, text in key_files(small_checkout).items() if before.get(name) != text}
+
+
 def test_only_relevant_changes_change_a_key(small_checkout):
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    small_checkout.plan()
     before = key_files(small_checkout)
     front = small_checkout.folder / "stages/segment_agent/__main__.py"
     text = front.read_text()
     front.write_text(text.replace('"""Hash the inputs."""', '"""Other words."""  # and a comment\n'))
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
-    assert key_files(small_checkout) == before
+    assert changed_keys(small_checkout, before) == set()
     front.write_text(text.replace("* 64", "* 65"))
     small_checkout.write("stages/report/page.html", "<p>")
     small_checkout.write("agents/toy.toml", "[estimate_flow]\nseed = 2\n")
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
-    after = key_files(small_checkout)
-    assert {name for name in after if after[name] != before[name]} == {
-        "masks.json",
-        "report.json",
-        "flow.json",
-    }
+    assert changed_keys(small_checkout, before) == {"masks.json", "report.json", "flow.json"}
 
 
 def test_new_session_does_not_change_the_templates(small_checkout):
-    for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d", "b.r3d"):
-        small_checkout.write(f"captures/toy/{name}", name)
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    small_checkout.record("walkthrough.r3d", "turnaround.r3d", "a.r3d", "b.r3d")
+    small_checkout.plan()
     before = key_files(small_checkout)
     small_checkout.write("captures/toy/c.r3d", "c")
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
-    after = key_files(small_checkout)
-    changed = {name for name in before if after[name] != before[name]}
+    changed = changed_keys(small_checkout, before)
     assert changed >= {"registration.json", "reconstruction.json", "behavior_data.json"}
     assert not changed & {
         "scene_template.json",
@@ -337,25 +328,19 @@ def test_new_session_does_not_change_the_templates(small_checkout):
 
 
 def test_changed_recording_with_the_same_size_and_time_is_detected(small_checkout):
-    for name, text in RECORDED.items():
-        small_checkout.write(name, text)
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    small_checkout.record(*RECORDED)
+    small_checkout.plan()
     before, path = key_files(small_checkout), small_checkout.folder / "captures/toy/a.r3d"
     age = path.stat()
-    path.write_text("b")
+    path.write_text("b.r3d")
     os.utime(path, ns=(age.st_atime_ns, age.st_mtime_ns))
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
-    after = key_files(small_checkout)
-    assert {name for name in after if before.get(name) != after[name]} == {"video.v002.json"}
+    assert changed_keys(small_checkout, before) == {"video.v002.json"}
 
 
 def test_walkthrough_without_depth_is_scaled_by_training_sessions(small_checkout):
-    for name in ("walkthrough.mp4", "turnaround.r3d", "a.r3d", "b.mp4", "c.r3d"):
-        small_checkout.write(f"captures/toy/{name}", name)
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
-    jobs = {
-        job["id"]: job for job in json.loads((small_checkout.folder / "build/toy/plan/dag.json").read_text())
-    }
+    small_checkout.record("walkthrough.mp4", "turnaround.r3d", "a.r3d", "b.mp4", "c.r3d")
+    small_checkout.plan()
+    jobs = small_checkout.jobs()
     walk = jobs["frames.v000"]
     assert walk["arguments"][walk["arguments"].index("--captures") + 1] == "captures/toy"
     assert [key.rpartition("/")[2] for key in walk["keys"]] == [
@@ -367,33 +352,26 @@ def test_walkthrough_without_depth_is_scaled_by_training_sessions(small_checkout
 
 
 def test_clicks_are_an_input_of_reconstruction_metrics_only(small_checkout):
-    for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d"):
-        small_checkout.write(f"captures/toy/{name}", name)
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    small_checkout.record(*RECORDED)
+    small_checkout.plan()
     before = key_files(small_checkout)
     small_checkout.write("captures/toy/clicks.json", "not even JSON")
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
-    after = key_files(small_checkout)
-    assert {name for name in after if before.get(name) != after[name]} == {"extra.clicks.json"}
-    jobs = json.loads((small_checkout.folder / "build/toy/plan/dag.json").read_text())
-    readers = [job["id"] for job in jobs if "--clicks" in job["arguments"]]
-    assert readers == ["reconstruction_metrics"]
-    assert all("extra.clicks.json" in str(job["keys"]) for job in jobs if job["id"] in readers)
+    assert changed_keys(small_checkout, before) == {"extra.clicks.json"}
+    jobs = small_checkout.jobs()
+    assert [id for id, job in jobs.items() if "--clicks" in job["arguments"]] == ["reconstruction_metrics"]
+    assert "extra.clicks.json" in str(jobs["reconstruction_metrics"]["keys"])
 
 
 def test_earlier_reconstruction_is_an_input_except_for_variants(small_checkout):
-    for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d"):
-        small_checkout.write(f"captures/toy/{name}", name)
+    small_checkout.record(*RECORDED)
     small_checkout.write("captures/toy/former/motion.npz", "unfinished")
-    assert small_checkout.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
+    assert small_checkout.plan().returncode == 0
     before = key_files(small_checkout)
     assert not any("former" in name for name in before), "no artifact"
     small_checkout.write("captures/toy/former/manifest.json", "{}")
     small_checkout.write("agents/variants/longer.toml", "[reconstruct]\nseed = 7\n")
-    for home in ("toy", "toy/variants/longer"):
-        assert small_checkout.python("pipeline.workflow.plan", "plan", home).returncode == 0
-    after = key_files(small_checkout)
-    assert {name for name in after if before.get(name) != after[name]} == {"extra.former"}
+    assert small_checkout.plan("toy/variants/longer").returncode == 0
+    assert changed_keys(small_checkout, before) == {"extra.former"}
     plans = [
         small_checkout.folder / "build/toy" / inside / "plan/dag.json" for inside in (".", "variants/longer")
     ]
@@ -405,17 +383,14 @@ def test_earlier_reconstruction_is_an_input_except_for_variants(small_checkout):
 
 
 def test_further_homes_are_inputs_of_the_behavior_model_only(small_checkout):
-    for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d"):
-        small_checkout.write(f"captures/toy/{name}", name)
+    small_checkout.record(*RECORDED)
     small_checkout.write("agents/toy.toml", '[train_behavior]\nhomes = ["summer"]\n')
-    missing = small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    missing = small_checkout.plan()
     assert missing.returncode == 2 and "ART-003" in missing.stderr and "make summer" in missing.stderr
     for artifact in ("behavior_data", "feature_basis", "scene_template"):
         small_checkout.write(f"build/summer/{artifact}/world.json", "{}")
-    assert small_checkout.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
-    jobs = {
-        job["id"]: job for job in json.loads((small_checkout.folder / "build/toy/plan/dag.json").read_text())
-    }
+    assert small_checkout.plan().returncode == 0
+    jobs = small_checkout.jobs()
     readers = {id for id, job in jobs.items() if any("summer" in each["path"] for each in job["inputs"])}
     assert readers == {"behavior"}
     assert [each["path"] for each in jobs["behavior"]["inputs"]] == [
@@ -433,7 +408,7 @@ def test_further_homes_are_inputs_of_the_behavior_model_only(small_checkout):
 @pytest.mark.parametrize("name", ["toy", "../cat", "pair/animals/dog"])
 def test_home_that_is_no_other_build_is_refused(small_checkout, name):
     small_checkout.write("agents/toy.toml", f'[train_behavior]\nhomes = ["{name}"]\n')
-    refused = small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    refused = small_checkout.plan()
     assert refused.returncode == 2 and "REC-002" in refused.stderr and name in refused.stderr
 
 
@@ -445,16 +420,12 @@ def test_home_that_is_no_other_build_is_refused(small_checkout, name):
     ],
 )
 def test_sidecar_is_an_input_of_one_job_of_its_recording_only(small_checkout, kind, job, text):
-    for name in ("walkthrough.r3d", "turnaround.r3d", "a.r3d", "b.r3d"):
-        small_checkout.write(f"captures/toy/{name}", name)
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    small_checkout.record("walkthrough.r3d", "turnaround.r3d", "a.r3d", "b.r3d")
+    small_checkout.plan()
     before = key_files(small_checkout)
     small_checkout.write(f"captures/toy/b.r3d.{kind}.toml", text)
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
-    after = key_files(small_checkout)
-    assert {name for name in after if before.get(name) != after[name]} == {f"{kind}.v003.json"}
-    jobs = json.loads((small_checkout.folder / "build/toy/plan/dag.json").read_text())
-    given = {each["id"]: each for each in jobs if f"--{kind}" in each["arguments"]}
+    assert changed_keys(small_checkout, before) == {f"{kind}.v003.json"}
+    given = {id: each for id, each in small_checkout.jobs().items() if f"--{kind}" in each["arguments"]}
     assert list(given) == [job], "b.r3d"
     assert f"captures/toy/b.r3d.{kind}.toml" in given[job]["arguments"]
     assert any(key.endswith(f"keys/{kind}.v003.json") for key in given[job]["keys"])
@@ -472,12 +443,9 @@ def test_names_passed_to_make_are_never_executed(small_checkout, variable, value
 
 
 def test_session_without_depth_is_read_with_estimated_depth(small_checkout):
-    for name in ("walkthrough.r3d", "turnaround.mp4", "a.mp4", "b.r3d"):
-        small_checkout.write(f"captures/toy/{name}", name)
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
-    jobs = {
-        job["id"]: job for job in json.loads((small_checkout.folder / "build/toy/plan/dag.json").read_text())
-    }
+    small_checkout.record("walkthrough.r3d", "turnaround.mp4", "a.mp4", "b.r3d")
+    small_checkout.plan()
+    jobs = small_checkout.jobs()
     made = {name for name in jobs if name.split(".")[0] in ("frames", "pictures", "estimated_frames")}
     assert made == {
         "frames.v000", "frames.v003", "pictures.v001", "pictures.v002",
@@ -499,9 +467,8 @@ def test_session_without_depth_is_read_with_estimated_depth(small_checkout):
 
 
 def test_sessions_without_depth_of_several_animals_do_not_wait_for_masks(small_checkout):
-    for name in ("walkthrough.r3d", "turnaround_a.mp4", "turnaround_b.mp4", "s.mp4", "t.mp4"):
-        small_checkout.write(f"captures/toy/{name}", name)
-    assert small_checkout.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
+    small_checkout.record("walkthrough.r3d", "turnaround_a.mp4", "turnaround_b.mp4", "s.mp4", "t.mp4")
+    assert small_checkout.plan().returncode == 0
     jobs = json.loads((small_checkout.folder / "build/toy/plan/dag.json").read_text())
     read = {job["id"]: {each["name"] for each in job["inputs"]} for job in jobs if job["home"] == "toy"}
     sessions = [names for job, names in read.items() if job.startswith("estimated_frames.")]
@@ -511,7 +478,7 @@ def test_sessions_without_depth_of_several_animals_do_not_wait_for_masks(small_c
 def test_make_starts_what_templates_need_first_and_long_recordings_before_short_ones(small_checkout):
     for name, size in {"walkthrough": 1, "turnaround": 1, "a": 10, "b": 30, "c": 20}.items():
         small_checkout.write(f"captures/toy/{name}.r3d", "x" * size)
-    assert small_checkout.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
+    assert small_checkout.plan().returncode == 0
     rules = (small_checkout.folder / "build/toy/plan/rules.mk").read_text()
     listed = re.search(r"^toy: (.*)$", rules, re.MULTILINE)[1].replace("/.ok", "").split()
     order = [path.removeprefix("build/toy/") for path in listed]

@@ -93,7 +93,7 @@ def test_motion_tables_need_no_recordings(tmp_path):
     small_checkout.write("agents/dog.toml", '[flow]\nbegins_at = "trajectories"\n')
     for name in ("a.csv", "b.npz", "ignored.txt"):
         small_checkout.write(f"captures/dog/{name}", name)
-    completed = small_checkout.python("pipeline.workflow.plan", "plan", "dog")
+    completed = small_checkout.plan("dog")
     assert completed.returncode == 0, completed.stderr
     assert "'ignored.txt'" in completed.stdout
     jobs = json.loads((tmp_path / "build/dog/plan/dag.json").read_text())

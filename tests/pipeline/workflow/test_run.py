@@ -52,6 +52,22 @@ def leftovers(small_checkout):
     return [p for pattern in (".*.tmp*", ".*.old*") for p in (small_checkout.folder / "build").rglob(pattern)]
 
 
+def begun(small_checkout, job):
+    """Run a job, and return its process once its stage writes."""
+    command = [sys.executable, "-SE", "-m", "pipeline.workflow.run", "toy", job]
+    running = subprocess.Popen(command, cwd=small_checkout.folder, stderr=subprocess.PIPE, text=True)
+    while not leftovers(small_checkout) and running.poll() is None:
+        time.sleep(0.02)
+    return running
+
+
+def building(small_checkout):
+    """Start `make` in a process group of its own."""
+    command = ["make", f"PYTHON={sys.executable}", "-j2", "toy"]
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    return subprocess.Popen(command, cwd=small_checkout.folder, start_new_session=True, **silent)
+
+
 @pytest.mark.slow
 def test_second_build_runs_no_job(small_checkout):
     assert started_jobs(small_checkout.make("toy")) == set()
@@ -93,13 +109,10 @@ def test_changes_are_detected_when_the_clock_is_set_back(small_checkout):
 
 def test_key_that_changes_during_its_job_is_not_stamped(small_checkout):
     small_checkout.write("agents/toy.toml", "[train_behavior]\npause_s = 1.0\n")
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
-    command = [sys.executable, "-SE", "-m", "pipeline.workflow.run", "toy", "behavior"]
-    running = subprocess.Popen(command, cwd=small_checkout.folder, stderr=subprocess.PIPE, text=True)
-    while not leftovers(small_checkout) and running.poll() is None:
-        time.sleep(0.02)
+    small_checkout.plan()
+    running = begun(small_checkout, "behavior")
     small_checkout.write("agents/toy.toml", "[train_behavior]\nseed = 5\n")
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    small_checkout.plan()
     assert running.communicate(timeout=60)[1].count("] begins (") == 2
     assert running.returncode == 0
     assert started_jobs(small_checkout.make("toy")) == {"simulator", "evaluation", "report"}
@@ -158,7 +171,7 @@ def test_variant_shares_unaffected_artifacts(small_checkout):
 def test_failing_stage_keeps_the_old_artifact_and_its_exit_code(small_checkout):
     before = contents(small_checkout)
     small_checkout.write("agents/toy.toml", "[train_behavior]\nfail = true\n")
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    small_checkout.plan()
     failed = small_checkout.python("pipeline.workflow.run", "toy", "behavior")
     assert failed.returncode == 2
     assert "TST-001" in failed.stderr
@@ -222,13 +235,7 @@ def test_removed_recording_reruns_the_merge(tmp_path):
 def test_concurrent_builds_are_correct(small_checkout):
     reference = contents(small_checkout)
     shutil.rmtree(small_checkout.folder / "build")
-    command = ["make", f"PYTHON={sys.executable}", "-j2", "toy"]
-    both = [
-        subprocess.Popen(
-            command, cwd=small_checkout.folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        for _ in range(2)
-    ]
+    both = [building(small_checkout) for _ in range(2)]
     assert [each.wait() for each in both] == [0, 0]
     assert contents(small_checkout) == reference
 
@@ -241,14 +248,7 @@ def test_builds_recover_from_kills(small_checkout, victim):
     choice = random.Random(victim)
     shutil.rmtree(small_checkout.folder / "build")
     for complete in sorted(choice.sample(range(len(reference) - 5), 2)):
-        command = ["make", f"PYTHON={sys.executable}", "-j2", "toy"]
-        build = subprocess.Popen(
-            command,
-            cwd=small_checkout.folder,
-            start_new_session=True,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+        build = building(small_checkout)
         while (
             build.poll() is None
             and sum(artifact.MANIFEST in files for *_, files in os.walk(small_checkout.folder / "build"))
@@ -272,19 +272,15 @@ def test_builds_recover_from_kills(small_checkout, victim):
 
 def test_terminated_job_ends_its_stage(small_checkout):
     small_checkout.write("agents/toy.toml", "[synthesize_capture]\npause_s = 60.0\n")
-    assert small_checkout.python("pipeline.workflow.plan", "plan", "toy").returncode == 0
-    command = [sys.executable, "-SE", "-m", "pipeline.workflow.run", "toy", "synthetic_capture"]
-    running = subprocess.Popen(command, cwd=small_checkout.folder, stderr=subprocess.PIPE, text=True)
-    while not leftovers(small_checkout) and running.poll() is None:
-        time.sleep(0.02)
+    assert small_checkout.plan().returncode == 0
+    running = begun(small_checkout, "synthetic_capture")
     running.send_signal(signal.SIGTERM)
     completed = running.communicate(timeout=run.GRACE_S - 5)[1]
     assert (running.returncode, completed.count("run the same again to go on")) == (128 + signal.SIGTERM, 1)
 
 
 def test_snakemake_accepts_results_of_make(small_checkout):
-    command = [sys.executable, "-m", "snakemake", "--cores", "2", "--config", "agent=toy"]
-    completed = subprocess.run(command, cwd=small_checkout.folder, capture_output=True, text=True)
+    completed = small_checkout.snakemake("--cores", "2", "--config", "agent=toy")
     assert completed.returncode == 0, completed.stderr
     assert "Nothing to be done" in completed.stdout + completed.stderr
 
@@ -293,8 +289,7 @@ def test_snakemake_accepts_results_of_make(small_checkout):
 def test_snakemake_and_make_give_the_same_artifacts(small_checkout):
     reference = contents(small_checkout)
     shutil.rmtree(small_checkout.folder / "build")
-    command = [sys.executable, "-m", "snakemake", "--cores", "2", "--config", "agent=toy"]
-    completed = subprocess.run(command, cwd=small_checkout.folder, capture_output=True, text=True)
+    completed = small_checkout.snakemake("--cores", "2", "--config", "agent=toy")
     assert completed.returncode == 0, completed.stderr
     assert contents(small_checkout) == reference
     assert started_jobs(small_checkout.make("toy")) == set()
@@ -302,7 +297,7 @@ def test_snakemake_and_make_give_the_same_artifacts(small_checkout):
 
 def test_deterministic_failures_are_not_retried(small_checkout):
     small_checkout.write("agents/toy.toml", "[train_behavior]\nfail = true\n")
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    small_checkout.plan()
     again = ("pipeline.workflow.run", "--attempt", "2", "toy", "behavior")
     assert "TST-001" in small_checkout.python(*again).stderr  # no record of an earlier attempt
     refused = small_checkout.python(*again)
@@ -312,10 +307,10 @@ def test_deterministic_failures_are_not_retried(small_checkout):
         "TST-001" in small_checkout.python("pipeline.workflow.run", "toy", "behavior").stderr
     )  # the user retries
     small_checkout.write("agents/toy.toml", "")
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    small_checkout.plan()
     assert small_checkout.python(*again).returncode == 0
     small_checkout.write("agents/toy.toml", "[train_behavior]\nfail = true\n")
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    small_checkout.plan()
     assert "TST-001" in small_checkout.python(*again).stderr, (
         "what failed before was forgotten by the success"
     )
@@ -367,7 +362,7 @@ def test_processes_of_one_and_two_machines_connect(small_checkout, monkeypatch, 
     front = small_checkout.folder / "stages/reconstruct/__main__.py"
     head, _, _ = front.read_text().partition("def run(")
     front.write_text(head + PROCESSES_MEET)
-    small_checkout.python("pipeline.workflow.plan", "plan", "toy")
+    small_checkout.plan()
     options = ["--processes", "2"]
     if machines == 2:  # the launcher starts torchrun twice on this machine, as srun does on two
         small_checkout.write(

@@ -8,9 +8,7 @@ import os
 import shutil
 import socket
 import subprocess
-import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -102,27 +100,10 @@ def _wait(ready) -> None:
 @pytest.mark.skipif(not FOUND, reason="needs root, Slurm, munge and Snakemake's plugin for Slurm")
 def test_flow_runs_on_slurm(slurm, tmp_path):
     small_checkout = checkout.create(tmp_path / "checkout")
-    command = [
-        sys.executable,
-        "-m",
-        "snakemake",
-        "--workflow-profile",
-        "profiles/slurm",
-        "--config",
-        "agent=toy",
-    ]
-    options = [
-        "--slurm-status-command",
-        "squeue",
-        "--retries",
-        "0",
-        "--slurm-init-seconds-before-status-checks",
-        "2",
-    ]
-    target = Path("build/toy/frames/v001/.ok")
-    made = subprocess.run(
-        [*command, *options, "--", str(target)], cwd=small_checkout.folder, capture_output=True, text=True
-    )
+    options = "--workflow-profile profiles/slurm --config agent=toy --slurm-status-command squeue --retries 0"
+    target = "build/toy/frames/v001/.ok"
+    checks = ("--slurm-init-seconds-before-status-checks", "2")
+    made = small_checkout.snakemake(*options.split(), *checks, "--", target)
     assert made.returncode == 0, made.stderr
     assert (small_checkout.folder / target).is_file()
     assert made.stderr.count("has been submitted with SLURM jobid") == 2, (
