@@ -6,7 +6,6 @@ place of the model, at the same moments in the same homes, so that a policy that
 the animal. The true cat flees by its rule (`stages.synthesize_capture.policy`).
 """
 
-import shutil
 from collections import deque
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,18 +14,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from benchmarks.behavior_builds import SESSION_S, TAKES, slice_sessions, train_model
 from pipeline.behavior.avoidance import clearance_of
 from pipeline.behavior.trajectories import RATE_HZ, BehaviorData, Context
-from pipeline.core.progress import log
-from pipeline.core.videos import Video
-from pipeline.data import npz
 from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.residents import Resident
 from pipeline.environments.world import AnimalWorld
 from pipeline.geometry import rigid
 from stages.read_trajectories.motion import CLIP_GAP_S, MeasuredMotion
-from stages.slice_behavior import stage as slicing
-from stages.slice_behavior.config import Config as SlicingConfig
 from stages.synthesize_capture import camera_motion, dwellings, gait, session
 from stages.synthesize_capture.camera_motion import ARM_M
 from stages.synthesize_capture.lives.lives import rest
@@ -35,7 +30,6 @@ from stages.synthesize_capture.observer import AT_HOME
 from stages.synthesize_capture.policy import DELAY_S, STEP_S, Policy, SeenWalker
 from stages.synthesize_capture.room import Place, Room
 from stages.synthesize_capture.voxels import volume_of
-from stages.train_behavior import stage as training
 from stages.train_behavior.config import (
     AugmentationConfig,
     BehaviorOptimizerConfig,
@@ -46,10 +40,6 @@ from stages.train_behavior.config import Config as TrainingConfig
 
 HOMES, TEST_HOMES, TEST_SESSIONS = 24, 3, 4
 """Homes to learn from, a session each, further homes for testing, and sessions in each of these."""
-TAKES, SESSION_S = 5, 150.0
-"""Takes of a session, each from a random start, and its duration: as in `stages.synthesize_capture.lives`."""
-WINDOW_STRIDE = 5
-"""Frames between windows: adjacent ones are nearly identical."""
 WALKS_UP = replace(AT_HOME, approach_m_s=(0.15, 1.3), approach_s=(4.0, 10.0))
 """A person who walks up to the cat at all speeds, slow ones for longer; `AT_HOME` knows none below 0.8 m/s."""
 MODEL = TrainingConfig(
@@ -103,23 +93,12 @@ def simulated_build(out: Path) -> None:
     """Simulate sessions, slice them into windows and train the model, unless ``out`` has it."""
     if (out / "behavior" / "behavior.json").is_file():
         return
-    videos, tables = [], {}
-    for name, (number, session_number) in session_names().items():
-        tables[name] = out / "lives" / name
-        shutil.rmtree(tables[name], ignore_errors=True)
-        tables[name].mkdir(parents=True)
-        motion = simulated_session(*home_of(number, session_number))
-        npz.save(tables[name] / "motion.npz", compress=False, **motion.arrays())
-        npz.save(tables[name] / "skin.npz", agent_from_bone_rest=motion.agent_from_bone_rest)
-        npz.save(tables[name] / "feature_volume.npz", **vars(motion.volume))
-        videos.append(Video(name, f"{name}.npz", "session", "train" if number < HOMES else "test", None))
-    log(f"{len(videos)} sessions of {SESSION_S:g} s in {HOMES + TEST_HOMES} homes")
-    for part in ("behavior_data", "behavior"):
-        shutil.rmtree(out / part, ignore_errors=True)
-        (out / part).mkdir()
-    windows = SlicingConfig(stride=WINDOW_STRIDE)
-    slicing.run(slicing.Inputs(trajectories=tables), windows, out / "behavior_data", videos=tuple(videos))
-    training.run(training.Inputs(out / "behavior_data"), MODEL, out / "behavior")
+    sessions = (
+        (name, "train" if number < HOMES else "test", simulated_session(*home_of(number, session_number)))
+        for name, (number, session_number) in session_names().items()
+    )
+    slice_sessions(sessions, out)
+    train_model(out, MODEL, "behavior")
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ the recorded animal fled from a nearby person, and how often sampled plans from 
 `rl`; one thread.
 """
 
-import argparse
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -26,6 +25,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
+from benchmarks import command_lines
 from benchmarks.approach_animal import TrueWorld, simulated_build
 from pipeline.behavior.trajectories import RATE_HZ, TEST, TRAIN
 from pipeline.core.progress import log
@@ -261,9 +261,7 @@ def picture(world: AnimalWorld, curves: list[OutcomeRecorder], runs: dict[str, E
 
 def main() -> None:
     """Train, compare and print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_lines.described(__doc__)
     parser.add_argument("build", type=Path)
     parser.add_argument(
         "--simulate", action="store_true", help="make the build first; also meet the true cat"

@@ -6,7 +6,6 @@ Prints one line per count; `--list` prints the locations behind one of them. `te
 limits.
 """
 
-import argparse
 import ast
 import dataclasses
 import importlib
@@ -18,6 +17,8 @@ from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+
+from benchmarks import command_lines
 
 ROOT = Path(__file__).parent.parent
 MAX_COLUMNS = 110
@@ -266,9 +267,7 @@ COUNTS = {
 
 def main() -> None:
     """Print the counts, or the locations behind one of them."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_lines.described(__doc__)
     parser.add_argument("--list", choices=COUNTS, help="print the locations behind this count")
     arguments = parser.parse_args()
     if arguments.list:

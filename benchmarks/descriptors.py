@@ -8,7 +8,6 @@ of a cell follows from depth and poses; it is found if the nearest neighbor amon
 within one cell of it. Each descriptor is evaluated raw and reduced to the 16 channels that all stages use.
 """
 
-import argparse
 import json
 import time
 from collections.abc import Callable, Iterator
@@ -21,6 +20,7 @@ import scipy.ndimage
 import torch
 from jaxtyping import Float, UInt8
 
+from benchmarks import command_lines
 from pipeline.backends import daisy
 from pipeline.data import npz
 from pipeline.data.clips import Clip
@@ -237,9 +237,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 def main() -> None:
     """Print one line per descriptor and set."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_lines.described(__doc__)
     parser.add_argument("build", type=Path, help="a build with a finished registration")
     parser.add_argument("--rgbd", type=Path, help="a folder of frames in the 7-Scenes format")
     parser.add_argument("--pairs", type=int, default=24, help="pairs of views per set")

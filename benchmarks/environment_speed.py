@@ -6,7 +6,6 @@ Persons walk at random. Both are measured in one run with the few-step sampler; 
 the default sampler. Plans per step show how long plans are followed.
 """
 
-import argparse
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks import command_lines
 from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
 from pipeline.behavior.simulator import Simulator
 from pipeline.environments.config import EnvironmentConfig
@@ -63,9 +63,7 @@ def sequential_speed(
 
 def main() -> None:
     """Print the speeds."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_lines.described(__doc__)
     parser.add_argument("build", type=Path)
     parser.add_argument("--count", type=int, default=32)
     parser.add_argument("--steps", type=int, default=100)

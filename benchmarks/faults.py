@@ -7,7 +7,6 @@ times in `build/` are shifted) with a changed recipe. After each fault every com
 bit with that of a reference build without faults; at the end the build is finished and compared as a whole.
 """
 
-import argparse
 import contextlib
 import os
 import random
@@ -22,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks import command_lines
 from benchmarks.workflow_scale import ROOT
 from pipeline.workflow import artifact
 
@@ -296,9 +296,7 @@ def temporary_file_system() -> Iterator[Path]:
 
 def main() -> None:
     """Inject faults and print the results."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_lines.described(__doc__)
     counts = {"kills": 200, "training_kills": 50, "full_disks": 50, "stops": 20, "clock_steps": 20}
     for name, default in counts.items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=int, default=default)

@@ -8,7 +8,6 @@ process; rendering and describing views is reported separately, since every kind
 registration.
 """
 
-import argparse
 import json
 import time
 from collections.abc import Callable, Iterator
@@ -21,6 +20,8 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from benchmarks import command_lines
+from benchmarks.command_lines import recordings
 from pipeline.backends.descriptors import Describer
 from pipeline.data import npz, ply
 from pipeline.data.clips import Clip, Masks
@@ -112,7 +113,7 @@ def _summary(rotation, translation):
 def rows(build: Path, queries: int, per_session: int, settings: tuple[Setting, ...]) -> Iterator[str]:
     """Train and localize; yield the lines of a Markdown table as they are measured."""
     template = build / "scene_template"
-    clip = Clip.open(build / "frames" / _walkthrough(build))
+    clip = Clip.open(build / "frames" / recordings(build, "walkthrough")[0])
     walk = SceneCameras.open(template).world_from_camera
     floor_m = json.loads((template / "world.json").read_text())["floor"]
     scene = SceneConfig(views=max(setting.views for setting in settings), held_out=40)
@@ -147,11 +148,6 @@ def rows(build: Path, queries: int, per_session: int, settings: tuple[Setting, .
         yield f"| {setting.kind} | {setting.views} | {setting.steps or ''} | {training_s:.0f} | {per_query:.3f} | {error_cells} |"
 
 
-def _walkthrough(build: Path) -> str:
-    videos = json.loads((build / "plan" / "videos.json").read_text())
-    return next(video["id"] for video in videos if video["role"] == "walkthrough")
-
-
 def timed(work: Callable):
     """Return the result of a call and its CPU seconds."""
     start = time.process_time()
@@ -160,11 +156,7 @@ def timed(work: Callable):
 
 def main() -> None:
     """Print the table of one agent's build."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("agent", help="agent of the build, for example cat")
-    parser.add_argument("--build", type=Path, default=Path("build"), help="folder of builds")
+    parser = command_lines.for_agent(__doc__)
     parser.add_argument("--queries", type=int, default=60, help="number of localized renders")
     parser.add_argument("--frames", type=int, default=12, help="localized frames per session")
     parser.add_argument(
@@ -185,7 +177,7 @@ def main() -> None:
         for setting in SETTINGS
         if setting.steps <= arguments.max_steps and setting.kind in arguments.kinds
     )
-    for line in rows(arguments.build / arguments.agent, arguments.queries, arguments.frames, settings):
+    for line in rows(command_lines.build_of(arguments), arguments.queries, arguments.frames, settings):
         print(line, flush=True)
 
 

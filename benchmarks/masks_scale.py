@@ -6,9 +6,6 @@ The frames of one session are repeated, alternately forward and backward, up to 
 own process; CPU seconds and peak memory are those of that process.
 """
 
-import argparse
-import json
-import multiprocessing
 import resource
 import time
 from pathlib import Path
@@ -17,6 +14,7 @@ import cv2
 import numpy as np
 import torch
 
+from benchmarks import command_lines
 from benchmarks.registration_scale import RepeatedClip, repeat_frames
 from pipeline.data.clips import Clip
 from stages.segment_agent.config import Config
@@ -43,20 +41,14 @@ def measure(build: Path, video: str, frames: int) -> tuple[float, float, float]:
 
 def main() -> None:
     """Print the table for one session of a build."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("agent", help="agent of the build, for example cat")
-    parser.add_argument("--build", type=Path, default=Path("build"), help="folder of builds")
+    parser = command_lines.for_agent(__doc__)
     parser.add_argument("--frames", type=int, nargs="+", default=[200, 800, 3200], help="lengths to measure")
     arguments = parser.parse_args()
-    build = arguments.build / arguments.agent
-    videos = json.loads((build / "plan" / "videos.json").read_text())
-    video = next(video["id"] for video in videos if video["role"] == "session")
+    build = command_lines.build_of(arguments)
+    video = command_lines.recordings(build, "session")[0]
     print("| frames | s | s / frame | peak MB | animal seen |\n|---|---|---|---|---|", flush=True)
     for frames in arguments.frames:
-        with multiprocessing.get_context("spawn").Pool(1) as pool:
-            seconds, peak_mb, seen = pool.apply(measure, (build, video, frames))
+        seconds, peak_mb, seen = command_lines.in_own_process(measure, build, video, frames)
         print(
             f"| {frames} | {seconds:.0f} | {seconds / frames:.3f} | {peak_mb:.0f} | {seen:.2f} |", flush=True
         )

@@ -6,7 +6,6 @@ furniture, a noisier depth sensor.
 Writes `recordings/session-<seed>.r3d` and `truth/session-<seed>.npz`, in the format that `benchmarks.semi_real` scores.
 """
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from benchmarks import command_lines
 from pipeline.core.progress import log
 from pipeline.data import npz
 from stages.synthesize_capture import animal, dwellings, record3d, script, sheets, texture
@@ -113,9 +113,7 @@ def render_session(out: Path, seed: int, seconds: float) -> None:
 
 def main() -> None:
     """Parse the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_lines.described(__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--seeds", type=int, nargs="+", default=[5])
     parser.add_argument("--seconds", type=float, default=14.0)

@@ -9,21 +9,19 @@ Chromium and samples one goal per plan there and in Python. Needs Chromium, and 
 `behavior_data`.
 """
 
-import argparse
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from benchmarks import command_lines
 from pipeline.behavior.trajectories import BehaviorData
 from tests.stages.export_simulator import browser, twins
 
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_lines.described(__doc__)
     parser.add_argument(
         "build",
         type=Path,

@@ -7,7 +7,6 @@ first animal is the first frame that shows it; times are relative to the start o
 several loads, each in a new browser. Needs Chromium, and a finished `simulator` or `home_simulator`.
 """
 
-import argparse
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from playwright.sync_api import Page
 
+from benchmarks import command_lines
 from tests.stages.export_simulator import browser
 
 TARGETS = {
@@ -39,9 +39,7 @@ class PageLoad:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_lines.described(__doc__)
     parser.add_argument(
         "build",
         type=Path,

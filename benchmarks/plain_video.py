@@ -9,7 +9,6 @@ are copied. Build it like any capture, then evaluate it against the ground truth
     python -m stages.evaluate.reconstruction_metrics --truth build/toy/synthetic_capture/truth ...
 """
 
-import argparse
 import shutil
 from fractions import Fraction
 from pathlib import Path
@@ -18,6 +17,7 @@ import av
 import cv2
 import numpy as np
 
+from benchmarks import command_lines
 from pipeline.core.progress import log, track
 from pipeline.data import images
 from pipeline.recordings.formats import open_recording
@@ -52,9 +52,7 @@ def write_plain_video(recording: Path, movie: Path) -> None:
 
 def main() -> None:
     """Parse the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_lines.described(__doc__)
     parser.add_argument("capture", type=Path, help="a finished `synthetic_capture` artifact")
     parser.add_argument("out", type=Path, help="folder of recordings to create")
     arguments = parser.parse_args()

@@ -8,16 +8,15 @@ and thumbnails are memory-mapped; ``memory_mb`` is the growth of anonymous memor
 until the steps are done: poses, bones and their optimizer state per frame.
 """
 
-import argparse
 import dataclasses
-import json
-import multiprocessing
 import time
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from benchmarks import command_lines
+from benchmarks.command_lines import recordings
 from stages.reconstruct import assemble, fuse, optimize, reading
 from stages.reconstruct.config import (
     FieldSizes,
@@ -36,13 +35,8 @@ KINDS = ("frames", "masks", "flow", "features")
 
 def load_problem(build: Path, sessions: int) -> Problem:
     """Return the optimization problem of the first ``sessions`` sessions."""
-    videos = json.loads((build / "plan" / "videos.json").read_text())
-    ids_by_role = {
-        role: [video["id"] for video in videos if video["role"] == role]
-        for role in ("walkthrough", "turnaround", "session")
-    }
-    walkthrough, turnaround = ids_by_role["walkthrough"][0], ids_by_role["turnaround"][0]
-    ids = [walkthrough, turnaround, *ids_by_role["session"][:sessions]]
+    walkthrough, turnaround = (recordings(build, role)[0] for role in ("walkthrough", "turnaround"))
+    ids = [walkthrough, turnaround, *recordings(build, "session")[:sessions]]
     found = {kind: {id: build / kind / id for id in ids if (build / kind / id).exists()} for kind in KINDS}
     folders = reading.Inputs(
         **found, **{name: build / name for name in ("registration", "scene_template", "agent_template")}
@@ -98,16 +92,13 @@ def measure(build: Path, sessions: int, steps: int) -> dict[str, float]:
 
 def main() -> None:
     """Measure and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_lines.described(__doc__)
     parser.add_argument("agent")
     parser.add_argument("--sessions", type=int, nargs="+", default=[1, 2, 4])
     parser.add_argument("--steps", type=int, default=20)
     arguments = parser.parse_args()
     for sessions in arguments.sessions:
-        with multiprocessing.get_context("spawn").Pool(1) as pool:
-            row = pool.apply(measure, (Path("build", arguments.agent), sessions, arguments.steps))
+        row = command_lines.in_own_process(measure, Path("build", arguments.agent), sessions, arguments.steps)
         print("  ".join(f"{name} {value:.4g}" for name, value in row.items()), flush=True)
 
 

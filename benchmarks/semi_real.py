@@ -29,7 +29,6 @@ With `--structure` cameras are also compared with structure from motion on the c
 calibration of their confidence is then measured against that, else against the poses of the sequence.
 """
 
-import argparse
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +38,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 
-from benchmarks import structure
+from benchmarks import command_lines, structure
 from benchmarks.composited import Actor, Compositor, Sequence, course, measure_noise, resampled, surfaces
 from pipeline.core.errors import InputError, exit_code
 from pipeline.core.progress import log
@@ -355,9 +354,7 @@ def _p95(values: np.ndarray) -> float:
 
 def main() -> int:
     """Parse the command line and run; return the exit code."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_lines.described(__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     draw_parser = commands.add_parser("draw")
     draw_parser.add_argument("sequence", type=Path, help="a recording with depth")

@@ -13,9 +13,7 @@ compared with the recorded dog: distance to the cat, collisions, and the fractio
 (`classify_activity`). Bodies are not learned; the dog faces its direction of motion.
 """
 
-import argparse
-import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,6 +21,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from benchmarks import command_lines
+from benchmarks.behavior_builds import SESSION_S, TAKES, slice_sessions, train_model
 from pipeline.baselines.predictors import Ats, LocationPrior, Samples
 from pipeline.behavior.avoidance import clearance_of
 from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
@@ -42,22 +42,19 @@ from pipeline.behavior.trajectories import (
     Context,
 )
 from pipeline.core.progress import log
-from pipeline.core.videos import Video
+from pipeline.core.videos import Split
 from pipeline.data import npz
 from pipeline.geometry import rigid
 from pipeline.metrics.flight import flees
 from pipeline.metrics.intervals import bootstrapped, episodes
 from pipeline.metrics.scores import goal_energy_score, goal_minde
 from stages.read_trajectories.motion import CLIP_GAP_S, MeasuredMotion
-from stages.slice_behavior import stage as slicing
-from stages.slice_behavior.config import Config as SlicingConfig
 from stages.synthesize_capture import camera_motion, dwellings, gait, session
 from stages.synthesize_capture.dog import DOG
 from stages.synthesize_capture.lives.lives import rest
 from stages.synthesize_capture.observer import AT_HOME
 from stages.synthesize_capture.room import Room
 from stages.synthesize_capture.voxels import volume_of
-from stages.train_behavior import stage as training
 from stages.train_behavior.config import (
     AugmentationConfig,
     BehaviorOptimizerConfig,
@@ -66,10 +63,6 @@ from stages.train_behavior.config import (
 )
 from stages.train_behavior.config import Config as TrainingConfig
 
-TAKES, SESSION_S = 5, 150.0
-"""Takes of a session, each from a random start, and its duration: as in `stages.synthesize_capture.lives`."""
-WINDOW_STRIDE = 5
-"""Frames between windows: adjacent ones are nearly identical, and a window of 6.4 s takes memory."""
 MODEL = TrainingConfig(
     export=False,
     ensemble_size=1,
@@ -212,44 +205,26 @@ def simulate_session(home: Room, rng: np.random.Generator) -> MeasuredMotion:
 
 def load_data(out: Path, homes: int, test_homes: int, test_sessions: int) -> tuple[BehaviorData, Scenes]:
     """Simulate sessions and slice them into windows."""
-    sliced = out / "behavior_data"
-    if not (sliced / "qa.json").is_file():
-        videos, tables = [], {}
+
+    def sessions() -> Iterator[tuple[str, Split, MeasuredMotion]]:
         for number in range(homes + test_homes):
             home = dwellings.furnish_otherwise(np.random.default_rng([0, 10, number]))
             for session_index in range(1 if number < homes else test_sessions):
                 rng = np.random.default_rng([0, 13, number, session_index])
-                name = f"home{number}-{session_index}"
-                tables[name] = out / "lives" / name
-                shutil.rmtree(tables[name], ignore_errors=True)
-                tables[name].mkdir(parents=True)
                 motion = simulate_session(dwellings.rearranged(home, rng), rng)
-                npz.save(tables[name] / "motion.npz", compress=False, **motion.arrays())
-                npz.save(tables[name] / "skin.npz", agent_from_bone_rest=motion.agent_from_bone_rest)
-                npz.save(tables[name] / "feature_volume.npz", **vars(motion.volume))
-                split = "train" if number < homes else "test"
-                videos.append(Video(name, f"{name}.npz", "session", split, None))
-        log(f"{len(videos)} sessions of {SESSION_S:g} s in {homes + test_homes} homes")
-        shutil.rmtree(sliced, ignore_errors=True)
-        sliced.mkdir()
-        slicing.run(
-            slicing.Inputs(trajectories=tables),
-            SlicingConfig(stride=WINDOW_STRIDE),
-            sliced,
-            videos=tuple(videos),
-        )
+                yield f"home{number}-{session_index}", "train" if number < homes else "test", motion
+
+    sliced = out / "behavior_data"
+    if not (sliced / "qa.json").is_file():
+        slice_sessions(sessions(), out)
     data = BehaviorData.load(sliced)
     return data, Scenes.load(sliced, data.videos)
 
 
-def train_model(out: Path, seed: int) -> Path:
-    """Train one model, unless it exists."""
-    model = out / f"behavior-{seed}"
-    if not (model / "behavior.json").is_file():
-        shutil.rmtree(model, ignore_errors=True)
-        model.mkdir()
-        training.run(training.Inputs(out / "behavior_data"), replace(MODEL, seed=seed), model)
-    return model
+def open_model(out: Path, seed: int, scenes: Scenes) -> Ats:
+    """Train one model, unless it exists, and open it."""
+    model = train_model(out, replace(MODEL, seed=seed), f"behavior-{seed}")
+    return Ats.load(model, scenes, PlanSamplingConfig())
 
 
 def with_perception(context: Context, perception: str) -> Context:
@@ -282,7 +257,7 @@ def sampled_goals(out: Path, seed: int, scenes: Scenes, context: Context) -> dic
     """Return goals of a model for each perception, from the same noise; cached."""
     path = out / f"goals-{seed}.npz"
     if not path.is_file():
-        ats = Ats.load(train_model(out, seed), scenes, PlanSamplingConfig())
+        ats = open_model(out, seed, scenes)
         shown = {perception: with_perception(context, perception) for perception in PERCEIVED}
         goals = {
             perception: ats.goals(seen, GOALS, np.random.default_rng(seed)).goal
@@ -298,7 +273,7 @@ def rollouts(out: Path, seed: int, scenes: Scenes, takes: RecordedTakes) -> dict
     path = out / f"lives-{seed}.npz"
     found = npz.load(path) if path.is_file() else {}
     if missing := [perception for perception in PERCEIVED if perception not in found]:
-        ats = Ats.load(train_model(out, seed), scenes, PlanSamplingConfig())
+        ats = open_model(out, seed, scenes)
         found |= {perception: takes.rollout(ats, perception, seed) for perception in missing}
         npz.save(path, compress=False, **found)
         log(f"seed {seed}: rollouts finished")
@@ -312,9 +287,7 @@ def over_seeds(values: Sequence[float], form: str = ".3f") -> str:
 
 def main() -> None:
     """Simulate, train, evaluate and print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_lines.described(__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument(

@@ -6,11 +6,12 @@ artifact.
 Wall seconds depend on the load of the machine, CPU seconds less so.
 """
 
-import argparse
 import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
+
+from benchmarks import command_lines
 
 
 @dataclass(frozen=True)
@@ -65,13 +66,9 @@ def table(found: list[Cost]) -> str:
 
 def main() -> None:
     """Print the table for one build."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("agent", help="agent of the build, for example cat")
-    parser.add_argument("--build", type=Path, default=Path("build"), help="folder of builds")
+    parser = command_lines.for_agent(__doc__)
     arguments = parser.parse_args()
-    print(table(costs(arguments.build / arguments.agent)))
+    print(table(costs(command_lines.build_of(arguments))))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ the body is less than a voxel further above a surface below it than usual in the
 table is the recorded motion. With ``--home`` the animal lives in the home of another build, which has the holes.
 """
 
-import argparse
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
+from benchmarks import command_lines
 from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
 from pipeline.behavior.model import bones_from_channels
 from pipeline.behavior.perception import FeatureVolume
@@ -149,9 +149,7 @@ def lived(world: AnimalWorld, lives: int, seconds: float) -> dict[str, Poses]:
 
 def main() -> None:
     """Print the shares of each animal for each kind of holes."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_lines.described(__doc__)
     parser.add_argument("build", type=Path)
     parser.add_argument("--home", type=Path)
     parser.add_argument("--plans", choices=("environment", "simulate"), default="environment")
@@ -160,7 +158,6 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     config = EnvironmentConfig() if arguments.plans == "environment" else SimulateConfig()
-    folders = {name: each for name, each in folders_of(arguments.build, None).items() if each is not None}
     folders = {name: each for name, each in folders_of(arguments.build, None).items() if each is not None}
     homes = {name: (arguments.home or each) / "behavior_data" for name, each in folders.items()}
     judges = {name: Judge(homes[name], each) for name, each in folders.items()}

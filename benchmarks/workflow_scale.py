@@ -4,7 +4,6 @@ Creates a checkout with empty recordings, plans it, marks everything as built, a
 times the planning of N agents of 23 recordings instead. No stage runs.
 """
 
-import argparse
 import json
 import resource
 import shutil
@@ -14,6 +13,8 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+
+from benchmarks import command_lines
 
 ROOT = Path(__file__).resolve().parent.parent
 PER_HOME = 23
@@ -103,9 +104,7 @@ def time_engines(folder: Path, count: int, snakemake: bool) -> dict[str, Cost]:
 
 def main() -> None:
     """Measure and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_lines.described(__doc__)
     parser.add_argument("recordings", type=int, nargs="?", default=3000)
     parser.add_argument("--homes", type=int, help="time the planning of this many agents instead")
     parser.add_argument("--no-snakemake", action="store_true")

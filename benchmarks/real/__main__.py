@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import torch
 
+from benchmarks import command_lines
 from benchmarks.real.rows import ROWS
 from benchmarks.real.table import write
 from pipeline.core.progress import log
@@ -30,9 +31,7 @@ def stamp(arguments: argparse.Namespace) -> str:
 
 def main() -> None:
     """Print the table and write it as Markdown and JSON."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_lines.described(__doc__)
     parser.add_argument("data", type=Path, help="folder with the public data")
     parser.add_argument("--out", type=Path, default=Path("build/real_benchmark"), help="output folder")
     parser.add_argument("--rows", nargs="+", default=list(ROWS), choices=list(ROWS), help="rows to measure")

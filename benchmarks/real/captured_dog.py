@@ -5,12 +5,12 @@ The stages are those of `agents/dog.toml`: joints are converted to a root and bo
 """
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.behavior_builds import emptied
 from benchmarks.real.forecasts import LocationPriorPath
 from benchmarks.real.table import Row
 from pipeline.baselines.predictors import Ats, ConstantVelocity, LocationPrior, Samples, StandStill
@@ -62,10 +62,7 @@ def read_clips(recording: Path, folder: Path) -> dict[str, Path]:
 
 def evaluate_fold(clip: str, clips: dict[str, Path], folder: Path, config: TrainingConfig) -> MethodScores:
     """Train on all clips but one and return the scores of all methods on the windows of that clip."""
-    sliced, model = folder / "behavior_data", folder / f"behavior-{config.seed}"
-    for each in (sliced, model):
-        shutil.rmtree(each, ignore_errors=True)
-        each.mkdir(parents=True)
+    sliced, model = (emptied(folder / name) for name in ("behavior_data", f"behavior-{config.seed}"))
     videos = tuple(Video(name, name, "session", "test" if name == clip else "train", None) for name in clips)
     slicing.run(slicing.Inputs(trajectories=clips), SlicingConfig(), sliced, videos=videos)
     training.run(training.Inputs(sliced), config, model)

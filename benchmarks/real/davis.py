@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
+from benchmarks.behavior_builds import emptied
 from pipeline.data import images, npz
 from stages.estimate_flow import stage as flowing
 from stages.estimate_flow.config import Config as FlowConfig
@@ -82,9 +83,9 @@ def frames(sequence: DavisSequence, folder: Path) -> Path:
     """Write the pictures as the frames of a recording without depth, poses and intrinsics."""
     if (folder / "frames.npz").is_file():
         return folder
-    shutil.rmtree(folder, ignore_errors=True)
+    emptied(folder)
     for name in ("color", "depth", "confidence"):
-        (folder / name).mkdir(parents=True)
+        (folder / name).mkdir()
     for number, picture in enumerate(sequence.pictures):
         shutil.copy(picture, folder / "color" / f"{number:06d}.jpg")
         images.write_depth(folder / "depth" / f"{number:06d}.exr", np.zeros(DEPTH_SIZE))
@@ -104,7 +105,5 @@ def frames(sequence: DavisSequence, folder: Path) -> Path:
 def flow(recording: Path, folder: Path) -> Path:
     """Run `estimate_flow` on frames; cached."""
     if not (folder / "qa.json").is_file():
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        flowing.run(flowing.Inputs(recording), FlowConfig(), folder)
+        flowing.run(flowing.Inputs(recording), FlowConfig(), emptied(folder))
     return folder

@@ -2,13 +2,13 @@
 GrabCut in a box that our flow moves from frame to frame."""
 
 import json
-import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Bool
 
+from benchmarks.behavior_builds import emptied
 from benchmarks.real import davis
 from benchmarks.real.davis import DavisSequence
 from benchmarks.real.table import Row
@@ -44,10 +44,8 @@ def mean_iou(sequence: DavisSequence, folder: Path) -> float:
     if not done.is_file():
         frames = davis.frames(sequence, folder / "frames")
         flows = davis.flow(frames, folder / "flow")
-        prompt, out = folder / "box.prompt.toml", folder / "masks"
+        prompt, out = folder / "box.prompt.toml", emptied(folder / "masks")
         prompt.write_text(f"frame = 0\nbox = {box_of(sequence.mask(0))}\n")
-        shutil.rmtree(out, ignore_errors=True)
-        out.mkdir(parents=True)
         stage.run(stage.Inputs(frames, flows, prompt), Config(), out)
         found = Masks.open(out)
         each = [iou(found[frame] == AGENT, sequence.mask(frame)) for frame in range(len(sequence.masks))]

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float, Integer
 
 from benchmarks import structure
+from benchmarks.behavior_builds import emptied
 from benchmarks.real.table import Row
 from pipeline.backends.descriptors import Describer
 from pipeline.core.errors import InputError
@@ -77,10 +78,7 @@ def numbers(scene: Path) -> list[int]:
 
 def half(scene: Path, chosen: list[int], folder: Path) -> Half:
     """Extract some frames as a recording without poses."""
-    recording, frames = folder / "recording", folder / "frames"
-    for each in (recording, frames):
-        shutil.rmtree(each, ignore_errors=True)
-        each.mkdir(parents=True)
+    recording, frames = emptied(folder / "recording"), emptied(folder / "frames")
     for number in chosen:
         for path in scene.glob(f"frame-{number:06d}.*"):
             if ".pose." not in path.name:
@@ -178,9 +176,7 @@ def _published_sequences(file: Path) -> Iterable[dict[int, Float[np.ndarray, "4 
 def evaluate(scene: Path, folder: Path) -> dict[str, dict[str, dict[str, float]]]:
     """Return the errors (`summary`) of all methods on the second half, for all references."""
     walk, session = halves(scene, folder)
-    workspace = folder / "workspace"
-    shutil.rmtree(workspace, ignore_errors=True)
-    workspace.mkdir(parents=True)
+    workspace = emptied(folder / "workspace")
     none = np.zeros((len(walk.clip), 4, 4, 2), np.float16)
     scene_template, _ = template.build(walk.clip, none, TemplateConfig(), workspace)
     config, rng = LocalizerConfig(), np.random.default_rng(0)

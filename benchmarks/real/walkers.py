@@ -6,13 +6,13 @@ behavior model draws 20 independent samples for every window of the protocol.
 """
 
 import json
-import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+from benchmarks.behavior_builds import emptied, train_model
 from benchmarks.real.crowds import FUTURE, PAST, STEP_S, Crowd, Walk
 from benchmarks.real.forecasts import TURN_STD_RAD, ConstantVelocityPath, LocationPriorPath, score_forecasts
 from benchmarks.real.table import Row
@@ -26,7 +26,6 @@ from stages.read_trajectories import stage as reading
 from stages.read_trajectories.config import Config as ReadingConfig
 from stages.slice_behavior import stage as slicing
 from stages.slice_behavior.config import Config as SlicingConfig
-from stages.train_behavior import stage as training
 from stages.train_behavior.config import (
     AugmentationConfig,
     BehaviorOptimizerConfig,
@@ -131,23 +130,10 @@ def prepare_fold(train: dict[str, Crowd], test: dict[str, Crowd], reads: Path, f
     ]
     sliced = folder / "behavior_data"
     if not (sliced / "qa.json").is_file():
-        shutil.rmtree(sliced, ignore_errors=True)
-        sliced.mkdir(parents=True)
         config = SlicingConfig(smooth_s=0.0, past_s=PAST * STEP_S, rate_hz=1 / STEP_S)
-        slicing.run(slicing.Inputs(trajectories=tables), config, sliced, videos=tuple(videos))
+        slicing.run(slicing.Inputs(trajectories=tables), config, emptied(sliced), videos=tuple(videos))
     data = BehaviorData.load(sliced)
     return Fold(data.with_horizon(FUTURE), Scenes.load(sliced, data.videos), test)
-
-
-def train_model(folder: Path, config: TrainingConfig) -> Path:
-    """Run `train_behavior` on the prepared data; cached."""
-    model = folder / f"behavior-{config.seed}"
-    if (model / "behavior.json").is_file():
-        return model
-    shutil.rmtree(model, ignore_errors=True)
-    model.mkdir()
-    training.run(training.Inputs(folder / "behavior_data"), config, model)
-    return model
 
 
 def forecast(fold: Fold, model: Path, context: Context, rng: np.random.Generator) -> Samples:
@@ -216,7 +202,7 @@ def evaluate_scene(scene: Path, folder: Path, seeds: int) -> dict[str, dict[str,
             record(name, method.sample(context, SAMPLES, np.random.default_rng(0)))
         for seed, name in enumerate(seed_names):
             if name not in found:
-                model = train_model(folder, replace(MODEL, seed=seed))
+                model = train_model(folder, replace(MODEL, seed=seed), f"behavior-{seed}")
                 record(name, forecast(fold, model, context, np.random.default_rng(seed)))
         count = sum(window.accompanied for window in windows)
         found["windows"] = {"judged": int(accompanied.sum()), "accompanied": count, "all": len(windows)}

@@ -7,10 +7,8 @@ import pytest
 
 from benchmarks import approach_animal
 from benchmarks.approach_animal import TrueCats
+from benchmarks.behavior_builds import slice_sessions
 from pipeline.behavior.trajectories import TRAIN, BehaviorData
-from pipeline.core.videos import Video
-from pipeline.data import npz
-from stages.slice_behavior import stage as slicing
 from stages.slice_behavior.config import Config as SlicingConfig
 
 EYE_M = 1.4
@@ -25,14 +23,8 @@ def data(tmp_path_factory) -> BehaviorData:
         patch.setattr(approach_animal, "TAKES", 1)
         patch.setattr(approach_animal, "SESSION_S", 40.0)
         motion = approach_animal.simulated_session(*approach_animal.home_of(0, 0))
-    npz.save(folder / "motion.npz", compress=False, **motion.arrays())
-    npz.save(folder / "skin.npz", agent_from_bone_rest=motion.agent_from_bone_rest)
-    npz.save(folder / "feature_volume.npz", **vars(motion.volume))
-    (folder / "sliced").mkdir()
-    video = Video("home0-0", "home0-0.npz", "session", "train", None)
-    inputs = slicing.Inputs(trajectories={"home0-0": folder})
-    slicing.run(inputs, SlicingConfig(), folder / "sliced", videos=(video,))
-    return BehaviorData.load(folder / "sliced")
+    slice_sessions([("home0-0", "train", motion)], folder, SlicingConfig.stride)
+    return BehaviorData.load(folder / "behavior_data")
 
 
 def met(data: BehaviorData, speed_m_s: float, seconds: float) -> tuple[np.ndarray, np.ndarray]:

@@ -83,7 +83,7 @@ def test_forecasts_do_not_depend_on_the_future(fold, data, tmp_path):
     shutil.copytree(folder / "trajectories" / "elsewhere", trajectories / "elsewhere")
     crowds = {"here": Crowd(places)}
     changed = walkers.prepare_fold(walkers.crowds(data / "train"), crowds, trajectories, tmp_path)
-    model, forecasts, futures = walkers.train_model(folder, tiny_config()), [], []
+    model, forecasts, futures = walkers.train_model(folder, tiny_config(), "behavior-0"), [], []
     for each in (true, changed):
         number = [window.number for window in each.forecast_windows() if window.walk.start == 3]
         context, future = each.data.windows(np.array(number))
