@@ -26,6 +26,13 @@ def join(rank: int, port: str) -> None:
     distributed.join("cpu")
 
 
+def leave(rank: int, folder: Path, result: torch.Tensor | list[torch.Tensor]) -> None:
+    """Save what a process found as ``rank<rank>.pt`` in ``folder``, and leave the group with the other one."""
+    torch.save(result, folder / f"rank{rank}.pt")
+    distributed.wait()
+    assert distributed.leave() == (rank == 0)
+
+
 @contextlib.contextmanager
 def started(module: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """Run ``module`` with a port and ``folder`` as the second process; yield the port."""

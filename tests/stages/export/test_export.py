@@ -13,10 +13,11 @@ import pytest
 from pipeline.behavior.perception import FeatureVolume
 from pipeline.core.errors import InputError
 from pipeline.data import glb, images, npz
-from pipeline.data.glb import Action, Skin
+from pipeline.data.glb import Action
 from pipeline.data.motion import Motion
 from stages.export import bvh, cameras, mjcf, neuro, reading, retarget, splats, tables, usd, writing
 from stages.export import glb as glb_export
+from tests.stages.export import moving_tube
 from tests.stages.export_simulator import small_world
 
 RNG = np.random.default_rng(0)
@@ -25,16 +26,8 @@ WEB = Path(__file__).parents[3] / "stages/export_simulator/web"
 
 @pytest.fixture(scope="module")
 def agent() -> reading.Agent:
-    """A tube of five bones with two motions and four influences per vertex."""
-    mesh, weights = small_world.tube()
-    joints = np.argsort(-weights, 1)[:, :4]
-    heaviest = np.take_along_axis(weights, joints, 1)
-    skin = Skin(
-        joints.astype(np.uint8),
-        (heaviest / heaviest.sum(1, keepdims=True)).astype(np.float32),
-        small_world.rest(),
-        tuple(f"bone_{bone:02d}" for bone in range(small_world.BONES)),
-    )
+    """A tube of five bones with two motions."""
+    mesh, skin = moving_tube.skinned_tube()
     actions = [
         Action(name, track.timestamp_s, track.world_from_agent, track.agent_from_bone.astype(np.float64))
         for name, track in (("walk", small_world.trajectory(20, 0)), ("turn", small_world.trajectory(12, 1)))

@@ -282,17 +282,20 @@ def test_surface_behind_a_depth_edge_may_be_occluded():
     assert torch.equal(outside(edge, 0.0), hidden), "sensors do not measure along edges"
 
 
+def fused_scene(distance: torch.Tensor) -> Field:
+    """Return a scene of 80 cm with these fused distances of grid points in truncation lengths, -1..1."""
+    block = torch.cat([distance.expand(9, 9, 9, 1), torch.zeros(9, 9, 9, 4)], dim=-1)
+    table, blocks = torch.ones(2, 1, 1, 1, dtype=torch.int32), block.expand(2, -1, -1, -1, -1).half()
+    fused = FusedGeometry(torch.full((3,), -0.4), 0.1, 0.2, table, blocks)
+    shape = FieldShape((-0.4,) * 3, (0.4,) * 3, (0.4,), videos=1, truncation_m=0.2)
+    return Field(shape, free_m=0.1, fused=fused)
+
+
 def test_penetration_of_the_floor_is_penalized():
     """The floor is 10 cm below the center of the ball; the bottom of the ball is moved up."""
     found, _ = problem()
-    height = torch.linspace(-0.4, 0.4, 9).view(1, 9, 1, 1).expand(9, 9, 9, 1) + 0.1
-    block = torch.cat([(height / 0.2).clamp(-1, 1), torch.zeros(9, 9, 9, 4)], dim=-1)
-    table = torch.ones(2, 1, 1, 1, dtype=torch.int32)
-    floor = FusedGeometry(
-        torch.full((3,), -0.4), 0.1, 0.2, table, torch.stack([torch.ones(9, 9, 9, 5), block]).half()
-    )
-    shape = FieldShape((-0.4,) * 3, (0.4,) * 3, (0.4,), videos=1, truncation_m=0.2)
-    found = replace(found, scene=Field(shape, free_m=0.1, fused=floor))
+    height = torch.linspace(-0.4, 0.4, 9).view(1, 9, 1, 1) + 0.1
+    found = replace(found, scene=fused_scene((height / 0.2).clamp(-1, 1)))
     pose, shift = Pose.of(found, found.agent_frames[:2]), torch.zeros(3, requires_grad=True)
     pose = replace(pose, world_from_agent=rigid_torch.make(torch.eye(3), shift).expand(2, 4, 4))
     points = found.surface.points[:200].expand(2, -1, -1)
@@ -305,16 +308,7 @@ def test_penetration_of_the_floor_is_penalized():
 def test_deep_penetration_is_penalized():
     """Fused distances end a little below a surface; a ball half a meter below the floor is moved up too."""
     found, _ = problem()
-    block = torch.cat([torch.ones(9, 9, 9, 1), torch.zeros(9, 9, 9, 4)], dim=-1)
-    fused = FusedGeometry(
-        torch.full((3,), -0.4),
-        0.1,
-        0.2,
-        torch.ones(2, 1, 1, 1, dtype=torch.int32),
-        block.expand(2, -1, -1, -1, -1).half(),
-    )
-    shape = FieldShape((-0.4,) * 3, (0.4,) * 3, (0.4,), videos=1, truncation_m=0.2)
-    found = replace(found, scene=Field(shape, free_m=0.1, fused=fused))
+    found = replace(found, scene=fused_scene(torch.ones(1)))
     pose, shift = Pose.of(found, found.agent_frames[:2]), torch.zeros(3, requires_grad=True)
     pose = replace(
         pose, world_from_agent=rigid_torch.make(torch.eye(3), shift - 0.5 * torch.eye(3)[1]).expand(2, 4, 4)
@@ -330,14 +324,8 @@ def test_deep_penetration_is_penalized():
 def test_foot_skate_is_penalized_only_in_slow_contact():
     """A ball rolls at 1 cm and at 1 m per frame, and flies 20 cm above the floor."""
     found, _ = problem()
-    free = (
-        torch.cat([torch.ones(9, 9, 9, 1), torch.zeros(9, 9, 9, 4)], dim=-1).expand(2, -1, -1, -1, -1).half()
-    )
-    fused = FusedGeometry(torch.full((3,), -0.4), 0.1, 0.2, torch.ones(2, 1, 1, 1, dtype=torch.int32), free)
-    field = Field(
-        FieldShape((-0.4,) * 3, (0.4,) * 3, (0.4,), videos=1, truncation_m=0.2), free_m=0.1, fused=fused
-    )
-    found = replace(found, scene=field, floor_m=float(found.surface.sole[:, 1].max()))
+    floor_m = float(found.surface.sole[:, 1].max())
+    found = replace(found, scene=fused_scene(torch.ones(1)), floor_m=floor_m)
     pose, shift = Pose.of(found, found.agent_frames[:3]), torch.tensor([0.0, 0.01, 1.01], requires_grad=True)
     rolling = torch.stack([shift, torch.zeros(3), torch.zeros(3)], dim=-1)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.core import distributed, training
+from pipeline.core import training
 from pipeline.core.errors import InputError
 from stages.reconstruct import losses, optimize
 from stages.reconstruct.config import LossWeights
@@ -55,9 +55,7 @@ def side(rank: int, port: str, folder: Path) -> tuple[torch.Tensor, torch.Tensor
     found, whole = three_videos(), three_videos()
     weights, total = fitted(found, loss_of(found, rank), shared=True)
     optimize.optimize(whole, plan(folder / "resume", template=2, scene=3, body=2, joint=3, save_every=2))
-    torch.save(learned(whole), folder / f"rank{rank}.pt")
-    distributed.wait()
-    assert distributed.leave() == (rank == 0)
+    two_processes.leave(rank, folder, learned(whole))
     return learned(whole), weights, total
 
 

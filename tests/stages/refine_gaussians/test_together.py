@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.core import distributed
 from pipeline.core.training import FitRecord
 from pipeline.fields.gaussians import Splats
 from stages.refine_gaussians import refine
@@ -35,9 +34,7 @@ def side(rank: int, port: str, folder: Path) -> tuple[FitRecord, torch.Tensor]:
     """Run one of two processes and save its result."""
     two_processes.join(rank, port)
     record, found = refined(2 * STEPS)
-    torch.save(found, folder / f"rank{rank}.pt")
-    distributed.wait()
-    assert distributed.leave() == (rank == 0)
+    two_processes.leave(rank, folder, found)
     return record, found
 
 

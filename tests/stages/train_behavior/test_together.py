@@ -10,7 +10,6 @@ import torch
 
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.scenes import Scenes
-from pipeline.core import distributed
 from pipeline.core.training import generator_for
 from stages.train_behavior import baseline_losses, objective, training
 from stages.train_behavior.config import BehaviorOptimizerConfig, BehaviorTrainingConfig
@@ -42,9 +41,7 @@ def side(rank: int, port: str, folder: Path) -> list[training.TrainedBehavior]:
     """Run one of two processes and save its weights."""
     two_processes.join(rank, port)
     found = [trained(family, 16, folder / family) for family in FAMILIES]
-    torch.save([weights(each) for each in found], folder / f"rank{rank}.pt")
-    distributed.wait()
-    assert distributed.leave() == (rank == 0)
+    two_processes.leave(rank, folder, [weights(each) for each in found])
     return found
 
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.core import distributed
 from stages.train_localizer import networks
 from stages.train_localizer.config import NetworkConfig
 from tests import two_processes
@@ -26,9 +25,7 @@ def side(rank: int, port: str, folder: Path) -> torch.Tensor:
     """Run one of two processes and save its weights."""
     two_processes.join(rank, port)
     found = trained(8)
-    torch.save(found, folder / f"rank{rank}.pt")
-    distributed.wait()
-    assert distributed.leave() == (rank == 0)
+    two_processes.leave(rank, folder, found)
     return found
 
 

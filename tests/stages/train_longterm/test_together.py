@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.core import distributed
 from pipeline.longterm.config import LongTermOptimizerConfig
 from stages.train_longterm import learning, training
 from stages.train_longterm.config import Config
@@ -33,9 +32,7 @@ def side(rank: int, port: str, folder: Path) -> learning.TrainedLongTerm:
     """Run one of two processes and save its weights."""
     two_processes.join(rank, port)
     found = trained(16)
-    torch.save(weights(found), folder / f"rank{rank}.pt")
-    distributed.wait()
-    assert distributed.leave() == (rank == 0)
+    two_processes.leave(rank, folder, weights(found))
     return found
 
 
