@@ -152,15 +152,11 @@ def run_episodes(world: AnimalWorld, policy: Policy, episodes: int, split: str, 
     """Run ``episodes`` episodes in parallel until each has ended."""
     world.begin(episodes, np.random.default_rng(seed), split)
     frames = round(world.config.episode_s * RATE_HZ)
-    reached, fled, seconds = (
-        np.zeros(episodes, bool),
-        np.zeros(episodes, bool),
-        np.full(episodes, world.config.episode_s),
-    )
-    person_paths, animal_paths = (
-        np.full((episodes, frames + 1, 2), np.nan),
-        np.full((episodes, frames + 1, 2), np.nan),
-    )
+    reached = np.zeros(episodes, bool)
+    fled = np.zeros(episodes, bool)
+    seconds = np.full(episodes, world.config.episode_s)
+    person_paths = np.full((episodes, frames + 1, 2), np.nan)
+    animal_paths = np.full((episodes, frames + 1, 2), np.nan)
     for frame in range(frames):
         going = ~(reached | fled)
         person_paths[going, frame] = world.persons.position[going]

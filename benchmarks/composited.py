@@ -489,10 +489,8 @@ def _contact_shadow(depth, focal_center, up_camera, balls):
     for i in range(depth.shape[0]):
         for j in range(depth.shape[1]):
             z = depth[i, j]
-            x, y = (
-                (j + 0.5 - focal_center[2]) / focal_center[0] * z,
-                (i + 0.5 - focal_center[3]) / focal_center[1] * z,
-            )
+            x = (j + 0.5 - focal_center[2]) / focal_center[0] * z
+            y = (i + 0.5 - focal_center[3]) / focal_center[1] * z
             lost = 0.0
             for ball in range(balls.shape[0]):
                 dx, dy, dz = balls[ball, 0] - x, balls[ball, 1] - y, balls[ball, 2] - z

@@ -86,10 +86,8 @@ def errors_of_sessions(
     """Return the same over frames of the sessions, against their registered poses."""
     found, truth = [], []
     for path in sorted(build.glob("registration/*/poses.npz")):
-        clip, masks = (
-            Clip.open(build / "frames" / path.parent.name),
-            Masks.open(build / "masks" / path.parent.name),
-        )
+        clip = Clip.open(build / "frames" / path.parent.name)
+        masks = Masks.open(build / "masks" / path.parent.name)
         poses = npz.load(path, ("world_from_camera",))["world_from_camera"]
         for frame in np.linspace(0, len(clip) - 1, per_session).astype(int):
             camera = (clip.depth_intrinsics[frame], clip.intrinsics[frame])

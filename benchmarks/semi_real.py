@@ -210,10 +210,8 @@ def scores(build: Path, truth: Path) -> dict[str, dict[str, float]]:
             labels = np.stack([masks[frame] for frame in range(len(masks))])
             metrics = mask_metrics(labels, true[row])
             if animals:
-                others, mine = (
-                    (np.delete(true, row, axis=0).any(0) & (labels == 255)),
-                    true[row] & (labels == 255),
-                )
+                others = np.delete(true, row, axis=0).any(0) & (labels == 255)
+                mine = true[row] & (labels == 255)
                 metrics["swaps"] = float((others.sum((1, 2)) > mine.sum((1, 2))).mean())
             found[f"{session} {name}".strip()] = metrics
     return found

@@ -100,10 +100,8 @@ class ForwardFacingSampler(Sampler):
     ) -> Float[np.ndarray, "plan frame channel"]:
         """Return roots that turn along the path, starting with heading +z."""
         steps = np.diff(path, axis=1, prepend=codes.start[:, None])[..., ::2]
-        facing, found = (
-            np.tile([0.0, 1.0], (len(path), 1)),
-            np.tile(self.scaling.body_mean, (*path.shape[:2], 1)),
-        )
+        facing = np.tile([0.0, 1.0], (len(path), 1))
+        found = np.tile(self.scaling.body_mean, (*path.shape[:2], 1))
         for frame in range(path.shape[1]):
             step = steps[:, frame]
             facing = (

@@ -22,10 +22,8 @@ def moments_together(
     They are of ``split``, of any for an animal that has none in it.
     """
     windows, begin_s = {leading: window}, data[leading].begin_s[window]
-    placed, video = (
-        data[leading].place_world[[window]],
-        data[leading].videos[int(data[leading].video[window])],
-    )
+    placed = data[leading].place_world[[window]]
+    video = data[leading].videos[int(data[leading].video[window])]
     for name in (other for other in data if other != leading):
         mine = data[name]
         known = mine.indices(split) if (mine.split == split).any() else np.arange(len(mine.split))

@@ -203,10 +203,8 @@ def _drawn_by_splats(
         if root is not None:
             posed = [torch.as_tensor(part, dtype=torch.float32) for part in (root, bones)]
             cloud = gaussians.concatenate(cloud, splats.place_agent(*posed, video=None))
-        camera_from_world, intrinsics = (
-            torch.as_tensor(part, dtype=torch.float32)
-            for part in (rigid.inverse(shot.world_from_camera), shot.intrinsics)
-        )
+        camera_from_world = torch.as_tensor(rigid.inverse(shot.world_from_camera), dtype=torch.float32)
+        intrinsics = torch.as_tensor(shot.intrinsics, dtype=torch.float32)
         height, width = shot.depth.shape
         with torch.no_grad():
             seen = gaussians.render(cloud, camera_from_world, intrinsics, height, width)

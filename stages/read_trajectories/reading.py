@@ -65,10 +65,8 @@ def _from_life(path: Path, stored: dict[str, np.ndarray]) -> MeasuredMotion:
     frames, bones = (motion[name].shape[:1] for name in ("timestamp_s", "agent_from_bone_rest"))
     shapes = frames, (*frames, 4, 4), (*frames, *bones, 4, 4), (*frames, 4, 4), (*bones, 4, 4)
     if not (frames and tuple(a.shape for a in motion.values()) == shapes and set(VOLUME_KEYS) <= set(stored)):
-        what, remedy = (
-            "has arrays of a life missing or of other shapes",
-            "see data_layout.md, synthetic_lives",
-        )
+        what = "has arrays of a life missing or of other shapes"
+        remedy = "see data_layout.md, synthetic_lives"
         raise InputError("TRJ-001", what, str(path), remedy)
     features, occupancy, origin, voxel_m = (stored[name] for name in VOLUME_KEYS)
     volume = FeatureVolume(features, occupancy, origin, float(voxel_m))

@@ -138,9 +138,8 @@ def surface_terms(
     within = torch.minimum(pixel.clamp_min(0.5 * THUMBNAIL), last)
     outside_px = _sampled(views.outside_px[pose.frame], within, "bilinear", "border")
     with torch.no_grad():
-        measured, nearest = (
-            _sampled(each[pose.frame], pixel, "nearest", "zeros") for each in (views.depth, views.occluder)
-        )
+        measured = _sampled(views.depth[pose.frame], pixel, "nearest", "zeros")
+        nearest = _sampled(views.occluder[pose.frame], pixel, "nearest", "zeros")
         inside_picture = ((pixel >= 0) & (pixel <= size_px[:, None])).all(-1)
         in_view = inside_picture & (depth > NEAREST_M)
         occluded = (nearest > 0) & (nearest < depth - MARGIN_M)

@@ -86,9 +86,8 @@ class Problem:
             what = f"{size} processes, but fewer recordings that show the agent in its home"
             raise InputError("RCN-002", what, "PROCESSES", "take fewer processes")
         own = torch.isin(self.video, torch.tensor(order[rank::size], device=self.device))
-        scene, agent = (
-            rays.at(torch.nonzero(own[rays.frame])[:, 0]) for rays in (self.store.scene, self.store.agent)
-        )
+        scene = self.store.scene.at(torch.nonzero(own[self.store.scene.frame])[:, 0])
+        agent = self.store.agent.at(torch.nonzero(own[self.store.agent.frame])[:, 0])
         return replace(
             self,
             store=RayStore(scene, agent, self.store.views),

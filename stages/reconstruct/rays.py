@@ -233,9 +233,8 @@ def mask_distance_px(
     outside = (mask == NOT_AGENT).astype(np.uint8)
     if outside.all():
         return np.full(small, FAR_PX, np.float16)
-    beyond, within = (
-        cv2.distanceTransform(part, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for part in (outside, 1 - outside)
-    )
+    beyond = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    within = cv2.distanceTransform(1 - outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     signed = np.where(outside, beyond - 0.5, 0.5 - within)
     height, width = (size * THUMBNAIL for size in small)
     limited = np.clip(signed[:height, :width], -FAR_PX, FAR_PX)

@@ -247,9 +247,8 @@ class SceneLoss:
         rays = store.scene.at(self.measured[pick(len(self.measured), number, generator, problem.device)])
         others = store.scene.at(pick(len(store.scene), batches.rendered_rays // 2, generator, problem.device))
         videos = problem.scene.shape.videos
-        code_of, other_code = (
-            swap_codes(problem.video[some.frame], videos, probability, generator) for some in (rays, others)
-        )
+        code_of = swap_codes(problem.video[rays.frame], videos, probability, generator)
+        other_code = swap_codes(problem.video[others.frame], videos, probability, generator)
         terms = measured_terms(problem, rays, code_of, self.weights, generator)
 
         def density_of(index: Tensor, depth: Tensor) -> Tensor:

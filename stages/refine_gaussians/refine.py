@@ -131,10 +131,8 @@ class FrameLoss:
         return len(in_view(center, size, camera_from_world, target.intrinsics, *target.depth.shape)) > 0
 
     def _pose(self, video: DrawnVideo, frame: int) -> tuple[Tensor, Tensor]:
-        root, bones = (
-            torch.from_numpy(a[frame]).float().to(self.device)
-            for a in (video.motion.world_from_agent, video.motion.agent_from_bone)
-        )
+        root = torch.from_numpy(video.motion.world_from_agent[frame]).float().to(self.device)
+        bones = torch.from_numpy(video.motion.agent_from_bone[frame]).float().to(self.device)
         return self.deltas.apply(root, bones, video.first + frame)
 
     def camera(self, video: DrawnVideo, frame: int) -> Float[Tensor, "4 4"]:

@@ -18,11 +18,9 @@ def _patched(
 ) -> Float[np.ndarray, "vertex 4"]:
     """Draw a white coat with large black patches, a black saddle and ears, and a brown face."""
     x, y, z = vertices.T
-    white, black, brown = (
-        np.array([0.74, 0.72, 0.68]),
-        np.array([0.022, 0.02, 0.02]),
-        np.array([0.33, 0.15, 0.05]),
-    )
+    white = np.array([0.74, 0.72, 0.68])
+    black = np.array([0.022, 0.02, 0.02])
+    brown = np.array([0.33, 0.15, 0.05])
     phase = rng.uniform(0, 2 * np.pi, 4)
     patch = np.sin(z / 0.05 + phase[0]) + np.sin(y / 0.04 + phase[1]) * np.sin(x / 0.05 + phase[2])
     saddle = 2.2 * np.clip((y - 0.01) / 0.05, -1, 1) * ((z > -0.2) & (z < 0.14))

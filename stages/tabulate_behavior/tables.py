@@ -50,9 +50,8 @@ def _add_contrasts(table: dict[str, float | None], method: str, scores: MethodSc
             difference, frames = scores.values[first] - scores.values[second], scores.past + scores.future
             found = interval(difference, scores.windows_of(first), frames, seed)
             table |= found.as_figures(f"behavior/{method}/{name}")
-    given_goal, end_to_end = (
-        scores.values.get(f"{protocol}/path_minade_m") for protocol in ("truth_fed", UNPREFIXED)
-    )
+    given_goal = scores.values.get("truth_fed/path_minade_m")
+    end_to_end = scores.values.get(f"{UNPREFIXED}/path_minade_m")
     if given_goal is not None and end_to_end is not None:
         table[f"behavior/{method}/path_minade_truth_fed_share"] = float(given_goal.mean() / end_to_end.mean())
 

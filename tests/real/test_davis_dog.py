@@ -119,10 +119,8 @@ def test_flow_is_at_least_as_good_as_opencv(dog):
 
     def chained(step):
         def move(first, second):
-            whole, pixel = (
-                np.zeros((*size, 2), np.float32),
-                np.stack(np.meshgrid(*map(np.arange, size[::-1])), -1).astype(np.float32),
-            )
+            whole = np.zeros((*size, 2), np.float32)
+            pixel = np.stack(np.meshgrid(*map(np.arange, size[::-1])), -1).astype(np.float32)
             for frame in range(first, second):
                 at = pixel + whole
                 whole = whole + cv2.remap(

@@ -15,11 +15,9 @@ from pipeline.geometry.meshes import Mesh, RayCaster
 COLOR_SIZE, DEPTH_SIZE = (120, 90), (120, 90)
 INTRINSICS = np.array([[84.0, 0, 45], [0, 84.0, 60], [0, 0, 1]])
 UP = np.array([0.0, 1.0, 0.0])
-ROOM_COLOR, ANIMAL_COLOR, OTHER_COLOR = (
-    np.array([120, 130, 150]),
-    np.array([190, 120, 50]),
-    np.array([60, 160, 80]),
-)
+ROOM_COLOR = np.array([120, 130, 150])
+ANIMAL_COLOR = np.array([190, 120, 50])
+OTHER_COLOR = np.array([60, 160, 80])
 
 
 def box(size, at) -> trimesh.Trimesh:

@@ -43,10 +43,8 @@ def test_roots_face_the_path_and_keep_the_posture():
 
 def test_one_stage_body_has_the_heading_of_its_path():
     """The heading is the same for given and for jointly denoised paths, and unknown where noise hides it."""
-    net, std = (
-        OneStageDenoiser(SequenceDenoiser(Schedule()), identity_prior(10), 6, FRAMES),
-        torch.tensor([0.4, 0.1, 0.4, 1.0]),
-    )
+    net = OneStageDenoiser(SequenceDenoiser(Schedule()), identity_prior(10), 6, FRAMES)
+    std = torch.tensor([0.4, 0.1, 0.4, 1.0])
     net.velocity_std[:] = std
     path, _ = walk(torch.full((FRAMES,), 0.03), 0.8)
     given = BodyDenoiser(SequenceDenoiser(Schedule()), identity_prior(6), 6, FRAMES).steps(
@@ -70,11 +68,9 @@ def test_residual_from_the_current_posture_is_denoised():
 
     net = BodyDenoiser(RecordingNetwork(Schedule()), identity_prior(9), 9, FRAMES)
     posture = torch.cat([columns(torch.zeros(1))[0, :, 0], torch.tensor([0.3, -0.2, 0.1])])[None]
-    clean, noise, t = (
-        posture[..., None].expand(-1, -1, FRAMES),
-        torch.randn(1, 9, FRAMES),
-        torch.tensor([20.0]),
-    )
+    clean = posture[..., None].expand(-1, -1, FRAMES)
+    noise = torch.randn(1, 9, FRAMES)
+    t = torch.tensor([20.0])
     share = float(Schedule().alpha_bar[20])
     net(
         np.sqrt(share) * clean + np.sqrt(1 - share) * noise,

@@ -111,12 +111,10 @@ def test_uncontrolled_network_equals_controlled_one_without_control():
     free.load_state_dict(
         {name: value for name, value in steered.state_dict().items() if name in free.state_dict()}
     )
-    x, t, code, control = (
-        torch.randn(2, 4, 56),
-        torch.tensor([3.0, 40.0]),
-        torch.randn(2, 8),
-        torch.randn(2, 3),
-    )
+    x = torch.randn(2, 4, 56)
+    t = torch.tensor([3.0, 40.0])
+    code = torch.randn(2, 8)
+    control = torch.randn(2, 3)
     dropped = torch.zeros(2, 1)
     torch.testing.assert_close(free(x, t, code, control, dropped + 1), steered(x, t, code, control, dropped))
 

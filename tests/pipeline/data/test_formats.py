@@ -12,10 +12,8 @@ from pipeline.geometry.meshes import Mesh
 
 def test_row_writer_gives_the_same_file_as_save(tmp_path):
     rng = np.random.default_rng(0)
-    flow, flags = (
-        rng.normal(size=(5, 4, 3, 2)).astype(np.float16),
-        rng.integers(0, 255, (5, 4), dtype=np.uint8),
-    )
+    flow = rng.normal(size=(5, 4, 3, 2)).astype(np.float16)
+    flags = rng.integers(0, 255, (5, 4), dtype=np.uint8)
     npz.save(tmp_path / "whole.npz", flow=flow, flags=flags)
     with npz.Rows(
         tmp_path / "rows.npz", flow=(flow.shape, np.float16), flags=(flags.shape, np.uint8)

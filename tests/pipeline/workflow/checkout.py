@@ -171,18 +171,16 @@ def create(folder: Path) -> Checkout:
 def _fields(stage: str) -> str:
     """Return the fields of `Inputs` of the stage, as declared in the flow."""
     nodes = [node for node in dag.FLOW if node.stage == stage]
-    kinds, in_every = (
-        {},
-        set.intersection(
-            *(
-                {
-                    need.option or need.artifact
-                    for need in dag.needs_of(node, "recordings")
-                    if not (need.others or need.homes != "any" or dag.NODES[need.artifact].of_several)
-                }
-                for node in nodes
-            )
-        ),
+    kinds = {}
+    in_every = set.intersection(
+        *(
+            {
+                need.option or need.artifact
+                for need in dag.needs_of(node, "recordings")
+                if not (need.others or need.homes != "any" or dag.NODES[need.artifact].of_several)
+            }
+            for node in nodes
+        )
     )
     for node in nodes:
         for need in dag.needs_of(node, "recordings"):

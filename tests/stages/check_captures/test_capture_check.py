@@ -162,11 +162,9 @@ def _shots(
     only in the depth.
     """
     mesh = textured_room.textured_room(seed, edge_m=0.08)
-    caster, size, intrinsics = (
-        RayCaster(mesh),
-        (240, 180),
-        np.array([[178.0, 0, 90], [0, 178.0, 120], [0, 0, 1]]),
-    )
+    caster = RayCaster(mesh)
+    size = (240, 180)
+    intrinsics = np.array([[178.0, 0, 90], [0, 178.0, 120], [0, 0, 1]])
     found = []
     for frame, camera in enumerate(textured_room.walk(count, seed=7)):
         depth, hits = render_view(caster, camera, intrinsics, *size)
@@ -289,10 +287,8 @@ def test_movers_are_counted():
         ]
 
     still = moving_objects.find_motion(_shots(0, 16))
-    lone, pair = (
-        moving_objects.find_motion(_shots(0, 16, balls=one)),
-        moving_objects.find_motion(_shots(0, 16, balls=two)),
-    )
+    lone = moving_objects.find_motion(_shots(0, 16, balls=one))
+    pair = moving_objects.find_motion(_shots(0, 16, balls=two))
     assert still.seen == 0
     assert lone.seen > 0.6
     assert lone.several < 0.2

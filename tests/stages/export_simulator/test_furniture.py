@@ -65,15 +65,13 @@ def home() -> np.ndarray:
     return solid
 
 
-BOX, TABLE, BENCH, WALL, SHELF, COUNTER, FLOOR = (
-    [-0.05, 0.75, 0.05],
-    [1.1, 0.6, 1.1],
-    [-1.75, 0.4, -0.9],
-    [-1.95, 1.0, 1.8],
-    [-1.8, 1.25, 0.75],
-    [0.0, 0.9, -1.5],
-    [1.5, 0.0, -0.5],
-)
+BOX = [-0.05, 0.75, 0.05]
+TABLE = [1.1, 0.6, 1.1]
+BENCH = [-1.75, 0.4, -0.9]
+WALL = [-1.95, 1.0, 1.8]
+SHELF = [-1.8, 1.25, 0.75]
+COUNTER = [0.0, 0.9, -1.5]
+FLOOR = [1.5, 0.0, -0.5]
 
 
 def asked(question: str, **more: Any) -> Any:

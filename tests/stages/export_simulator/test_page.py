@@ -190,10 +190,8 @@ def _check_reaction(page: Page) -> None:
 def _check_it_reacts_as_python_does(page: Page, build: Path) -> None:
     """The same fraction of 200 approaches shifts goals away as in Python, and goals agree."""
     met = twins.approaches(BehaviorData.load(build / "behavior_data"), 200, np.random.default_rng(0))
-    here, there = (
-        twins.goals_of_page(page, met, 5),
-        twins.goals_of_python(build, build / "simulator", met, 5),
-    )
+    here = twins.goals_of_page(page, met, 5)
+    there = twins.goals_of_python(build, build / "simulator", met, 5)
     assert 0.6 < there.rate(met.side) < 0.85, (
         "goals shift away from whoever is nearer than 1.8 m, which are 70 %"
     )
@@ -478,10 +476,8 @@ def _exported_with(thing: trimesh.Trimesh, folder: Path) -> Path:
     """Export the small world with an additional mesh."""
     small_world.write(folder)
     scene = ply.read_ply(folder / "reconstruction/scene.ply")
-    vertices, faces = (
-        np.concatenate([scene.vertices, thing.vertices]),
-        np.concatenate([scene.faces, thing.faces + len(scene.vertices)]),
-    )
+    vertices = np.concatenate([scene.vertices, thing.vertices])
+    faces = np.concatenate([scene.faces, thing.faces + len(scene.vertices)])
     color = np.concatenate([scene.color, np.full((len(thing.vertices), 3), 99)]).astype(np.uint8)
     ply.write_ply(
         folder / "reconstruction/scene.ply", Mesh(vertices.astype(np.float32), faces.astype(np.int32), color)

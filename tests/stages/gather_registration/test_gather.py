@@ -15,11 +15,9 @@ REFUSED = {"registered": False, "reason": "no overlap", "figures": {}}
 
 
 def _poses() -> RegisteredPoses:
-    camera, agent, ones = (
-        np.repeat(np.eye(4)[None], 5, axis=0),
-        np.repeat(np.eye(4)[None], 5, axis=0),
-        np.ones(5),
-    )
+    camera = np.repeat(np.eye(4)[None], 5, axis=0)
+    agent = np.repeat(np.eye(4)[None], 5, axis=0)
+    ones = np.ones(5)
     agent[2] = np.nan
     return RegisteredPoses(np.arange(5.0), camera, agent, ones, ones, ones > 0)
 

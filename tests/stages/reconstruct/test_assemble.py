@@ -100,10 +100,8 @@ def test_masks_are_weighted_by_visibility(monkeypatch):
         inside = torch.nonzero((hidden[frame] < 0).flatten())[:, 0]
         hidden[frame].view(-1)[inside[len(inside) // keep :]] = 8.0
     monkeypatch.setattr(assemble, "WHOLE_SHARE", 1.0)
-    before, after = (
-        assemble.mask_weights(views),
-        assemble.mask_weights(dataclasses.replace(views, outside_px=hidden)),
-    )
+    before = assemble.mask_weights(views)
+    after = assemble.mask_weights(dataclasses.replace(views, outside_px=hidden))
     assert 0.15 < after[2] / before[2] < 0.35 and after[3] == assemble.MIN_MASK_WEIGHT
     rest = torch.arange(len(before)) > 3
     torch.testing.assert_close(after[rest], before[rest])

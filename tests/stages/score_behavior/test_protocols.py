@@ -157,10 +157,8 @@ def test_networks_alone_sample_by_the_schedule_and_do_not_snap_to_goals(method, 
             self.calls += 1
             return x
 
-    scaling, counted = (
-        Scaling(np.ones(3), np.ones(4), np.ones((3, 56)), np.zeros(6), np.ones(6)),
-        CountingNetworks(),
-    )
+    scaling = Scaling(np.ones(3), np.ones(4), np.ones((3, 56)), np.zeros(6), np.ones(6))
+    counted = CountingNetworks()
     sampler, goal = Sampler(counted, replace(STANDARD, method=method), scaling), np.full((4, 3), 2.0)
     snapped = PlanSamplingConfig(guidance=1.0, max_path_draws=1, sequence_steps=steps)
     alone, ends = snapped.networks_only(), []

@@ -69,11 +69,9 @@ def test_other_animal_is_a_companion_where_visible():
 
 def test_short_gaps_are_interpolated_and_uncertain_frames_are_gaps():
     motion = jittered(np.random.default_rng(0))
-    agent, confidence, visible = (
-        motion.world_from_agent.copy(),
-        motion.confidence.copy(),
-        motion.agent_visible.copy(),
-    )
+    agent = motion.world_from_agent.copy()
+    confidence = motion.confidence.copy()
+    visible = motion.agent_visible.copy()
     agent[50:53] = np.nan
     confidence[100:120] = 0.1
     visible[150:153] = visible[160:175] = False

@@ -249,10 +249,8 @@ def test_approaches_are_oversampled_and_perceived(windows, monkeypatch):
 def test_conditions_are_dropped_together_with_the_given_probability(windows, untrained, monkeypatch):
     monkeypatch.setattr(objective, "CONDITION_DROPOUT", 0.0)
     batch, _ = drawn(windows, replace(PLAIN, approached=0.0))
-    settings, generator = (
-        ObjectiveConfig(code_dropout=0.0, joint_dropout=0.5),
-        torch.Generator().manual_seed(0),
-    )
+    settings = ObjectiveConfig(code_dropout=0.0, joint_dropout=0.5)
+    generator = torch.Generator().manual_seed(0)
     joint = joint_mask(batch, settings, generator)
     assert 0 < joint.mean() < 1
     code = perceive(untrained, batch, settings, generator, joint)
@@ -323,10 +321,8 @@ def test_fast_scene_sampling_agrees_with_the_exact_grid(data, windows):
 
 
 def test_rectified_flow_target_is_noise_minus_sample():
-    schedule, clean = (
-        Schedule(course="rectified"),
-        torch.randn(64, 4, generator=torch.Generator().manual_seed(1)),
-    )
+    schedule = Schedule(course="rectified")
+    clean = torch.randn(64, 4, generator=torch.Generator().manual_seed(1))
     inputs_seen = {}
 
     def denoise(x, t):
@@ -476,9 +472,8 @@ def test_goals_and_paths_have_their_own_fraction_of_approaches(homes, monkeypatc
 def test_contract_is_complete_and_round_trips(windows, untrained, tmp_path):
     scaling = statistics_from_windows(windows, 0.0).scaling
     write_contract(tmp_path, untrained, ARCHITECTURE, scaling, Schedule(), REST)
-    contract, golden = (
-        json.loads((tmp_path / name).read_text()) for name in ("behavior.json", "golden.json")
-    )
+    contract = json.loads((tmp_path / "behavior.json").read_text())
+    golden = json.loads((tmp_path / "golden.json").read_text())
     assert contract["architecture"]["bones"] == len(contract["bones"]) == 3
     assert len(golden["plans"]["guidance_1"]["path"]) == 56
     architecture, loaded, rescaled, schedule, rest = model.load(tmp_path)

@@ -42,10 +42,8 @@ def test_every_network_learns(learned):
 def test_training_is_deterministic_and_ablations_are_written(dataset, learned, tmp_path):
     one = LongTermOptimizerConfig(steps=2, batch=4)
     settings = replace(SETTINGS, body=one, route=one, pose=one, ablations="all")
-    first, second = (
-        learning.train_networks(dataset, settings, sizes=SIZES),
-        learning.train_networks(dataset, replace(settings, ablations="none"), sizes=SIZES),
-    )
+    first = learning.train_networks(dataset, settings, sizes=SIZES)
+    second = learning.train_networks(dataset, replace(settings, ablations="none"), sizes=SIZES)
     for name in ("static", "route", "pose"):
         for key, value in getattr(first.model, name).state_dict().items():
             assert torch.equal(value, getattr(second.model, name).state_dict()[key]), f"{name}.{key}"
