@@ -3,7 +3,6 @@
 import shutil
 import subprocess
 import sys
-import warnings
 
 import numpy as np
 import pytest
@@ -29,15 +28,14 @@ def build(tmp_path_factory):
     return write_build(tmp_path_factory.mktemp("build"))
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("embodiment", ["person", "robot"])
 def test_gymnasium_checker_passes(build, embodiment):
     from gymnasium.utils.env_checker import check_env
 
     how = {"config": QUICK, "embodiment": embodiment, "episode_s": 3.0}
     env = gymnasium.make(NAME, build=str(build), **how)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(env.unwrapped)
+    check_env(env.unwrapped)
 
 
 @pytest.mark.parametrize(
@@ -53,16 +51,15 @@ def test_gymnasium_finds_the_environment_in_a_new_process(lines):
     assert "InputError: ART-003 missing" in done.stderr, "the environment is found, the build is not"
 
 
+@pytest.mark.filterwarnings("error")
 def test_pettingzoo_checks_pass():
     from pettingzoo.test import parallel_api_test, parallel_seed_test
 
     from pipeline.environments.parallel_env import PersonAnimalEnv
 
     world = small_world()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        parallel_api_test(PersonAnimalEnv(world), num_cycles=60)
-        parallel_seed_test(lambda: PersonAnimalEnv(AnimalWorld(world.residents, QUICK)), num_cycles=40)
+    parallel_api_test(PersonAnimalEnv(world), num_cycles=60)
+    parallel_seed_test(lambda: PersonAnimalEnv(AnimalWorld(world.residents, QUICK)), num_cycles=40)
 
 
 def test_vectorized_episodes_restart_and_are_seeded(build):

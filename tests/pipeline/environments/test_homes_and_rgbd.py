@@ -1,7 +1,6 @@
 """Several homes in one world, and rendered RGB-D observations of persons."""
 
 import shutil
-import warnings
 
 import numpy as np
 import pytest
@@ -95,6 +94,7 @@ def test_joined_homes_keep_their_start_states_and_volumes(builds):
     assert open_homes(own, data, []).data is data
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.slow
 @pytest.mark.parametrize("observations", [("rgbd",), ("animal", "rgbd")])
 def test_gymnasium_accepts_image_observations(builds, observations):
@@ -102,9 +102,7 @@ def test_gymnasium_accepts_image_observations(builds, observations):
 
     how = {"homes": [str(build) for build in builds], "config": QUICK, "observations": observations}
     env = gymnasium.make(NAME, build=str(builds[0]), episode_s=3.0, **how)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(env.unwrapped)
+    check_env(env.unwrapped)
     seen, _ = env.reset(seed=0)
     assert set(seen) == {"rgb", "depth", *observations} - {"rgbd"}
     rgb, depth = seen["rgb"].astype(int), seen["depth"]

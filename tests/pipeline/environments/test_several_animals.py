@@ -1,7 +1,6 @@
 """Environments in a home of a cat and a dog."""
 
 import shutil
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +38,7 @@ def three(pair, tmp_path):
     return tmp_path / "three"
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("animal", [None, "dog"])
 def test_gymnasium_checker_passes(pair, animal):
     from gymnasium.utils.env_checker import check_env
@@ -47,23 +47,20 @@ def test_gymnasium_checker_passes(pair, animal):
 
     how = {"config": QUICK, "episode_s": 3.0, "animal": animal}
     env = gymnasium.make("AgentToSim/Cat-v0", build=str(pair), **how)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(env.unwrapped)
+    check_env(env.unwrapped)
     seen, _ = env.reset(seed=0)
     assert seen["others"].shape == (1, 8) and env.unwrapped.world.target == (animal or "cat")
 
 
+@pytest.mark.filterwarnings("error")
 def test_pettingzoo_checks_pass(pair):
     from pettingzoo.test import parallel_api_test, parallel_seed_test
 
     from pipeline.environments.parallel_env import PersonAnimalEnv
 
     world = AnimalWorld.load(pair, QUICK)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        parallel_api_test(PersonAnimalEnv(world), num_cycles=60)
-        parallel_seed_test(lambda: PersonAnimalEnv(AnimalWorld(world.residents, QUICK)), num_cycles=40)
+    parallel_api_test(PersonAnimalEnv(world), num_cycles=60)
+    parallel_seed_test(lambda: PersonAnimalEnv(AnimalWorld(world.residents, QUICK)), num_cycles=40)
 
 
 def test_each_animal_is_an_agent_that_may_be_steered(pair):
