@@ -278,9 +278,9 @@ def rollouts(out: Path, seed: int, scenes: Scenes, takes: RecordedTakes) -> dict
     return found
 
 
-def over_seeds(values: Sequence[float], form: str = ".3f") -> str:
+def over_seeds(values: Sequence[float]) -> str:
     """Format a mean over seeds and its range."""
-    return f"{np.mean(values):{form}} ({min(values):{form}} to {max(values):{form}})"
+    return f"{np.mean(values):.3f} ({min(values):.3f} to {max(values):.3f})"
 
 
 def main() -> None:

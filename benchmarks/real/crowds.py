@@ -49,8 +49,9 @@ class Crowd:
         position[step, person] = rows[:, 2:4]
         return cls(position)
 
-    def walks(self, steps: int = PAST + FUTURE) -> list[Walk]:
+    def walks(self) -> list[Walk]:
         """Return all windows of people who are present throughout, ordered by person and time."""
+        steps = PAST + FUTURE
         known = np.isfinite(self.position[..., 0])
         if len(known) < steps:
             return []
