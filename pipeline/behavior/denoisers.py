@@ -148,9 +148,7 @@ class SequenceDenoiser(nn.Module):
     def velocity(
         self, x: Sequences, t: Steps, condition: Conditions, control: Controls, keep: Keep
     ) -> Float[Tensor, "batch output frame"]:
-        """Return the velocity (v-prediction) in x, then further outputs, if there are any; ``keep`` 0 drops
-        the control.
-        """
+        """Return the velocity (v-prediction) in x, then any further outputs; ``keep`` 0 drops the control."""
         raise NotImplementedError
 
 

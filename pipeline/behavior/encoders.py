@@ -76,9 +76,7 @@ class SetEncoder(nn.Module):
         inside: Float[Tensor, "batch other 1"],
         keep: Float[Tensor, "batch"],
     ) -> tuple[Float[Tensor, "batch code"], Float[Tensor, "batch other head"]]:
-        """Encode features that are zero where ``inside`` is 0, and return the attention; a set of one is not
-        pooled.
-        """
+        """Return code and attention; features are zero where ``inside`` is 0; a set of one is not pooled."""
         present = keep[:, None, None]
         hidden = self.layers[0](features * present) + kind * inside * present * self.animal
         codes = self.layers[1:](hidden)

@@ -304,9 +304,7 @@ class AnimalWorld:
     def _start(
         self, here: Mapping[str, Float[np.ndarray, "2"]], floor: PersonFloor
     ) -> Float[np.ndarray, "2"]:
-        """Draw a free place around the target that is on no other animal, the last one drawn where none is
-        free.
-        """
+        """Draw a free place around the target, on no other animal; the last drawn where none is free."""
         near, far = self.config.start_m
         animal = place = here[self.target]
         for _ in range(START_DRAWS):

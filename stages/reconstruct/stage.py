@@ -10,8 +10,6 @@ from stages.reconstruct import assemble, former, fuse, optimize, pictures, readi
 from stages.reconstruct.config import Config
 from stages.reconstruct.reading import Inputs
 
-__all__ = ["Inputs", "run"]
-
 
 def run(
     inputs: Inputs,
