@@ -108,10 +108,8 @@ def fuse(clip: Clip, masks: Masks, turnaround: Turnaround, voxel_m: float, verti
     """
     frames = np.flatnonzero(masks.visible).tolist()
     points = {frame: _on_animal(clip, masks, turnaround, frame) for frame in frames}
-    together = np.concatenate(list(points.values()))
-    distance = np.linalg.norm(together - np.median(together, axis=0), axis=1)
-    inlier = distance < OUTLIER_FACTOR * np.quantile(distance, OUTLIER_QUANTILE)
-    volume = enclose(together[inlier], voxel_m=voxel_m, truncation_m=TRUNCATION_M)
+    together = _without_outliers(np.concatenate(list(points.values())))
+    volume = enclose(together, voxel_m=voxel_m, truncation_m=TRUNCATION_M)
     counts = _fuse_frames(clip, masks, turnaround, volume, points)
     off_mask, below = counts.share_off_mask(), _below_ground(volume, turnaround)
     body = extract(volume, off_mask, below, vertices)
@@ -150,6 +148,12 @@ def _on_animal(clip: Clip, masks: Masks, turnaround: Turnaround, frame: int) -> 
     own = (depth_labels(masks[frame], clip.depth_size) == 255) & supported(depth)
     points_camera = cameras.back_project(depth, clip.depth_intrinsics[frame])[own].astype(float)
     return rigid.apply(turnaround.world_from_camera[frame], points_camera)
+
+
+def _without_outliers(points_world: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point 3"]:
+    """Remove points much farther from the middle than nearly all others."""
+    distance = np.linalg.norm(points_world - np.median(points_world, axis=0), axis=1)
+    return points_world[distance < OUTLIER_FACTOR * np.quantile(distance, OUTLIER_QUANTILE)]
 
 
 def extract(

@@ -59,11 +59,10 @@ class WalkthroughTerm:
             points = _points(clip, frame, max_points, masks[frame] > 0)
             pixel = cameras.project(points.points_camera, pinholes[frame])[0]
             world = rigid.apply(poses[frame], points.points_camera)
-            overlap = []
-            for pose, lens in zip(self._walked, pinholes[len(clip) :], strict=True):
-                seen, z = cameras.project(rigid.apply(rigid.inverse(pose), world), lens)
-                share = cameras.in_picture(seen, z, walk.clip.color_size).sum() / max(len(z), 1)
-                overlap.append(share * (pose[:3, 2] @ poses[frame, :3, 2]))
+            overlap = [
+                _visible_share(world, pose, lens, walk.clip.color_size) * (pose[:3, 2] @ poses[frame, :3, 2])
+                for pose, lens in zip(self._walked, pinholes[len(clip) :], strict=True)
+            ]
             for key in np.argsort(-np.array(overlap), kind="stable")[:MATCHED_PICTURES]:
                 if overlap[key] > MIN_SHARED:
                     pairs = sift.matches(points.descriptors, walked[key].descriptors)
@@ -98,3 +97,9 @@ def _points(clip, frame, max_points, agent=None) -> sift.SiftPoints:
     free = None if agent is None else cv2.erode((~agent).astype(np.uint8), np.ones((MASK_MARGIN_PX,) * 2))
     lenses = clip.intrinsics[frame], depth, clip.depth_intrinsics[frame]
     return sift.lift(sift.describe(gray, max_points, PEAK_THRESHOLD, free), *lenses)
+
+
+def _visible_share(points_world, world_from_camera, intrinsics, size) -> float:
+    """Return the share of points that project into a camera's picture."""
+    pixel, z = cameras.project(rigid.apply(rigid.inverse(world_from_camera), points_world), intrinsics)
+    return cameras.in_picture(pixel, z, size).sum() / max(len(z), 1)

@@ -89,13 +89,14 @@ def _elsewhere(inputs: Inputs, home: Path, data: BehaviorData, c: Config, device
     moved = move_in(own, ReconstructedHome.of_build(home), data)
     simulator = _simulator(inputs, moved.data, moved.home.scenes(), _sampling(c), ReplanningConfig(), device)
     take = rollout(simulator, _observer(simulator, c), seconds=c.seconds, seed=c.seed)
+    about = elsewhere.metrics(take, moved, home.name)
 
     def write(folder: Path) -> None:
         write_take(folder, take)
-        elsewhere.write_home(folder, take, moved, home.name)
+        elsewhere.write_home(folder, moved, about)
 
-    about = elsewhere.summary(take, moved)
-    return FinishedTake(f"{c.seconds:g} s in the home of {home.name}: {about}", write)
+    summary = f"{c.seconds:g} s in the home of {home.name}: {elsewhere.summary(take, about)}"
+    return FinishedTake(summary, write)
 
 
 def of_home(inputs: Inputs, animals: Path, c: Config, device: str) -> FinishedTake:
@@ -136,13 +137,14 @@ def of_home(inputs: Inputs, animals: Path, c: Config, device: str) -> FinishedTa
     scene = ply.read_ply(where / "reconstruction/scene.ply")
     summary = f"{c.seconds:g} s of {', '.join(names)}"
     summary += f", {apart.min():.2f} m apart at least" if len(names) == 2 else ""
-    for name, here in moved.items():
-        summary += f"; {name}: {elsewhere.summary(takes[name], here)}"
+    about = {name: elsewhere.metrics(takes[name], here, where.name) for name, here in moved.items()}
+    for name, each in about.items():
+        summary += f"; {name}: {elsewhere.summary(takes[name], each)}"
 
     def write(folder: Path) -> None:
         write_takes(folder, takes, scene)
         for name, here in moved.items():
-            elsewhere.write_home(folder / name, takes[name], here, where.name)
+            elsewhere.write_home(folder / name, here, about[name])
 
     return FinishedTake(summary, write)
 

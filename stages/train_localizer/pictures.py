@@ -1,6 +1,7 @@
 """Quality page of a localizer: error histogram and worst held-out views."""
 
 import numpy as np
+from jaxtyping import UInt8
 
 from pipeline.data import plots
 from pipeline.data.qa import Check, Picture
@@ -44,11 +45,10 @@ def pictures(held_out: HeldOutErrors, localizer: Localizer, target: Target) -> l
     rotation = np.nan_to_num(held_out.rotation_deg, nan=180.0)
     worst = np.argsort(-rotation, kind="stable")[:8]
     probability = localizer.calibration.probability(held_out.inlier_ratio)
-    tiles = []
-    for index in worst:
-        picture, text = held_out.views[index].color, f"{rotation[index]:.1f} deg, p {probability[index]:.2f}"
-        size = [round(side * EDGE_PX / max(picture.shape[:2])) for side in picture.shape[:2]]
-        tiles.append(plots.labeled(plots.resized(picture, (size[0], size[1])), text))
+    tiles = [
+        _tile(held_out.views[index].color, f"{rotation[index]:.1f} deg, p {probability[index]:.2f}")
+        for index in worst
+    ]
     series = {"rotation error [deg]": np.clip(rotation, 0.1, 180)}
     errors = plots.histograms(series, log=True, good_below=POSE_TOLERANCE[target][0])
     what = "The eight held-out renders with the largest error, and the probability they were given."
@@ -56,3 +56,10 @@ def pictures(held_out: HeldOutErrors, localizer: Localizer, target: Target) -> l
         Picture("errors", errors, "Rotation error of held-out renders, in degrees; green: counted as right."),
         Picture("worst", plots.grid(tiles, 4), what),
     ]
+
+
+def _tile(picture: UInt8[np.ndarray, "height width 3"], text: str) -> UInt8[np.ndarray, "_ _ 3"]:
+    """Resize a picture's longer side to 240 pixels and label it."""
+    scale = EDGE_PX / max(picture.shape[:2])
+    size = (round(picture.shape[0] * scale), round(picture.shape[1] * scale))
+    return plots.labeled(plots.resized(picture, size), text)
