@@ -209,8 +209,8 @@ class AnimalBatch:
 
     def _intent(self, some: Int[np.ndarray, "some"]) -> Float[np.ndarray, "some frame 3"]:
         """Return where animals with companions intend to be: what is left of their plans, moved with the
-        companion that the goal is beside. NaN after the horizon, without companions, when commanded, and
-        where the observer has moved, to whom animals react anew.
+        companion that the goal is beside, where they may be. NaN after the horizon, without companions,
+        when commanded, and where the observer has moved, to whom animals react anew.
         """
         others, then = self._others_now()[some, 1:], self.planned_others[some, 1:]
         intent = np.full((len(some), self.plan_frames, 3), np.nan)
@@ -225,7 +225,8 @@ class AnimalBatch:
             moved = (others - then)[row, away.argmin()] if attached else np.zeros(3)
             frame = (self.played[animal] + np.arange(left)).clip(max=self.plan_frames - 1)
             path = self.plan.root[animal, frame, :3, 3]
-            intent[row, :left] = path + moved * (np.arange(left) / left)[:, None]
+            moving = path + moved * (np.arange(left) / left)[:, None]
+            intent[row, :left] = self._where_allowed(moving[None], some[[row]])[0]
         return intent
 
     def _draw_plans(

@@ -310,6 +310,14 @@ def test_intent_moves_with_the_companion_at_the_goal_and_ends_with_the_horizon(s
     intent, rest = animals._intent(first)[0], animals.plan.root[0, 5:, :3, 3]
     assert np.isnan(intent[left:]).all()
     np.testing.assert_allclose(intent[:left], rest + moved * (np.arange(left) / left)[:, None])
+    volume = animals.scenes.volumes[0]
+    wall = volume.origin[0] + volume.voxel_m * np.ceil(
+        (rest[-1, 0] + 0.03 - volume.origin[0]) / volume.voxel_m
+    )
+    here = volume.origin[0] + volume.voxel_m * np.arange(volume.occupancy.shape[0]) < wall - 1e-6
+    allowed = np.broadcast_to(here[:, None, None], volume.occupancy.shape)
+    animals.scenes = Scenes((volume,), (allowed,), np.zeros(1, int))
+    assert not animals.scenes.inside_solid(animals._intent(first)[:, :left], None).any(), "within the home"
     animals.goal[0] += 2.0
     np.testing.assert_allclose(animals._intent(first)[0, :left], rest)
     animals.observer[-1][0] += ABSENT_M

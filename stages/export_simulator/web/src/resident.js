@@ -98,10 +98,12 @@ export class Resident {
 
   // A line in time whose blends of plans stay where plans do.
   timed(past, tick) {
+    return new Timeline(past, tick, (place) => this.whereAllowed(place));
+  }
+
+  whereAllowed(place) {
     const { avoid_solid: kept } = this.contract.behavior.sampling;
-    return new Timeline(past, tick, (place) =>
-      kept && this.home.state.scene ? this.space.cleared(place) : place,
-    );
+    return kept && this.home.state.scene ? this.space.cleared(place) : place;
   }
 
   // Live, replay a clip, or be away, from now on.
@@ -282,7 +284,7 @@ export class Resident {
     const moved = [0, 1, 2].map((axis) => (beside ? nearest[0].place[axis] - nearest[1][axis] : 0));
     return Array.from({ length: left }, (_, i) => {
       const place = rootOf(this.timeline.at(start + i + 1)).slice(0, 3);
-      return place.map((value, axis) => value + (moved[axis] * i) / left);
+      return this.whereAllowed(place.map((value, axis) => value + (moved[axis] * i) / left));
     });
   }
 
