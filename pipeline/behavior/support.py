@@ -74,6 +74,22 @@ def mark_supported(
     return allowed.astype(np.uint8) + (allowed & beneath & (occupancy != 1))
 
 
+def with_headroom(
+    marks: UInt8[np.ndarray, "x y z"], voxel_m: float, range_m: Float[np.ndarray, "2 2"]
+) -> UInt8[np.ndarray, "x y z"]:
+    """Return the marks with supports only where the root may be at its lowest height (`Support.range_m`)
+    above them, and nothing allowed in columns without supports. Unchanged if heights are unknown.
+    """
+    lowest = range_m[:, 0].min()
+    if not np.isfinite(lowest):
+        return marks
+    above = max(int(lowest / voxel_m), 0)
+    fits = np.zeros(marks.shape, bool)
+    fits[:, : marks.shape[1] - above] = marks[:, above:] > 0
+    marks = np.where((marks >= SUPPORTED) & ~fits, 1, marks).astype(np.uint8)
+    return marks * (marks >= SUPPORTED).any(1, keepdims=True)
+
+
 def floor_level(supported: Bool[np.ndarray, "x y z"]) -> int | None:
     """Return the index along y of the voxels right above the floor; None without supports."""
     count = supported.sum((0, 2))

@@ -21,7 +21,7 @@ from pipeline.backends.descriptors import Describer
 from pipeline.behavior.path_encoding import REST_SPEED_M_S
 from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.support import SUPPORTED, Support, floor_level
+from pipeline.behavior.support import SUPPORTED, Support, floor_level, with_headroom
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, Trajectory
 from pipeline.core.errors import InputError
 from pipeline.data import npz
@@ -96,6 +96,11 @@ class ReconstructedHome:
         support = Support.of(self.volume, self.marks, self.stands_m)
         return Scenes((self.volume,), (self.marks > 0,), np.zeros(1, int), (support,))
 
+    def fitting(self, stands_m: Float[np.ndarray, "2 2"]) -> "ReconstructedHome":
+        """Return the home for a body of other heights, with supports where it fits."""
+        marks = with_headroom(self.marks, self.volume.voxel_m, stands_m)
+        return replace(self, marks=marks, stands_m=stands_m)
+
     def height_above_top(self, track: Trajectory, count: int) -> float:
         """Return the height of the root above its support in the last of ``count`` frames, meters, clipped to
         the animal's usual range at rest or in motion.
@@ -137,7 +142,7 @@ def move_in_together(
 
     Raises ART-007 and SIM-011 as `perceived` does, SIM-011 where no moment fits in.
     """
-    seen = {name: replace(perceived(own, other), stands_m=own.stands_m) for name, (own, _) in animals.items()}
+    seen = {name: perceived(own, other).fitting(own.stands_m) for name, (own, _) in animals.items()}
     starts = place_starts(animals, next(iter(seen.values())), np.random.default_rng(0))
     return {
         name: MovedAnimal(seen[name], starts[name], share_known(own, seen[name]))

@@ -9,7 +9,7 @@ from scipy.ndimage import binary_dilation
 
 from pipeline.behavior.path_encoding import REST_SPEED_M_S
 from pipeline.behavior.perception import FeatureVolume
-from pipeline.behavior.support import height_ranges, mark_supported
+from pipeline.behavior.support import height_ranges, mark_supported, with_headroom
 from pipeline.behavior.trajectories import (
     FUTURE,
     PAST,
@@ -105,4 +105,5 @@ def write_volumes(
     files = [folder / "volume.npz"] if shared else [folder / "volumes" / f"{id}.npz" for id in videos]
     files[0].parent.mkdir(exist_ok=True)
     for file, volume, allowed in zip(files, volumes, marks, strict=True):
-        npz.save(file, compress=True, **vars(volume), allowed=allowed, stands_m=stands_m)
+        fitting = with_headroom(allowed, volume.voxel_m, stands_m)
+        npz.save(file, compress=True, **vars(volume), allowed=fitting, stands_m=stands_m)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.behavior.perception import FeatureVolume
-from pipeline.behavior.support import mark_supported
+from pipeline.behavior.support import mark_supported, with_headroom
 from pipeline.behavior.trajectories import Trajectory
 from pipeline.data import npz
 from pipeline.geometry import rigid
@@ -77,6 +77,17 @@ def test_floor_is_level_unless_recordings_show_that_it_is_not(raised):
     level = with_level_floor(marks, volume, place)
     assert (level > 0).sum() >= (marks > 0).sum(), "nothing is forbidden"
     assert len(np.unique((level == SUPPORTED)[10:30, :, 20].argmax(1))) == (1 if raised == 0 else 2)
+
+
+def test_supports_are_where_the_body_fits():
+    _, marks = room(1.0)
+    marks[11:13, 3:5, 11:20] = 0  # nobody saw the space above this floor
+    stands_m = np.array([[0.21, 0.28], [0.25, 0.3]])
+    kept = with_headroom(marks, 0.1, stands_m)
+    assert not kept[11:13, :, 11:20].any()
+    marks[11:13, :, 11:20] = 0
+    np.testing.assert_array_equal(kept[10:30, :, 10:30], marks[10:30, :, 10:30])
+    np.testing.assert_array_equal(with_headroom(marks, 0.1, np.full((2, 2), np.nan)), marks)
 
 
 def test_home_is_the_floor_where_the_animal_was():
