@@ -79,6 +79,11 @@ class Clip:
         """Return whether cameras and depth come from the map instead of its own measurements."""
         return self.scale == MAPPED
 
+    @property
+    def has_foreground(self) -> bool:
+        """Return whether what stands in front of the map was segmented: in a mapped turnaround."""
+        return (self.folder / "foreground").exists()
+
     @classmethod
     def open(cls, folder: Path) -> "Clip":
         """Open a finished ``frames/<id>`` artifact."""
@@ -105,6 +110,10 @@ class Clip:
     def confidence(self, frame: int) -> UInt8[np.ndarray, "height width"]:
         """Read one frame's depth confidence: 0 low, 1 medium, 2 high."""
         return images.read_gray(self.folder / "confidence" / f"{frame:06d}.png")
+
+    def foreground(self, frame: int) -> UInt8[np.ndarray, "height width"]:
+        """Read what stands in front of the map, 255, else 0, of a recording that `has_foreground`."""
+        return images.read_gray(self.folder / "foreground" / f"{frame:06d}.png")
 
 
 @dataclass(frozen=True)

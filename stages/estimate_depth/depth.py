@@ -11,7 +11,7 @@ from pipeline.core.progress import track
 from pipeline.geometry import contact, subsampling
 from pipeline.mapping import plane_sweep
 from pipeline.mapping.plane_sweep import SweepView
-from stages.estimate_depth import foreground, tracking
+from stages.estimate_depth import foreground, standing, tracking
 from stages.estimate_depth.foreground import ColorView
 from stages.estimate_depth.tracking import MapViews
 
@@ -30,8 +30,10 @@ MAX_CONTACT_GAP_S = 2.0
 SWEPT_PX, SOURCES, PLANES, ANGLES_DEG = 224, 4, 96, (3.0, 22.0)
 """Plane sweep of turnarounds: longer side of pictures, pixels; source frames; planes; range of triangulation
 angles at the middle of the view, degrees."""
-NEAREST_M, FARTHEST_SHARE = 0.25, 1.3
-"""Nearest plane, meters; farthest plane in units of the map's largest depth."""
+REACH_QUANTILES, REACH = (0.05, 0.95), (0.5, 1.1)
+"""Quantiles of the map's depth behind what stands in front of it, and factors on them: the planes' range."""
+GRAY = np.uint8(128)
+"""Gray level of the map in stereo of what stands in front of it."""
 MIN_AGREEING = 2
 """Other frames that must agree on a depth; one more makes it certain."""
 
@@ -55,6 +57,8 @@ class FrameDepth:
     """2 from the map, or confirmed by several frames; 1 at edges, or inferred; 0 unknown."""
     inferred: bool
     """Whether part of it is an animal's, by contact or by a network."""
+    foreground: UInt8[np.ndarray, "height width"] | None = None
+    """255 where something stands in front of the map, else 0; only of turnarounds."""
 
 
 def of_map(target: ColorView) -> FrameDepth:
@@ -137,29 +141,45 @@ def _with_animal(frame, target: ColorView, blobs, touched, carried, length_m, de
 
 
 def of_turnaround(shown: Sequence[ColorView], room: MapViews, walk: Sequence[ColorView]) -> list[FrameDepth]:
-    """Return the depth of frames that circle a resting animal: by multi-view stereo, else from the map."""
-    views = [_sweep_view(each) for each in shown]
+    """Return the depth of frames that circle a resting animal: from the map, in front of it by stereo."""
+    by_view = {id(each.view): each for each in walk}
+    differing = []
+    for frame in standing.references(len(shown)):
+        seen = [by_view[id(view)] for view in tracking.walk_views(shown[frame].view, room)]
+        differing.append(foreground.foreground(shown[frame], seen, []))
+    in_front = standing.segment(shown, differing)
+    views = [_sweep_view(each, mask) for each, mask in zip(shown, in_front, strict=True)]
     others = [_source_frames(number, shown) for number in range(len(shown))]
-    farthest = [FARTHEST_SHARE * float(each.view.depth.max(initial=1.0)) for each in shown]
-    swept = plane_sweep.depths(views, others, [(NEAREST_M, far) for far in farthest], PLANES)
-    by_view, found = {id(each.view): each for each in walk}, []
-    for target, both in zip(track(shown, "multi-view consistency"), swept, strict=True):
-        size = target.view.gray.shape[::-1]
+    reach = [_reach_m(each.view.depth, mask) for each, mask in zip(shown, in_front, strict=True)]
+    found = []
+    for target, mask, both in zip(
+        shown, in_front, plane_sweep.depths(views, others, reach, PLANES), strict=True
+    ):
+        size, mapped = target.view.gray.shape[::-1], of_map(target)
         several, agree = (cv2.resize(each, size, interpolation=cv2.INTER_NEAREST) for each in both)
-        known = agree >= MIN_AGREEING
-        seen = [by_view[id(view)] for view in tracking.walk_views(target.view, room)]
-        in_front = cv2.dilate(foreground.foreground(target, seen, []).astype(np.uint8), DILATION) > 0
-        mapped = of_map(target)
-        depth = np.where(known, several, np.where(in_front, 0, mapped.depth))
-        sure = np.clip(agree.astype(int) - MIN_AGREEING + 1, 0, 2)
-        confidence = np.where(known, sure, np.where(depth > 0, 1, 0))
-        found.append(FrameDepth(depth.astype(np.float32), confidence.astype(np.uint8), False))
+        known = (agree >= MIN_AGREEING) & ((mapped.depth == 0) | (several < mapped.depth))
+        depth = np.where(mask, np.where(known, several, 0), mapped.depth)
+        sure = np.where(known, np.clip(agree.astype(int) - MIN_AGREEING + 1, 0, 2), 0)
+        confidence = np.where(mask, sure, mapped.confidence)
+        parts = depth.astype(np.float32), confidence.astype(np.uint8), False, mask * np.uint8(255)
+        found.append(FrameDepth(*parts))
     return found
 
 
-def _sweep_view(shown: ColorView) -> SweepView:
+def _sweep_view(shown: ColorView, mask: Bool[np.ndarray, "height width"]) -> SweepView:
+    """Return a view for stereo in which the map is gray: windows at thin parts match by their outlines."""
     view, side_px = shown.view, min(SWEPT_PX, max(shown.view.gray.shape))
-    return SweepView.resized(view.gray, view.intrinsics, view.world_from_camera, side_px)
+    gray = np.where(mask, view.gray, GRAY)
+    return SweepView.resized(gray, view.intrinsics, view.world_from_camera, side_px)
+
+
+def _reach_m(
+    mapped: Float[np.ndarray, "height width"], mask: Bool[np.ndarray, "height width"]
+) -> tuple[float, float]:
+    """Return the nearest and farthest plane: what stands in front of the map reaches it at its feet."""
+    behind = mapped[mask & (mapped > 0)]
+    low, high = np.quantile(behind if len(behind) else DEPTH_RANGE_M, REACH_QUANTILES)
+    return REACH[0] * float(low), REACH[1] * float(high)
 
 
 def _source_frames(number: int, shown: Sequence[ColorView]) -> list[int]:

@@ -28,7 +28,7 @@ from stages.segment_agent.refine import Edges
 from stages.segment_agent.resting import find_resting, is_resting
 from stages.segment_agent.segmenter import Mask, Segmenter, with_color_histogram
 from stages.segment_agent.trajectory import CameraPath, estimate_trajectory
-from stages.segment_agent.turnaround import EDGES, axes_focus, find_standing
+from stages.segment_agent.turnaround import EDGES, axes_focus, find_standing, foreground_evidence
 from stages.segment_agent.windows import Sphere, project_sphere, tracked, working_size
 
 POSITIVES_PER_NEGATIVE = 3
@@ -36,7 +36,8 @@ POSITIVES_PER_NEGATIVE = 3
 MIN_RECALL = 0.6
 """minimum recall on training pictures: an undertrained network would suppress the animal"""
 GROWTH = 2.0
-"""factor on the search radius of presumed spheres, once the appearance is known"""
+"""factor on the search radius of presumed spheres, once the appearance is known, and of what stands in
+front of the map, whose thin parts have no depth"""
 STATIC_STRIDE = 3
 """stride of depth samples that test a frame without a track for motion, pixels"""
 PROBES = 12
@@ -123,6 +124,9 @@ def _standing_segmenter(
     """Prepare the masks of a turnaround: what stands on the ground where the optical axes meet."""
     focus = axes_focus(poses) if placed is None else placed.center_world
     spheres, evidence_of = find_standing(clip, poses, focus)
+    if clip.has_foreground:
+        spheres = [each and replace(each, radius_m=GROWTH * each.radius_m) for each in spheres]
+        evidence_of = foreground_evidence(clip, evidence_of, working_size(clip, config.height_px))
     return with_color_histogram(Segmenter(clip, poses, spheres, evidence_of, config.height_px, edges=EDGES))
 
 

@@ -7,6 +7,7 @@ cluster of points above that ground nearest to the axes' meeting point is the an
 from dataclasses import dataclass
 from typing import cast
 
+import cv2
 import numpy as np
 import scipy.ndimage
 from jaxtyping import Bool, Float
@@ -172,5 +173,21 @@ def cluster_evidence(cluster: Cluster, ground: GroundPlane, whole: bool = True) 
             log_odds[uncertain], certainty[uncertain] = 0.0, UNKNOWN
         sure = window.trusted & (log_odds > 2)
         return Evidence(log_odds, certainty, sure, sure, log_odds <= -2)
+
+    return evidence_of
+
+
+def foreground_evidence(clip: Clip, standing: EvidenceOf, size: tuple[int, int]) -> EvidenceOf:
+    """Evidence of the clip's foreground, of which what is ``standing`` there for sure is part of the animal.
+
+    ``size``: of working pictures.
+    """
+
+    def evidence_of(frame: int, window: Window, sphere: Sphere) -> Evidence:
+        mask = cv2.resize(clip.foreground(frame), size[::-1], interpolation=cv2.INTER_NEAREST)
+        inside = mask[window.rows, window.columns] > 0
+        sure = standing(frame, window, sphere).animal & inside
+        log_odds = np.where(inside, SURE, -SURE)
+        return Evidence(log_odds, np.ones(inside.shape), sure, sure, ~inside)
 
     return evidence_of

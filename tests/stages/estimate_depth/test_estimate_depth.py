@@ -65,14 +65,16 @@ def test_turnaround_has_multi_view_depth(mapped, tmp_path):
     path, agent = filmed_room.circle(28)
     clip, kept, depth, masks = estimate(mapped, tmp_path, path, agent, "turnaround")
     check_cameras(clip, path[kept])
-    off, known = [], []
+    off, known, overlap = [], [], []
     for frame in range(2, len(clip) - 2):
-        found, confidence = clip.depth(frame), clip.confidence(frame)
+        found, confidence, in_front = clip.depth(frame), clip.confidence(frame), clip.foreground(frame) > 0
+        overlap.append((in_front & masks[frame]).sum() / (in_front | masks[frame]).sum())
         animal = masks[frame] & (confidence > 0)
         known.append(animal.sum() / masks[frame].sum())
         off.append(np.median(np.abs(found - depth[frame])[animal]))
     assert np.median(known) > 0.3
     assert np.median(off) < 0.03
+    assert clip.has_foreground and np.median(overlap) > 0.8
 
 
 @pytest.mark.slow

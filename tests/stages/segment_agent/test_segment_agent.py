@@ -76,6 +76,24 @@ def test_standing_animal_is_segmented_in_a_turnaround(tmp_path):
     )
 
 
+def test_foreground_completes_what_has_no_depth(tmp_path):
+    poses, agent = scenery.turnaround(20)
+    truth = scenery.record(tmp_path, poses, agent, poses)
+    clip = Clip.open(tmp_path)
+    (tmp_path / "foreground").mkdir()
+    unknown = np.indices(scenery.DEPTH_SIZE)[1] // 10 % 3 == 0
+    for frame, mask in enumerate(truth.masks):
+        shown = mask.copy()
+        shown[:4, :4] = True
+        images.write_gray(tmp_path / "foreground" / f"{frame:06d}.png", shown * np.uint8(255))
+        depth = np.where(unknown, np.float32(0), clip.depth(frame))
+        images.write_depth(tmp_path / "depth" / f"{frame:06d}.exr", depth)
+    segmented = masks.segment(clip, tmp_path, "turnaround", None, OPTIONS, np.random.default_rng(0))
+    found = [each.labels == 255 for each in segmented.masks]
+    assert np.mean([iou(own, true) for own, true in zip(found, truth.masks, strict=True)]) > 0.94
+    assert not any(own[:4, :4].any() for own in found), "foreground that nothing standing is part of"
+
+
 def around(middle, radius_m, outward=False, count=12):
     """Return level cameras on a circle that face its center or away from it."""
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)

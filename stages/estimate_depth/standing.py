@@ -1,0 +1,116 @@
+"""What stands in front of the map in the pictures of a turnaround, by their consistency with one another.
+
+The animal rests, and so does its shadow: a point of the map has the same color in every picture that sees it.
+A pixel shows the map if its color is likely among the colors that other pictures show there, where nothing
+covers it, and else what stands in front (kernel density estimation as of Elgammal et al. 2000, over views in
+place of times). What covers the map is found in rounds, beginning with what differs from the walk-through.
+"""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import scipy.ndimage
+from jaxtyping import Bool, Float
+
+from pipeline.core.progress import track
+from pipeline.geometry import cameras, subsampling
+from pipeline.segmentation.grabcut import dilated
+from stages.estimate_depth import views
+from stages.estimate_depth.foreground import ColorView
+
+REFERENCES, ROUNDS = 24, 3
+"""Frames spread over the recording whose colors are compared, and rounds of segmenting these."""
+FIRST_MARGIN_PX, MARGIN_PX = 6, 2
+"""Margins of what covers the map in the first round and in later ones, pixels of small pictures."""
+NOISE_STRIDE, NOISES, MIN_NOISE = 4, 2.0, 1.0
+"""Stride of pixels and of references at which noise is measured; bandwidth of the kernel in deviations
+of the noise, which misalignment adds to; least noise, 8-bit CIE Lab."""
+BINS, BLUR_BINS = np.array([16, 24, 24]), 0.7
+"""Bins of the histogram of what stands in front, along the axes of Lab, and its smoothing."""
+LEAST_DENSITY, MAX_LOG_ODDS, MIN_SEEN = 1e-7, 6.0, 2
+"""Density of colors that are neither; largest log-odds of a pixel; least pictures that see its point."""
+RADIUS_PX, EDGE = 2, 0.1
+"""Guided filter of log-odds: radius in pixels, standard deviation of color (0..1) below which it smooths."""
+Mask = Bool[np.ndarray, "height width"]
+Lab = Float[np.ndarray, "*shape 3"]
+
+
+def segment(shown: Sequence[ColorView], differing: Sequence[Mask]) -> list[Mask]:
+    """Return what stands in front of the map in every view; ``differing``: a first guess for `references`."""
+    chosen, margin_px, covered = references(len(shown)), FIRST_MARGIN_PX, list(differing)
+    bandwidth = NOISES * _noise(shown, chosen)
+    for number in range(ROUNDS + 1):
+        cores = [
+            shown[frame].lab[~dilated(~mask, MARGIN_PX)] for frame, mask in zip(chosen, covered, strict=True)
+        ]
+        own = _histogram(np.concatenate(cores))
+        blocked = {frame: dilated(mask, margin_px) for frame, mask in zip(chosen, covered, strict=True)}
+        frames = chosen if number < ROUNDS else range(len(shown))
+        covered = [
+            _in_front(shown, frame, blocked, own, bandwidth) for frame in track(frames, "comparing views")
+        ]
+        margin_px = MARGIN_PX
+    return covered
+
+
+def references(count: int) -> list[int]:
+    """Return the frames that each frame is compared with."""
+    return subsampling.evenly(count, REFERENCES).tolist()
+
+
+def _in_front(shown, frame: int, blocked: dict[int, Mask], own, bandwidth: Lab) -> Mask:
+    """Return where a color is more likely of what stands in front than of the map at that point."""
+    target, scale = shown[frame], float(np.prod(bandwidth)) * (2 * np.pi) ** 1.5
+    density, seen = np.zeros(target.view.gray.shape, np.float32), np.zeros(target.view.gray.shape, np.float32)
+    for other, cover in blocked.items():
+        if other == frame:
+            continue
+        there, known, color = _colors(target, shown[other])
+        known &= cv2.remap(cover.astype(np.uint8), *_index(there), cv2.INTER_NEAREST, borderValue=1) == 0
+        distance = (((color - target.lab) / bandwidth) ** 2).sum(-1)
+        density += np.exp(-distance / 2) * known
+        seen += known
+    mapped = density / np.maximum(seen, 1) / scale
+    log_odds = np.log(own[_bin(target.lab)] + LEAST_DENSITY) - np.log(mapped + LEAST_DENSITY)
+    log_odds = np.where(seen < MIN_SEEN, 0, np.clip(log_odds, -MAX_LOG_ODDS, MAX_LOG_ODDS)).astype(np.float32)
+    guide = target.color.astype(np.float32) / 255
+    return cv2.ximgproc.guidedFilter(guide, log_odds, RADIUS_PX, EDGE**2) > 0
+
+
+def _colors(target: ColorView, source: ColorView) -> tuple[np.ndarray, Mask, Lab]:
+    """Return where a source shows a target's points of the map, whether it sees them, and its colors."""
+    there, known = views.warp(target.view, source.view)
+    color = cameras.sample_bilinear(source.lab, there).astype(np.float32)
+    if known.any():  # exposure and white balance change while the phone circles
+        color += np.median((target.lab - color)[known], axis=0)
+    return there, known, color
+
+
+def _index(there: Float[np.ndarray, "height width 2"]) -> tuple[np.ndarray, np.ndarray]:
+    return there[..., 0] - 0.5, there[..., 1] - 0.5
+
+
+def _noise(shown: Sequence[ColorView], chosen: Sequence[int]) -> Float[np.ndarray, "3"]:
+    """Return the standard deviation (robust) of colors around the median of the other pictures."""
+    off = []
+    step = np.s_[::NOISE_STRIDE, ::NOISE_STRIDE]
+    for frame in chosen[::NOISE_STRIDE]:
+        seen = [_colors(shown[frame], shown[other])[1:] for other in chosen if other != frame]
+        color = np.stack([np.where(known[step][..., None], color[step], np.nan) for known, color in seen])
+        often = np.isfinite(color[..., 0]).sum(0) >= MIN_SEEN
+        off.append(shown[frame].lab[step][often] - np.nanmedian(color[:, often], axis=0))
+    return np.maximum(1.4826 * np.median(np.abs(np.concatenate(off)), axis=0), MIN_NOISE).astype(np.float32)
+
+
+def _histogram(lab: Float[np.ndarray, "pixel 3"]) -> Float[np.ndarray, "light a b"]:
+    """Return the density of colors, per unit of Lab."""
+    counts = np.zeros(BINS, np.float32)
+    np.add.at(counts, _bin(lab), 1.0)
+    smooth = scipy.ndimage.gaussian_filter(counts, BLUR_BINS)
+    return smooth / max(len(lab), 1) * float(np.prod(BINS / 255))
+
+
+def _bin(lab: Lab) -> tuple[np.ndarray, ...]:
+    at = np.clip(lab / 255 * BINS, 0, BINS - 1).astype(int)
+    return at[..., 0], at[..., 1], at[..., 2]
