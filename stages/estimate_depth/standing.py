@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.core.progress import track
 from pipeline.geometry import cameras, subsampling
+from pipeline.mapping.bundle_adjustment import MAD_TO_SIGMA
 from pipeline.segmentation.grabcut import dilated
 from stages.estimate_depth import views
 from stages.estimate_depth.foreground import ColorView
@@ -38,19 +39,15 @@ Lab = Float[np.ndarray, "*shape 3"]
 
 def segment(shown: Sequence[ColorView], differing: Sequence[Mask]) -> list[Mask]:
     """Return what stands in front of the map in every view; ``differing``: a first guess for `references`."""
-    chosen, margin_px, covered = references(len(shown)), FIRST_MARGIN_PX, list(differing)
+    chosen, covered = references(len(shown)), list(differing)
     bandwidth = NOISES * _noise(shown, chosen)
     for number in range(ROUNDS + 1):
-        cores = [
-            shown[frame].lab[~dilated(~mask, MARGIN_PX)] for frame, mask in zip(chosen, covered, strict=True)
-        ]
-        own = _histogram(np.concatenate(cores))
-        blocked = {frame: dilated(mask, margin_px) for frame, mask in zip(chosen, covered, strict=True)}
-        frames = chosen if number < ROUNDS else range(len(shown))
-        covered = [
-            _in_front(shown, frame, blocked, own, bandwidth) for frame in track(frames, "comparing views")
-        ]
-        margin_px = MARGIN_PX
+        pairs = list(zip(chosen, covered, strict=True))
+        own = _histogram(np.concatenate([shown[at].lab[~dilated(~mask, MARGIN_PX)] for at, mask in pairs]))
+        margin_px = MARGIN_PX if number else FIRST_MARGIN_PX
+        blocked = {frame: dilated(mask, margin_px) for frame, mask in pairs}
+        frames = track(chosen if number < ROUNDS else range(len(shown)), "comparing views")
+        covered = [_in_front(shown, frame, blocked, own, bandwidth) for frame in frames]
     return covered
 
 
@@ -61,7 +58,7 @@ def references(count: int) -> list[int]:
 
 def _in_front(shown, frame: int, blocked: dict[int, Mask], own, bandwidth: Lab) -> Mask:
     """Return where a color is more likely of what stands in front than of the map at that point."""
-    target, scale = shown[frame], float(np.prod(bandwidth)) * (2 * np.pi) ** 1.5
+    target, scale = shown[frame], float(np.prod(bandwidth)) * (2 * np.pi) ** (3 / 2)
     density, seen = np.zeros(target.view.gray.shape, np.float32), np.zeros(target.view.gray.shape, np.float32)
     for other, cover in blocked.items():
         if other == frame:
@@ -93,14 +90,14 @@ def _index(there: Float[np.ndarray, "height width 2"]) -> tuple[np.ndarray, np.n
 
 def _noise(shown: Sequence[ColorView], chosen: Sequence[int]) -> Float[np.ndarray, "3"]:
     """Return the standard deviation (robust) of colors around the median of the other pictures."""
-    off = []
-    step = np.s_[::NOISE_STRIDE, ::NOISE_STRIDE]
+    off, step = [], np.s_[::NOISE_STRIDE, ::NOISE_STRIDE]
     for frame in chosen[::NOISE_STRIDE]:
         seen = [_colors(shown[frame], shown[other])[1:] for other in chosen if other != frame]
         color = np.stack([np.where(known[step][..., None], color[step], np.nan) for known, color in seen])
         often = np.isfinite(color[..., 0]).sum(0) >= MIN_SEEN
         off.append(shown[frame].lab[step][often] - np.nanmedian(color[:, often], axis=0))
-    return np.maximum(1.4826 * np.median(np.abs(np.concatenate(off)), axis=0), MIN_NOISE).astype(np.float32)
+    sigma = MAD_TO_SIGMA * np.median(np.abs(np.concatenate(off)), axis=0)
+    return np.fmax(sigma, MIN_NOISE).astype(np.float32)
 
 
 def _histogram(lab: Float[np.ndarray, "pixel 3"]) -> Float[np.ndarray, "light a b"]:
