@@ -151,10 +151,8 @@ def of_turnaround(shown: Sequence[ColorView], room: MapViews, walk: Sequence[Col
     views = [_sweep_view(each, mask) for each, mask in zip(shown, in_front, strict=True)]
     others = [_source_frames(number, shown) for number in range(len(shown))]
     reach = [_reach_m(each.view.depth, mask) for each, mask in zip(shown, in_front, strict=True)]
-    found = []
-    for target, mask, both in zip(
-        shown, in_front, plane_sweep.depths(views, others, reach, PLANES), strict=True
-    ):
+    swept, found = plane_sweep.depths(views, others, reach, PLANES), []
+    for target, mask, both in zip(shown, in_front, swept, strict=True):
         size, mapped = target.view.gray.shape[::-1], of_map(target)
         several, agree = (cv2.resize(each, size, interpolation=cv2.INTER_NEAREST) for each in both)
         known = (agree >= MIN_AGREEING) & ((mapped.depth == 0) | (several < mapped.depth))
