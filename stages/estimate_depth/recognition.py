@@ -3,11 +3,10 @@
 A difference is not always the animal: its shadow differs too, and where the map has holes nothing does.
 """
 
-import cv2
 import numpy as np
 from jaxtyping import Bool
 
-from pipeline.segmentation.appearance import Appearance
+from pipeline.segmentation.appearance import Appearance, strongest
 from pipeline.segmentation.grabcut import dilated, sharpened
 from stages.estimate_depth.foreground import ColorView
 
@@ -24,8 +23,4 @@ def recognize(
     """Return the animal's mask: of what is recognized near foreground, the part with the most evidence."""
     log_odds = network.log_odds(target.color)
     near = (log_odds > 0) & dilated(in_front, REACH_PX)
-    count, part = cv2.connectedComponents(near.astype(np.uint8), connectivity=8)
-    if count < 2:
-        return np.zeros(in_front.shape, bool)
-    evidence = np.bincount(part.ravel(), np.maximum(log_odds, 0).ravel(), count)
-    return sharpened(target.color, part == 1 + evidence[1:].argmax(), rng)
+    return sharpened(target.color, strongest(near, log_odds), rng)

@@ -104,16 +104,6 @@ def remove_strays(
     return np.where(stray[component], 0, labels).astype(np.uint8)
 
 
-def doubt_all_but_strongest(
-    labels: UInt8[np.ndarray, "height width"], log_ratio: Float[np.ndarray, "height width"]
-) -> UInt8[np.ndarray, "height width"]:
-    """Make all components of the animal unknown but the one with the most evidence."""
-    component, area = _components((labels == 255).astype(np.uint8), 8)
-    evidence = np.bincount(component.ravel(), np.maximum(log_ratio, 0).ravel(), len(area))
-    others = (component > 0) & (component != 1 + evidence[1:].argmax()) if len(area) > 1 else component > 0
-    return np.where(others, 128, labels).astype(np.uint8)
-
-
 def _components(
     inside: UInt8[np.ndarray, "height width"], connectivity: int
 ) -> tuple[Int[np.ndarray, "height width"], Int[np.ndarray, "part"]]:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipeline.data.clips import Clip
-from pipeline.segmentation.appearance import Appearance
+from pipeline.segmentation.appearance import Appearance, strongest
 from pipeline.segmentation.grabcut import sharpened
 from stages.segment_agent import refine
 from stages.segment_agent.evidence import Evidence, EvidenceOf
@@ -110,9 +110,9 @@ class Segmenter:
                 log_ratio = network.log_odds_within(color, window.rows, window.columns)
                 labels, sure = self._by_appearance(window, evidence, log_ratio)
         if self.outline_rng is not None:
-            labels = refine.doubt_all_but_strongest(labels, log_ratio)
-            disagreed = sharpened(window.color, labels == 255, self.outline_rng) != (labels == 255)
-            labels = np.where(disagreed, np.uint8(128), labels)
+            part = strongest(labels == 255, log_ratio)
+            doubted = (sharpened(window.color, part, self.outline_rng) != part) | ((labels == 255) & ~part)
+            labels = np.where(doubted, np.uint8(128), labels)
         inside = labels == 255
         if sure[inside].sum() < (MIN_PRESUMED_PX if sphere.presumed else 1):
             return Mask(empty, False, ABSENT_PRESUMED if sphere.presumed else ABSENT_TRACKED)

@@ -5,8 +5,8 @@ import pytest
 
 from pipeline.data import images
 from pipeline.data.clips import Clip
-from pipeline.segmentation.appearance import Appearance
-from stages.segment_agent import masks, refine
+from pipeline.segmentation.appearance import Appearance, strongest
+from stages.segment_agent import masks
 from stages.segment_agent.config import Config, LearningConfig
 from tests.stages import room_with_animal as scenery
 
@@ -65,9 +65,9 @@ def test_what_is_recognized_is_segmented_where_depth_is_wrong(session):
 
 
 def test_only_the_strongest_component_is_the_animal():
-    labels, log_odds = np.zeros((20, 30), np.uint8), np.full((20, 30), -4.0)
-    labels[2:12, 2:10], log_odds[2:12, 2:10] = 255, 3.0
-    labels[5:18, 15:28], log_odds[5:18, 15:28] = 255, 0.5
-    found = refine.doubt_all_but_strongest(labels, log_odds)
-    assert (found[2:12, 2:10] == 255).all() and (found[5:18, 15:28] == 128).all()
-    assert not refine.doubt_all_but_strongest(np.zeros_like(labels), log_odds).any()
+    inside, log_odds = np.zeros((20, 30), bool), np.full((20, 30), -4.0)
+    inside[2:12, 2:10], log_odds[2:12, 2:10] = True, 3.0
+    inside[5:18, 15:28], log_odds[5:18, 15:28] = True, 0.5
+    found = strongest(inside, log_odds)
+    assert found[2:12, 2:10].all() and found.sum() == 80
+    assert not strongest(np.zeros_like(inside), log_odds).any()
