@@ -5,6 +5,7 @@ the background is no cue. `Identities.predict` classifies a picture, `identity_l
 one animal with the others, and `select_animal` keeps the moving pixels that show one animal.
 """
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from pipeline.data import npz
 from pipeline.segmentation import appearance
 from pipeline.segmentation.appearance import Appearance, Example, to_batch
 from pipeline.segmentation.augmentation import LightVariation, in_other_light, scaled_crop
+from pipeline.segmentation.config import LearningConfig
 from stages.segment_agent.identities.config import Config
 
 FILE, PORTRAITS = "identities.safetensors", "portraits.npz"
@@ -153,10 +155,14 @@ def select_animal(
 
 
 def learn_identities(
-    portraits: Sequence[Portrait], names: Sequence[str], config: Config, rng: np.random.Generator
+    portraits: Sequence[Portrait],
+    names: Sequence[str],
+    config: Config | LearningConfig,
+    rng: np.random.Generator,
+    start: Identities | None = None,
 ) -> Identities:
-    """Train the network on portraits of every animal."""
-    network = appearance.initialized(lambda: Identities(names), rng)
+    """Train the network on portraits of every animal, from scratch or from a copy of another one."""
+    network = copy.deepcopy(start) or appearance.initialized(lambda: Identities(names), rng)
     optimizer = torch.optim.AdamW(network.parameters(), appearance.RATE, weight_decay=appearance.WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, appearance.RATE, total_steps=config.steps)
     own = [[each for each in portraits if each.animal == index] for index in range(len(names))]

@@ -1,10 +1,10 @@
 """Localization of a session's animal: a sphere per frame, from motion and, once learned, appearance."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Shaped
 
 from pipeline.data.clips import Clip
 from pipeline.geometry import cameras
@@ -13,7 +13,7 @@ from stages.segment_agent import free_space, identity, movers
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.free_space import References, Votes
 from stages.segment_agent.movers import Candidate, PlacedPrompt
-from stages.segment_agent.windows import STEP_M, Sphere, snap_depth_steps
+from stages.segment_agent.windows import Sphere, snap_depth_steps
 
 COARSE_PX, FINE_PX = 111, 222
 """square root of the number of depth samples per frame, without and with known appearance"""
@@ -21,12 +21,6 @@ SCALE, MIN_RADIUS_M = 1.8, 0.15
 """radius of the sphere over that of candidates, which show one side of the animal; smallest radius"""
 OPENING = np.ones((2, 2), np.uint8)
 """opening that removes rims of furniture due to pose error, samples"""
-
-STEP_SHARE = 0.03
-"""share of the depth by which neighboring samples of a surface may differ, beside `STEP_M`"""
-CLEAR_LOG_ODDS, MIN_BODY_M2, INNER = 1.0, 0.01, (0.05, 0.95)
-"""mean log-odds of a whole body above which it clearly shows an animal; its least visible area, since smaller
-ones are parts; quantiles of its points that its extent spans"""
 
 AppearanceOf = Callable[[int], Float[np.ndarray, "height width"]]
 """log-odds of the animal's appearance in one frame, at any resolution"""
@@ -129,44 +123,6 @@ def _candidates(
         both += np.minimum(resample_nearest(margin_of(frame), clip.depth_size, chosen), 0)
     both[area == 0] = -movers.APPEARANCE_LIMIT
     return movers.candidates(both > 0, 1 / (1 + np.exp(-both)), points, area, animal, motion > 0)
-
-
-def recognized_bodies(
-    clip: Clip,
-    world_from_camera: Float[np.ndarray, "frame 4 4"],
-    references: References,
-    animal: AnimalConfig,
-    margins: Sequence[AppearanceOf],
-) -> Int[np.ndarray, "animal"]:
-    """Count the frames in which a whole moving body clearly shows each animal, by its log-odds ``margins``.
-
-    Parts of a body often look like another animal; the whole rarely does.
-    """
-    found = np.zeros(len(margins), int)
-    for frame, pose in enumerate(world_from_camera):
-        depth = free_space.interior_depth(clip, frame)
-        points, area, chosen = free_space.sample(clip, frame, pose, depth, COARSE_PX)
-        moving = opened_motion(free_space.vote(references, points, frame), movers.SURE_SHARES[-1])
-        scores = [resample_nearest(margin_of(frame), clip.depth_size, chosen) for margin_of in margins]
-        clear = np.zeros(len(margins), bool)
-        for body in split_bodies(moving, depth[chosen]):
-            extent_m = np.ptp(np.quantile(points[body], INNER, axis=0), axis=0).max()
-            if area[body].sum() >= MIN_BODY_M2 and extent_m < animal.largest_m:
-                clear |= [score[body].mean() > CLEAR_LOG_ODDS for score in scores]
-        found += clear
-    return found
-
-
-def split_bodies(
-    moving: Bool[np.ndarray, "row column"], depth: Float[np.ndarray, "row column"]
-) -> list[Bool[np.ndarray, "row column"]]:
-    """Group moving samples that neighbors connect without a depth step: animals touch in the picture."""
-    around = np.ones((3, 3), np.uint8)
-    low = cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), around)
-    whole = moving & (cv2.dilate(depth, around) - low < STEP_M + STEP_SHARE * low)
-    count, label = cv2.connectedComponents(whole.astype(np.uint8), connectivity=4)
-    size = np.bincount(label.ravel(), minlength=count)
-    return [label == index for index in range(1, count) if size[index] >= movers.MIN_PIXELS]
 
 
 def opened_motion(votes: Votes, share: float) -> Bool[np.ndarray, "row column"]:

@@ -13,10 +13,11 @@ from pipeline.core.errors import InputError
 from pipeline.core.videos import Video
 from pipeline.data.clips import Clip, Masks, usable_depth
 from pipeline.segmentation.appearance import Example
-from stages.segment_agent import free_space, identity, locate, masks, several, stage, trajectory
+from stages.segment_agent import bodies, free_space, identity, masks, several, stage, trajectory
 from stages.segment_agent.config import AnimalConfig, Config, LearningConfig
 from stages.segment_agent.identities import config as identities_config
 from stages.segment_agent.identities import stage as identities
+from stages.segment_agent.segmenter import Mask
 from stages.segment_agent.windows import Sphere
 
 _spec = importlib.util.spec_from_file_location(
@@ -139,33 +140,72 @@ def test_bodies_that_touch_in_the_picture_are_split_at_depth_steps():
     moving = np.zeros((40, 60), bool)
     moving[10:30, 10:50] = True
     slope = np.linspace(1.0, 1.4, 60, dtype=np.float32) * np.ones((40, 1), np.float32)
-    (whole,) = locate.split_bodies(moving, slope)
+    (whole,) = bodies.split_bodies(moving, slope)
     assert whole.sum() == moving.sum()
-    first, second = locate.split_bodies(moving, np.where(np.arange(60) < 30, slope, slope + 0.2))
+    first, second = bodies.split_bodies(moving, np.where(np.arange(60) < 30, slope, slope + 0.2))
     assert (
         first[:, :28].any() and not first[:, 30:].any() and second[:, 32:].any() and not second[:, :30].any()
     )
 
 
+GRID = (40, 60)
+
+
+def margins_of(*scores):
+    return [lambda _, score=score: score * np.ones((GRID[0], 1)) for score in scores]
+
+
 def test_animal_is_present_where_whole_bodies_show_it_not_where_parts_do(monkeypatch):
-    moving = np.zeros((40, 60), bool)
+    moving = np.zeros(GRID, bool)
     moving[10:30, 10:50] = True
-    grid = np.stack([*np.mgrid[0:40, 0:60] / 100, np.ones((40, 60))], axis=-1)
-    monkeypatch.setattr(free_space, "interior_depth", lambda *_: np.ones((40, 60), np.float32))
-    monkeypatch.setattr(
-        free_space, "sample", lambda *_: (grid, np.full((40, 60), 1e-4), (slice(None), slice(None)))
-    )
-    monkeypatch.setattr(free_space, "vote", lambda *_: None)
-    monkeypatch.setattr(locate, "opened_motion", lambda *_: moving)
-    part = np.where(np.arange(60) < 20, 6.0, -6.0) * np.ones((40, 1))
-    scores = (np.where(np.arange(60) < 20, -6.0, 6.0) * np.ones((40, 1)), part)
-    clip, poses = SimpleNamespace(depth_size=(40, 60)), np.repeat(np.eye(4)[None], 7, axis=0)
-    margins = [lambda _, score=score: score for score in scores]
-    assert locate.recognized_bodies(clip, poses, None, AnimalConfig(), margins).tolist() == [7, 0]
-    assert locate.recognized_bodies(clip, poses, None, AnimalConfig(largest_m=0.3), margins).tolist() == [
-        0,
-        0,
-    ]
+    grid = np.stack([*np.mgrid[0:40, 0:60] / 100, np.ones(GRID)], axis=-1)
+    every = (slice(None), slice(None))
+    monkeypatch.setattr(free_space, "interior_depth", lambda *_: np.ones(GRID, np.float32))
+    monkeypatch.setattr(free_space, "sample", lambda *_: (grid, np.full(GRID, 1e-4), every))
+    monkeypatch.setattr(free_space, "vote", lambda *_: free_space.Votes(9 * moving, 0 * moving, None, None))
+    clip, poses = SimpleNamespace(depth_size=GRID), np.repeat(np.eye(4)[None], 7, axis=0)
+    most = np.where(np.arange(60) < 20, -6.0, 6.0)
+    for largest_m, wanted in ((1.3, [7, 0]), (0.3, [0, 0])):
+        found = bodies.find_bodies(clip, poses, None, AnimalConfig(largest_m))
+        found = bodies.recognize(clip, found, margins_of(most, -most))
+        assert bodies.count(found).tolist() == wanted
+        assert all(row.whole.all() for row in found)
+    moving[:, :50] = True
+    assert not bodies.find_bodies(clip, poses, None, AnimalConfig())[0].whole.any(), "cut by the border"
+
+
+def two_bodies(log_odds, whole=(True, True)):
+    """Return a frame with two bodies, the second on the right, and the log-odds of both for each animal."""
+    label = np.zeros(GRID, np.uint8)
+    label[10:30, 5:25], label[10:30, 35:55], label[35:38] = 1, 2, bodies.MOVES
+    every = (slice(None), slice(None))
+    return bodies.Bodies(label, np.array(whole), every, np.array(log_odds, float))
+
+
+def test_only_whole_bodies_that_surely_show_an_animal_are_learned(monkeypatch):
+    monkeypatch.setattr(bodies, "working_picture", lambda *_: np.zeros((*GRID, 3), np.uint8))
+    monkeypatch.setattr(bodies, "working_size", lambda *_: GRID)
+    rows = [two_bodies([[4, -4], [-4, 4]]), two_bodies([[4, -4], [-4, 4]], (True, False))]
+    rows += [two_bodies([[1.5, -4], [-4, 1.5]]), two_bodies([[4, 4], [-4, -4]])]
+    assert bodies.sure(rows, 0, 9) == [(0, 1), (1, 1)], "sure, and alone"
+    assert bodies.sure(rows, 1, 9) == [(0, 2)], "not cut by the border"
+    assert bodies.sure(rows, 0, 1) == [(0, 1)]
+    labels = bodies.portrait(None, rows, 40, 1, 0, 2).labels
+    assert (labels[10:30, 35:55] == 255).all() and not labels[:5].any(), "body and room"
+    assert (labels[10:30, 5:25] == 128).all() and (labels[36] == 128).all(), "what else moves"
+
+
+def test_sure_bodies_are_one_animals_as_a_whole():
+    row, claims = two_bodies([[4, 1.5], [-4, -4]]), np.zeros((2, *GRID), np.uint8)
+    claims[0, 9:30, 5:20], claims[1, 9:30, 15:55] = 255, 255
+    segmenters = [SimpleNamespace(masks=lambda _, own=own: iter([Mask(own, True, 1.0)])) for own in claims]
+    scores = SimpleNamespace(against_others=lambda animal: lambda _: np.full(GRID, 2.0 * animal - 1))
+    first, second = (each.labels for each in several.resolve_overlaps(segmenters, scores, 0, row))
+    assert (first[9:30, 5:25] == 255).all() and (second[9:30, 5:25] == 128).all(), "thin parts too"
+    assert (first[9:30, 35:55] == 128).all() and (second[9:30, 35:55] == 255).all(), "not sure"
+    (row,) = bodies.restricted([row], np.array([False, True]))
+    first, second = (each.labels for each in several.resolve_overlaps(segmenters, scores, 0, row))
+    assert (first[9:30, 15:20] == 128).all() and (second[9:30, 15:20] == 255).all(), "the network decides"
 
 
 @pytest.fixture(scope="module")
@@ -196,6 +236,13 @@ def test_poses_are_estimated_again_without_what_moves(together, tmp_path, monkey
     animals = (truth.masks | truth.others) & usable
     assert (depth[animals] == 0).mean() > 0.8
     assert (depth[usable & ~animals] > 0).mean() > 0.9
+
+
+def test_nothing_is_learned_if_an_animal_that_is_here_has_no_sure_bodies(network, portraits, together):
+    scores = several.IdentityScores(Clip.open(together[0]), network, OPTIONS.height_px)
+    rows = [two_bodies([[4, -4], [-4, 1]])] * 9
+    same, unknown = several.adapt(scores, portraits, rows, np.array([True, True]), OPTIONS)
+    assert same is scores and not bodies.count(unknown).any()
 
 
 @pytest.mark.slow
