@@ -301,14 +301,14 @@ def _check_a_drawn_path(page: Page) -> None:
         "tick => ats.state().tick >= tick + 5", arg=drawn_at
     )  # the last plan has faded out
     aside, ends = [], []
-    for state in browser.states(page, 300):
+    for state in browser.states(page, 600):
         if state["route"] is None:
             break
         place = np.array(state["animal"])[[0, 2]]
         aside.append(np.linalg.norm(route - place, axis=1).min())
         ends.append(np.linalg.norm(route[-1] - place))
     else:
-        pytest.fail("half a minute")
+        pytest.fail("a minute: plans take long on a busy machine")
     assert np.median(aside) < 0.1 and min(ends) < 0.2, "meters"
 
 
