@@ -38,13 +38,14 @@ def scaled_crop(
     shift_px: Float[np.ndarray, "2"],
     side: int,
     outside: int,
+    turn_deg: float = 0.0,
 ) -> tuple[UInt8[np.ndarray, "side side 3"], Shaped[np.ndarray, "side side"]]:
-    """Return a scaled square crop in which a pixel (row, column) is at ``shift_px`` (x, y).
+    """Return a scaled and turned square crop in which a pixel (row, column) is at ``shift_px`` (x, y).
 
     Beyond the picture labels are ``outside`` and colors continue.
     """
-    left, top = np.array(place)[::-1] - shift_px / scale
-    source = np.array([[1 / scale, 0, left], [0, 1 / scale, top]])
+    axes = cv2.getRotationMatrix2D((0, 0), turn_deg, 1 / scale)[:, :2]
+    source = np.column_stack([axes, np.array(place)[::-1] - axes @ shift_px])
     linear, nearest = (how | cv2.WARP_INVERSE_MAP for how in (cv2.INTER_LINEAR, cv2.INTER_NEAREST))
     if scale < 1:
         color = cv2.GaussianBlur(color, (0, 0), SHRINKING_BLUR_PX / scale)

@@ -21,8 +21,8 @@ ROOM_SHARE, TURNAROUND_SHARE = 0.15, 0.25
 """Shares of crops of the room alone, and of the turnaround; in the others the animal is composited."""
 SIZE_PX, ROOM_SCALE = (12.0, 110.0), (0.5, 1.5)
 """Ranges of the animal's size in a crop (root of its area) and of the scale of a room's crop."""
-PLACEMENT = (0.2, 0.8)
-"""Range of the chosen pixel's position in a crop, shares of its side."""
+PLACEMENT, TURN_DEG = (0.2, 0.8), 45.0
+"""Range of the chosen pixel's position in a crop, shares of its side; largest turn: tails may rise."""
 UNSURE_PX = 15
 """Background this close to the turnaround's mask is ignored: tails are often missing there."""
 SHADOW_ABOVE, SHADOW_ASIDE, SHADOW_BELOW, SHADOW_BLUR = (0.3, 1.0), 0.15, (-0.05, 0.25), (0.03, 0.2)
@@ -36,6 +36,7 @@ BLURRED_SHARE, BLUR_PX = 0.3, (0.4, 1.2)
 """Share of blurred crops and range of the standard deviation: sessions are filmed while walking."""
 LIGHT = LightVariation(exposure=0.2, white_balance=0.06, contrast=0.2, brightness=0.1, noise=0.08)
 """Another day, the same phone."""
+Place = tuple[float, float]
 Picture = UInt8[np.ndarray, "height width 3"]
 Crop = tuple[UInt8[np.ndarray, "side side 3"], UInt8[np.ndarray, "side side"]]
 
@@ -54,13 +55,13 @@ def training_crop(portraits: Sequence[Example], rooms: Sequence[Picture], rng: n
     place, scale = _placed(portrait, rng)
     unsure = (portrait.labels == 0) & dilated(portrait.labels == 255, UNSURE_PX)
     labels = np.where(unsure, np.uint8(128), portrait.labels)
-    return _crop(Example(portrait.color, labels), place, scale, 128, rng)
+    return _crop(Example(portrait.color, labels), place, scale, 128, rng, TURN_DEG)
 
 
 def composite(portrait: Example, rooms: Sequence[Picture], rng: np.random.Generator) -> Crop:
     """Return a crop of a picture of the room, with the animal of a portrait and a shadow pasted into it."""
     place, scale = _placed(portrait, rng)
-    color, labels = _crop(portrait, place, scale, 0, rng)
+    color, labels = _crop(portrait, place, scale, 0, rng, TURN_DEG)
     animal = labels == 255
     shaded = _with_shadow(_room_crop(rooms, rng)[0], animal, rng)
     opacity = cv2.GaussianBlur(animal.astype(np.float32), (0, 0), EDGE_BLUR_PX)[..., None]
@@ -95,11 +96,11 @@ def _placed(portrait: Example, rng: np.random.Generator) -> tuple[tuple[int, int
 
 
 def _crop(
-    example: Example, place: tuple[float, float], scale: float, outside: int, rng: np.random.Generator
+    example: Example, place: Place, scale: float, outside: int, rng: np.random.Generator, most_deg: float = 0
 ) -> Crop:
-    """Return a scaled square crop that contains a pixel (row, column); labels are ``outside`` beyond it."""
-    shift_px = CROP_PX * rng.uniform(*PLACEMENT, 2)
-    return scaled_crop(example.color, example.labels, place, scale, shift_px, CROP_PX, outside)
+    """Return a scaled and turned square crop that contains a pixel (row, column), ``outside`` beyond it."""
+    shift_px, turn_deg = CROP_PX * rng.uniform(*PLACEMENT, 2), rng.uniform(-most_deg, most_deg)
+    return scaled_crop(example.color, example.labels, place, scale, shift_px, CROP_PX, outside, turn_deg)
 
 
 def _with_shadow(
