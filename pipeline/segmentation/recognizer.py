@@ -3,7 +3,8 @@
 from pathlib import Path
 
 import cv2
-from jaxtyping import UInt8
+import numpy as np
+from jaxtyping import Float, UInt8
 from numpy import ndarray
 from safetensors.torch import load_file, save_file
 
@@ -11,7 +12,21 @@ from pipeline.segmentation.appearance import Appearance, fold_batch_norms
 
 FILE = "recognizer.safetensors"
 SHORTER_PX = 240
-"""Shorter side of the pictures that it sees, pixels."""
+"""Shorter side of the pictures that it sees at scale 1, pixels."""
+SCALES = (1.0, 2.0)
+"""Scales at which it recognizes: the network halves pictures, and a session's animal is small."""
+
+
+class Recognizer(Appearance):
+    """A network that recognizes an animal by its mean log-odds over several scales of a picture."""
+
+    def log_odds(self, color: UInt8[ndarray, "height width channel"]) -> Float[ndarray, "height width"]:
+        """Return the log-odds of every pixel of a picture from `small`, within +-8."""
+        size, found = color.shape[1::-1], []
+        for scale in SCALES:
+            scaled = cv2.resize(color, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+            found.append(cv2.resize(super().log_odds(scaled), size, interpolation=cv2.INTER_AREA))
+        return np.mean(found, axis=0)
 
 
 def small(picture: UInt8[ndarray, "height width *channel"]) -> UInt8[ndarray, "row column *channel"]:
@@ -26,8 +41,9 @@ def save(network: Appearance, folder: Path) -> None:
     save_file({name: value.contiguous() for name, value in network.state_dict().items()}, folder / FILE)
 
 
-def load(folder: Path) -> Appearance:
+def load(folder: Path) -> Recognizer:
     """Read what `save` wrote, ready for recognition."""
-    network = Appearance()
+    network = Recognizer()
     network.load_state_dict(load_file(folder / FILE))
-    return fold_batch_norms(network.eval())
+    fold_batch_norms(network.eval())
+    return network

@@ -11,6 +11,7 @@ from pipeline.core.progress import track
 from pipeline.geometry import contact, subsampling
 from pipeline.mapping import plane_sweep
 from pipeline.mapping.plane_sweep import SweepView
+from pipeline.segmentation.appearance import Appearance
 from stages.estimate_depth import foreground, standing, tracking
 from stages.estimate_depth.foreground import ColorView
 from stages.estimate_depth.tracking import MapViews
@@ -36,13 +37,10 @@ GRAY = np.uint8(128)
 """Gray level of the map in stereo of what stands in front of it."""
 MIN_AGREEING = 2
 """Other frames that must agree on a depth; one more makes it certain."""
-
 ROUNDS, MIN_PIXELS, DEPTH_RANGE_M = 8, 50, (0.1, 20.0)
 """Alignment of a network's depth: iterations of reweighted least squares, least map pixels, range of depth in
 meters."""
 
-AnimalOf = Callable[[ColorView, Bool[np.ndarray, "height width"]], Bool[np.ndarray, "height width"]]
-"""The animal in a frame, given its foreground."""
 DepthNet = Callable[[int, Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]], np.ndarray]
 """Depth of one frame by a network, meters, given the map's depth and where it is valid."""
 
@@ -77,12 +75,12 @@ def of_session(
     walk: Sequence[ColorView],
     length_m: float,
     depth_net: DepthNet | None,
-    animal_of: AnimalOf | None = None,
+    recognizer: Appearance | None = None,
 ) -> list[FrameDepth | None]:
     """Return the depth of a session's frames: from the map for the room, inferred for the animal.
 
-    The animal is what ``animal_of`` finds, by default all foreground. None for frames that differ too much
-    from the map.
+    The animal is what the ``recognizer`` finds, without one all foreground. None for frames that differ
+    too much from the map.
     """
     by_view = {id(each.view): each for each in walk}
     times = subsampling.evenly(len(shown), foreground.OTHER_TIMES)
@@ -91,9 +89,8 @@ def of_session(
         distant = times[np.abs(timestamp_s[times] - timestamp_s[frame]) > foreground.MIN_GAP_S]
         seen = [by_view[id(view)] for view in tracking.walk_views(target.view, room)]
         in_front = foreground.foreground(target, seen, [shown[other] for other in distant])
-        blobs = None
-        if in_front.mean() <= MAX_FOREGROUND:
-            blobs = _blobs(in_front if animal_of is None else animal_of(target, in_front))
+        animal = in_front if recognizer is None else foreground.recognize(recognizer, target, in_front)
+        blobs = _blobs(animal) if in_front.mean() <= MAX_FOREGROUND else None
         camera = target.view.intrinsics, target.view.world_from_camera
         masks.append(blobs)
         contacts.append([contact.find(blob, *camera, room.caster) for blob in blobs or ()])

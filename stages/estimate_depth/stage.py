@@ -20,7 +20,7 @@ from pipeline.geometry import cameras
 from pipeline.geometry.meshes import RayCaster
 from pipeline.mapping.sift import Keypoints
 from pipeline.segmentation.recognizer import load
-from stages.estimate_depth import depth, foreground, landmarks, lens, recognition, tracking, views, writing
+from stages.estimate_depth import depth, foreground, landmarks, lens, tracking, views, writing
 from stages.estimate_depth.config import Config
 from stages.estimate_depth.foreground import ColorView
 from stages.estimate_depth.lens import Lens
@@ -75,7 +75,7 @@ def run(
         case "session":
             time_s = pictures.timestamp_s[placed]
             depth_net = None if network is None else _depth_net(network, pictures, placed, found)
-            nets = depth_net, _animal_of(inputs.recognizer, config.seed)
+            nets = depth_net, None if inputs.recognizer is None else load(inputs.recognizer)
             depths = depth.of_session(shown, time_s, room, walk_views, config.length_m, *nets)
         case role:
             assert_never(role)
@@ -115,13 +115,6 @@ def _placed(
     footage = TrackingInput(pictures.timestamp_s, gray, small, found.resized(gray[0].shape))
     tracked = tracking.place(footage, located, room, config.seed)
     return Lens(tracked.lens.focal_px / scale, found.radial, pictures.color_size), tracked
-
-
-def _animal_of(recognizer: Path | None, seed: int) -> depth.AnimalOf | None:
-    if recognizer is None:
-        return None
-    network, rng = load(recognizer), np.random.default_rng(seed)
-    return lambda target, in_front: recognition.recognize(network, target, in_front, rng)
 
 
 def _depth_net(

@@ -111,8 +111,8 @@ class Segmenter:
                 labels, sure = self._by_appearance(window, evidence, log_ratio)
         if self.outline_rng is not None:
             part = strongest(labels == 255, log_ratio)
-            doubted = (sharpened(window.color, part, self.outline_rng) != part) | ((labels == 255) & ~part)
-            labels = np.where(doubted, np.uint8(128), labels)
+            sharp = sharpened(window.color, part, self.outline_rng) | (part & (log_ratio > SURE))
+            labels = np.where((sharp != part) | ((labels == 255) & ~part), np.uint8(128), labels)
         inside = labels == 255
         if sure[inside].sum() < (MIN_PRESUMED_PX if sphere.presumed else 1):
             return Mask(empty, False, ABSENT_PRESUMED if sphere.presumed else ABSENT_TRACKED)

@@ -11,8 +11,9 @@ import torch
 from pipeline.core.errors import InputError
 from pipeline.data import images, npz
 from pipeline.segmentation import recognizer
-from pipeline.segmentation.appearance import Example, fold_batch_norms
-from stages.estimate_depth import recognition
+from pipeline.segmentation.appearance import Appearance, Example, fold_batch_norms
+from pipeline.segmentation.augmentation import scaled_crop
+from stages.estimate_depth import foreground
 from stages.estimate_depth.foreground import color_view
 from stages.estimate_depth.views import View
 from stages.train_recognizer import stage, training
@@ -61,7 +62,7 @@ def seen(color):
 def test_animal_is_recognized_without_its_shadow(network):
     rng = np.random.default_rng(1)
     color, inside, dark = with_animal(texture(rng, (110, 110, 120)), (150, 70), 18, shadow=0.5)
-    found = recognition.recognize(network, seen(color), inside | dark, rng)
+    found = foreground.recognize(network, seen(color), inside | dark)
     assert (found & inside).sum() / (found | inside).sum() > 0.7
     assert (found & dark).sum() < 0.2 * dark.sum()
 
@@ -70,7 +71,7 @@ def test_animal_is_completed_where_the_foreground_misses_it(network):
     rng = np.random.default_rng(2)
     color, inside, _ = with_animal(texture(rng, (110, 110, 120)), (150, 70), 18)
     lower = inside & (np.arange(SIZE[0])[:, None] > 150)
-    found = recognition.recognize(network, seen(color), lower, rng)
+    found = foreground.recognize(network, seen(color), lower)
     assert (found & inside).sum() / (found | inside).sum() > 0.7
 
 
@@ -78,10 +79,30 @@ def test_nothing_is_recognized_away_from_foreground_or_in_a_shadow(network):
     rng = np.random.default_rng(3)
     color, inside, dark = with_animal(texture(rng, (110, 110, 120)), (150, 70), 18, shadow=0.5)
     nowhere = np.zeros(SIZE, bool)
-    assert not recognition.recognize(network, seen(color), nowhere, rng).any()
+    assert not foreground.recognize(network, seen(color), nowhere).any()
     room = texture(rng, (110, 110, 120))
     shaded = np.where((inside | dark)[..., None], 0.5 * room, room).astype(np.uint8)
-    assert recognition.recognize(network, seen(shaded), inside | dark, rng).sum() < 0.2 * inside.sum()
+    assert foreground.recognize(network, seen(shaded), inside | dark).sum() < 0.2 * inside.sum()
+
+
+def test_small_animal_has_finer_outlines_in_magnified_pictures(network):
+    rng, found = np.random.default_rng(4), {Appearance: [], recognizer.Recognizer: []}
+    for _ in range(6):
+        color, inside, _ = with_animal(texture(rng, (110, 110, 120)), rng.uniform(60, 120, 2), 9)
+        for kind, overlaps in found.items():
+            shown = kind.log_odds(network, color) > 0
+            overlaps.append((shown & inside).sum() / (shown | inside).sum())
+    assert np.mean(found[recognizer.Recognizer]) > np.mean(found[Appearance]) + 0.02
+
+
+def test_animals_are_turned_about_the_chosen_pixel():
+    rng = np.random.default_rng(5)
+    color = rng.integers(0, 256, (61, 61, 3), np.uint8)
+    labels, middle, side = np.where(color[..., 0] > 128, 255, 0).astype(np.uint8), np.array([30, 30]), 61
+    for turns in range(4):
+        turned = scaled_crop(color, labels, (30, 30), 1.0, middle, side, 128, 90.0 * turns)
+        np.testing.assert_array_equal(turned[0], np.rot90(color, turns))
+        np.testing.assert_array_equal(turned[1], np.rot90(labels, turns))
 
 
 def write_recording(folder, pictures, masks=()):
