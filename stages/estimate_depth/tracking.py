@@ -26,7 +26,7 @@ from stages.estimate_depth.views import View
 WALK_VIEWS = 2
 """Pictures of the walk-through that each frame is compared with: those with most overlap."""
 NEIGHBORS = (1, 3)
-"""Frame gaps of the flow between neighbors."""
+"""Frame gaps of the flow between neighbors. Tracked over a longer one, a camera locks on to another board."""
 PROBES = 60
 """Sample pixels that measure the overlap with pictures of the walk-through."""
 MIN_RATIO, GOOD_RATIO = 0.35, 0.7
@@ -125,6 +125,8 @@ def _track_one(frame, footage: TrackingInput, poses, room: MapViews, seed) -> No
     """Track one frame, in place, from its nearest neighbor, by the hypothesis with most inliers."""
     known = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     other = int(known[np.abs(known - frame).argmin()])
+    if abs(other - frame) > NEIGHBORS[-1]:
+        return
     source, best = _view(other, footage, poses[other], room), None
     for hypothesis in _hypotheses(frame, other, footage, poses, room, seed):
         matches = views.flow_matches(_view(frame, footage, hypothesis, room), source)

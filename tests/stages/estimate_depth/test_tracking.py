@@ -1,0 +1,56 @@
+"""Cameras without landmarks are tracked from neighbors, but not across many pictures that show nothing."""
+
+import numpy as np
+import pytest
+
+from pipeline.geometry.meshes import RayCaster
+from stages.estimate_depth import landmarks, tracking, views
+from stages.estimate_depth.landmarks import Matches
+from stages.estimate_depth.lens import Lens, PnPResult
+from tests.stages.estimate_depth import filmed_room
+
+COUNT, LOCATED = 16, 5
+WALK_STRIDE = 5
+
+
+@pytest.fixture(scope="module")
+def filmed():
+    """The room, views of the walk-through, and the path and pictures of a session."""
+    room, walk = filmed_room.room_and_walk()
+    caster, rng = RayCaster(room), np.random.default_rng(0)
+
+    def picture(camera):
+        return filmed_room.render(caster, camera, None, rng)[0]
+
+    seen = [
+        views.view_of(views.small_gray(picture(pose)), filmed_room.INTRINSICS, pose, caster)
+        for pose in walk[::WALK_STRIDE]
+    ]
+    path = filmed_room.session(COUNT)[0]
+    return tracking.MapViews(caster, seen), path, [picture(camera) for camera in path]
+
+
+@pytest.mark.parametrize("dark", [1, 6])
+def test_cameras_are_tracked_over_short_gaps_only(filmed, dark):
+    room, path, pictures = filmed
+    hidden = range(LOCATED, LOCATED + dark)
+    shown = [np.zeros_like(each) if frame in hidden else each for frame, each in enumerate(pictures)]
+    lens = Lens(float(filmed_room.INTRINSICS[0, 0]), 0.0, filmed_room.SIZE)
+    footage = tracking.TrackingInput(
+        0.1 * np.arange(COUNT),
+        [views.small_gray(each) for each in shown],
+        [landmarks.describe(each) for each in shown],
+        lens,
+    )
+    matches = Matches(np.zeros((100, 2)), np.zeros((100, 3)))
+    located = [PnPResult(path[frame], matches, 1.0, lens.focal_px) for frame in range(LOCATED)]
+    found = tracking.place(footage, [*located, *[None] * (COUNT - LOCATED)], room, seed=0)
+    placed = np.isfinite(found.world_from_camera[:, 0, 0])
+    assert placed[:LOCATED].all() and not placed[hidden].any()
+    beyond = slice(LOCATED + dark, COUNT)
+    if dark < tracking.NEIGHBORS[-1]:
+        assert placed[beyond].all()
+        off_m = np.linalg.norm(found.world_from_camera[beyond, :3, 3] - path[beyond, :3, 3], axis=1)
+        assert off_m.max() < 0.05
+    else:
+        assert not placed[beyond].any()
