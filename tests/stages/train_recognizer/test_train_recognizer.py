@@ -101,8 +101,8 @@ def test_animals_are_turned_about_the_chosen_pixel():
     labels, middle, side = np.where(color[..., 0] > 128, 255, 0).astype(np.uint8), np.array([30, 30]), 61
     for turns in range(4):
         turned = scaled_crop(color, labels, (30, 30), 1.0, middle, side, 128, 90.0 * turns)
-        np.testing.assert_array_equal(turned[0], np.rot90(color, turns))
-        np.testing.assert_array_equal(turned[1], np.rot90(labels, turns))
+        np.testing.assert_array_equal(turned[0], np.rot90(color, -turns))
+        np.testing.assert_array_equal(turned[1], np.rot90(labels, -turns))
 
 
 def write_recording(folder, pictures, masks=()):
