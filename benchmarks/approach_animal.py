@@ -7,6 +7,8 @@ the animal. The true cat flees by its rule (`stages.synthesize_capture.policy`).
 """
 
 from collections import deque
+from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,10 +27,9 @@ from stages.read_trajectories.motion import CLIP_GAP_S, MeasuredMotion
 from stages.synthesize_capture import camera_motion, dwellings, gait, session
 from stages.synthesize_capture.camera_motion import ARM_M
 from stages.synthesize_capture.lives.lives import rest
-from stages.synthesize_capture.navigation import ANIMAL_M, Floor, floor_for
 from stages.synthesize_capture.observer import AT_HOME
 from stages.synthesize_capture.policy import DELAY_S, STEP_S, Policy, SeenWalker
-from stages.synthesize_capture.room import Place, Room
+from stages.synthesize_capture.room import Room
 from stages.synthesize_capture.voxels import volume_of
 from stages.train_behavior.config import (
     AugmentationConfig,
@@ -54,8 +55,8 @@ MODEL = TrainingConfig(
 """As in `agents/benchmark.toml`."""
 STEPS = round(1 / (RATE_HZ * STEP_S))
 """Steps of the cat per step of the environment."""
-PERCH_M = 0.1
-"""Height of the ground above which the cat is on one of its high places."""
+SAME_M, TURN_M = 0.001, 0.2
+"""Moments of a session are taken for the same if the cat is this close, counting so many meters per radian."""
 CALM_S = 0.8
 """How long the person has stood when an episode begins."""
 
@@ -73,13 +74,15 @@ def session_names() -> dict[str, tuple[int, int]]:
     return {f"home{home}-{each}": (home, each) for home, count in enumerate(counts) for each in range(count)}
 
 
-def simulated_session(home: Room, rng: np.random.Generator) -> MeasuredMotion:
-    """Simulate cat and person in a home in several takes."""
+def simulated_session(
+    home: Room, rng: np.random.Generator, watch: Callable[[Policy], None] = lambda _: None
+) -> MeasuredMotion:
+    """Simulate cat and person in a home in several takes; ``watch`` is called with the cat after every step."""
     time = np.arange(round(SESSION_S / TAKES * RATE_HZ)) / RATE_HZ
     sample = np.round(time / session.STEP_S).astype(int)
     roots, bones, cameras = [], [], []
     for _ in range(TAKES):
-        take = session.simulate_session(home, rng, SESSION_S / TAKES, WALKS_UP)
+        take = session.simulate_session(home, rng, SESSION_S / TAKES, WALKS_UP, watch=watch)
         motion = gait.poses(take.animal, time)
         roots.append(motion.world_from_agent)
         bones.append(motion.agent_from_bone.astype(np.float32))
@@ -101,6 +104,19 @@ def simulated_build(out: Path) -> None:
     train_model(out, MODEL, "behavior")
 
 
+def remembered(cat: Policy) -> Policy:
+    """Return a copy of a cat in its present state, in the same home."""
+    shared = (cat.rng, cat.walker.floor, cat.places, *cat.places)
+    return deepcopy(cat, {id(each): each for each in shared})
+
+
+def lived(name: str) -> list[Policy]:
+    """Simulate a session again, and return the cat as it was after every step."""
+    cats: list[Policy] = []
+    simulated_session(*home_of(*session_names()[name]), lambda cat: cats.append(remembered(cat)))
+    return cats
+
+
 @dataclass(frozen=True)
 class RootFrames:
     """One frame of all cats, as much of `PoseFrames` as observations read."""
@@ -113,10 +129,10 @@ class TrueCats:
 
     def __init__(self, data: BehaviorData):
         self.data, self.clearance_m, self.plans_drawn = data, clearance_of(data.agent_from_bone_rest), 0
-        self.places: dict[int, tuple[Floor, tuple[Place, ...]]] = {}
+        self.lives: dict[int, list[Policy]] = {}
 
     def begin(self, context: Context, rng: np.random.Generator, **_: Any) -> None:
-        """Start cats where the windows end, standing, with the person as there."""
+        """Start cats as they were where the windows end, with the person as there."""
         assert context.video is not None
         self.video, self.past = context.video, deque(maxlen=2)
         self.cats = [
@@ -131,19 +147,16 @@ class TrueCats:
         self.past.extend([self._frame()] * 2)
 
     def _cat(self, video: int, root: Float[np.ndarray, "past 4 4"], rng: np.random.Generator) -> Policy:
-        """Return the cat at the end of a window, on its perch where it is on one."""
-        if video not in self.places:
-            home, _ = home_of(*session_names()[self.data.videos[video]])
-            self.places[video] = floor_for(home.obstacles(), ANIMAL_M), home.places
-        floor, places = self.places[video]
-        position, ahead = root[-1, [0, 2], 3], root[-1, [0, 2], 2]
-        cat = Policy(floor, places, position, rng.spawn(1)[0])
-        cat.walker.yaw, cat.calm_s = float(np.arctan2(*ahead)), CALM_S
-        high = [place for place in places if place.position[1] > PERCH_M]
-        away = [np.linalg.norm(root[-1, :3, 3] - place.position) for place in high]
-        if away and min(away) < ARM_M:
-            cat.perch = high[int(np.argmin(away))]
-            cat.walker.position, cat.height = position, float(cat.perch.position[1])
+        """Return the cat as it was at the end of a window, with what it had in mind."""
+        if video not in self.lives:
+            self.lives[video] = lived(self.data.videos[video])
+        cats = self.lives[video]
+        off = np.linalg.norm([cat.walker.position for cat in cats] - root[-1, [0, 2], 3], axis=1)
+        ahead = np.arctan2(root[-1, 0, 2], root[-1, 2, 2])
+        off += TURN_M * np.abs(rigid.wrap(np.array([cat.walker.yaw for cat in cats]) - ahead))
+        alike = np.flatnonzero(off <= off.min() + SAME_M)
+        cat = remembered(cats[rng.choice(alike)])
+        cat.rng, cat.calm_s = rng.spawn(1)[0], CALM_S
         return cat
 
     def step(self, eyes: Float[np.ndarray, "animal 3"], companions: None = None) -> None:

@@ -5,6 +5,7 @@
 
 Trains from start states in the training recordings, then compares success (the person is within 0.7 m of an
 animal that does not flee) in episodes that start in the test recordings, for the learned and for scripted policies.
+Whether it flees is judged from where it goes (`benchmarks.approaches`); only rewards read plans.
 With `--simulate`, OUT is made first: an hour of the built-in cat's life in 24 homes and the model trained on it
 (`benchmarks.approach_animal`); then all policies also meet the true cat in the same episodes. Also reports how often
 the recorded animal fled from a nearby person, and how often sampled plans from the same moments do. Needs the extra
@@ -12,22 +13,22 @@ the recorded animal fled from a nearby person, and how often sampled plans from 
 """
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecNormalize
 
 from benchmarks import command_lines
 from benchmarks.approach_animal import TrueWorld, simulated_build
-from pipeline.behavior.trajectories import RATE_HZ, TEST, TRAIN
+from benchmarks.approaches import OBSERVATIONS, Episodes, Policy, facing, run_episodes, stand_still, walk_to
+from pipeline.behavior.trajectories import TEST, TRAIN
 from pipeline.core.progress import log
 from pipeline.data import plots
 from pipeline.environments.config import EnvironmentConfig
@@ -50,47 +51,14 @@ TRAINING_SAMPLER = {"sequence_steps": 3, "candidates": 1}
 """Half the denoising steps of paths and bodies, and one plan, for training alone: tests use the defaults."""
 SLOW_M_S = 0.2
 """Speed of a person who does not startle."""
-TURN_GAIN = 5.0
-"""Turning speed of a person who faces the animal, in shares of the highest per radian."""
 RESTING_M_S = 0.15
 """Speed below which the animal rests."""
-OBSERVATIONS = ("animal", "velocity")
-"""Without the floor plan around the person: its 256 numbers slowed learning down several times."""
-Policy = Callable[[dict[str, Float[np.ndarray, "person ..."]]], Float[np.ndarray, "person action"]]
-HELD_OUT_SEED = 1000
-"""Seed of start states and plans in the comparison, the same for all policies."""
 PLANS = 8
 """Plans drawn at every moment with a person near; with one, the rate of flights changes by 2 points by chance."""
 LAST_EPISODES = 300
 """Episodes at the end of training whose success is printed."""
 DRAWN_EPISODES = 6
 """Episodes whose paths are drawn."""
-
-
-@dataclass(frozen=True)
-class Episodes:
-    """Outcome of each episode at its first termination."""
-
-    reached: Bool[np.ndarray, "episode"]
-    fled: Bool[np.ndarray, "episode"]
-    seconds: Float[np.ndarray, "episode"]
-    person_paths: Float[np.ndarray, "episode step 2"]
-    """Of the person, world x and z, meters; NaN after the episode has ended."""
-    animal_paths: Float[np.ndarray, "episode step 2"]
-    scene: Int[np.ndarray, "episode"]
-    """Number of the scene."""
-
-
-def facing(observation: dict[str, np.ndarray]) -> Float[np.ndarray, "person"]:
-    """Return the action that turns persons towards the animal."""
-    return (np.arctan2(*observation["animal"].T[:2]) * TURN_GAIN).clip(-1, 1)
-
-
-def walk_to(observation: dict[str, np.ndarray], share: float = 1.0) -> Float[np.ndarray, "person 3"]:
-    """Turn towards the animal and walk to it at a share of full speed."""
-    left, ahead = observation["animal"].T[:2]
-    speed = share * np.cos(np.arctan2(left, ahead)).clip(0, 1)
-    return np.stack([speed, np.zeros_like(speed), facing(observation)], axis=-1)
 
 
 def slow_walk(observation: dict[str, np.ndarray]) -> Float[np.ndarray, "person 3"]:
@@ -107,11 +75,6 @@ def wait_then_walk(observation: dict[str, np.ndarray]) -> Float[np.ndarray, "per
 def random_walk(rng: np.random.Generator) -> Policy:
     """Return a policy that draws every action independently."""
     return lambda observation: rng.uniform(-1, 1, (len(observation["animal"]), 3))
-
-
-def stand_still(observation: dict[str, np.ndarray]) -> Float[np.ndarray, "person 3"]:
-    """Stand still."""
-    return np.zeros((len(observation["animal"]), 3))
 
 
 class HeldActionsEnv(PersonStableVecEnv):
@@ -146,29 +109,6 @@ def trained_policy(model: PPO, env: VecNormalize) -> Policy:
         return np.column_stack([walk, facing(observation)])
 
     return policy
-
-
-def run_episodes(world: AnimalWorld, policy: Policy, episodes: int, split: str, seed: int) -> Episodes:
-    """Run ``episodes`` episodes in parallel until each has ended."""
-    world.begin(episodes, np.random.default_rng(seed), split)
-    frames = round(world.config.episode_s * RATE_HZ)
-    reached = np.zeros(episodes, bool)
-    fled = np.zeros(episodes, bool)
-    seconds = np.full(episodes, world.config.episode_s)
-    person_paths = np.full((episodes, frames + 1, 2), np.nan)
-    animal_paths = np.full((episodes, frames + 1, 2), np.nan)
-    for frame in range(frames):
-        going = ~(reached | fled)
-        person_paths[going, frame] = world.persons.position[going]
-        animal_paths[going, frame] = world.animal_position[going][:, [0, 2]]
-        outcome = world.step(policy(person_observation(world)) * going[:, None])
-        ended = going & (outcome.reached | outcome.flees)
-        reached |= going & outcome.reached
-        fled |= going & outcome.flees
-        seconds[ended] = (frame + 1) / RATE_HZ
-        person_paths[ended, frame + 1] = world.persons.position[ended]
-        animal_paths[ended, frame + 1] = world.animal_position[ended][:, [0, 2]]
-    return Episodes(reached, fled, seconds, person_paths, animal_paths, world.scene)
 
 
 class OutcomeRecorder(BaseCallback):
@@ -285,10 +225,7 @@ def main() -> None:
 
     def test(policy: Policy) -> dict[str, Episodes]:
         each = tested.items()
-        return {
-            name: run_episodes(there, policy, arguments.episodes, "test", HELD_OUT_SEED)
-            for name, there in each
-        }
+        return {name: run_episodes(there, policy, arguments.episodes) for name, there in each}
 
     print("| animal, policy | reached, % | fled, % | neither, % | seconds to reach |\n|---|---|---|---|---|")
     scripted = {

@@ -12,8 +12,8 @@ from stages.synthesize_capture.animal import INDEX, Animal
 from stages.synthesize_capture.script import Script
 from stages.synthesize_capture.visitor import PERSON
 
-VISITOR_CELL_M = 0.006
-"""Grid spacing of the visitor's surface, before scaling."""
+VISITOR_CELL_M, FLOW_PX = 0.006, 4
+"""Grid spacing of the visitor's surface, before scaling, and of true flow in the picture."""
 
 
 @dataclass(frozen=True)
@@ -128,10 +128,8 @@ def _faces(bodies: Sequence[Body], start: int) -> Iterator[Int[np.ndarray, "face
         start += len(body.vertices_world)
 
 
-def true_flow(
-    stage: Stage, first: int, second: int, *, stride: int = 4
-) -> Float[np.ndarray, "rows columns 2"]:
-    """Return flow between two frames of the upright picture, pixels, at the centers of ``stride``-wide cells.
+def true_flow(stage: Stage, first: int, second: int) -> Float[np.ndarray, "rows columns 2"]:
+    """Return flow between two frames of the upright picture, pixels, at the centers of cells of `FLOW_PX`.
 
     NaN where the surface is hidden or out of view in frame ``second``.
     """
@@ -141,7 +139,7 @@ def true_flow(
     lenses = cameras.turn_intrinsics(matrices(script.intrinsics[pair]), size, turns)
     height, width = size if turns % 2 == 0 else size[::-1]
     here, there = (stage.mesh(stage.bodies(index)) for index in pair)
-    cells = (height // stride, width // stride)
+    cells = (height // FLOW_PX, width // FLOW_PX)
     coarse = cameras.scale_intrinsics(lenses[0], (height, width), cells)
     view = raster.rasterize(rigid.apply(upright_from_world[0], here[0]), here[1], coarse, *cells)
     rays = cameras.ray_directions(coarse, *cells)
@@ -150,7 +148,7 @@ def true_flow(
     corners = there[0][there[1][np.maximum(view.face, 0)]]
     moved = rigid.apply(upright_from_world[1], np.einsum("hwi,hwij->hwj", share, corners).reshape(-1, 3))
     pixel, depth = cameras.project(moved.reshape(*cells, 3), lenses[1])
-    flow = (pixel - (cameras.pixel_grid(*cells) * stride)).astype(np.float32)
+    flow = (pixel - (cameras.pixel_grid(*cells) * FLOW_PX)).astype(np.float32)
     inside = cameras.in_picture(pixel, depth, (height, width), 0.05) & (view.face >= 0)
     seen = raster.rasterize(rigid.apply(upright_from_world[1], there[0]), there[1], lenses[1], height, width)
     nearest = cameras.sample_nearest(seen.inverse_depth, pixel)

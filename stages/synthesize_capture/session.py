@@ -5,7 +5,7 @@ follow from them elsewhere, so this runs alone and fast.
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,11 +65,12 @@ def simulate_session(
     *,
     with_dog: bool = False,
     visitors: np.random.Generator | None = None,
+    watch: Callable[[Policy], None] = lambda _: None,
 ) -> SessionTrajectories:
     """Simulate one session in a room; the same generator states give the same session.
 
     Where a dog lives too, the person films whom it looks at, one or both. ``visitors`` decides about another
-    person, where one walks about.
+    person, where one walks about. ``watch`` is called with the first animal after every step.
     """
     obstacles = room.obstacles()
     animal_floor, person_floor = floor_for(obstacles, ANIMAL_M), floor_for(obstacles, PERSON_M)
@@ -97,6 +98,7 @@ def simulate_session(
         rows.append([course_row(animal) for animal in animals])
         person.append((walker.position.copy(), observer.looks_at.copy()))
         reason.append(REASONS.index(animals[0].reason))
+        watch(animals[0])
     position, looks_at = (np.array(column) for column in zip(*person, strict=True))
     first, *others = (course_from_rows(course) for course in zip(*rows, strict=True))
     second, walked = others[0] if others else None, course_from_rows(guest) if guest else None
@@ -153,5 +155,4 @@ def standing_course(room: Room, rng: np.random.Generator, duration_s: float) -> 
         current = goal if current is None else current + (goal - current) * (1 - np.exp(-STEP_S / 0.3))
         gaze[index] = current
     still = np.zeros(count)
-    timestamp_s, posture = np.arange(count) * STEP_S, np.zeros((count, 3))
-    return AnimalCourse(timestamp_s, position, yaw, posture, still, gaze, still + 0.1)
+    return AnimalCourse(np.arange(count) * STEP_S, position, yaw, 0 * gaze, still, gaze, still + 0.1)
