@@ -1,11 +1,11 @@
 """Compare how often a simulated animal flees from a person who walks up at some speed, with the animal itself.
 
-    python -m benchmarks.approach_policy build/approach --simulate --seeds 0     # makes the build, 4 CPU minutes
-    python -m benchmarks.flight build/approach
+    python -m benchmarks.flight OUT
 
-Prints the share of episodes in which the animal begins to flee before the person reaches it, by the person's speed,
-and of animals that flee from a person who begins close by and stands. Both are judged by the same criterion, from
-where they go (`benchmarks.approaches.flights`).
+OUT is made first (`benchmarks.approach_animal`, 4 CPU minutes), unless it is there. Prints the share of episodes in
+which the animal begins to flee before the person reaches it, by the person's speed, and of animals that flee from a
+person who begins close by and stands. Both are judged by the same criterion, from where they go
+(`benchmarks.approaches.flights`).
 """
 
 from dataclasses import replace
@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from benchmarks import command_lines
-from benchmarks.approach_animal import TrueWorld
+from benchmarks.approach_animal import TrueWorld, simulated_build
 from benchmarks.approaches import OBSERVATIONS, Policy, flights, meet, run_episodes, stand_still, walk_to
 from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.environments.config import EnvironmentConfig
@@ -40,6 +40,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=96)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    simulated_build(arguments.build)
     config = EnvironmentConfig(episode_s=APPROACH_S, observations=OBSERVATIONS)
     columns = [f"{speed:g} m/s" for speed in SPEEDS_M_S]
     columns += [f"stands at {low:g} to {high:g} m" for low, high in CLOSE_STARTS_M]
