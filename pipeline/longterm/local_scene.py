@@ -70,10 +70,9 @@ def read_distances(
     field: Float[Tensor, "clip x y z"], route: Float[Tensor, "clip frame 3"]
 ) -> Float[Tensor, "clip frame read"]:
     """Return the signed distance at the probes of every frame, and the clearance each lacks, both scaled."""
-    probes = route[:, :, None] + torch.tensor(PROBES_M, dtype=route.dtype, device=route.device)
-    last = VOXEL_M * (torch.tensor(SHAPE, dtype=route.dtype, device=route.device) - 1)
-    grid = 2 * (probes - torch.tensor(LOW_M, dtype=route.dtype, device=route.device)) / last - 1
-    grid = grid.flip(-1)[:, None]  # grid_sample counts the last axis first
-    values = field.to(route)[:, None]
-    read = functional.grid_sample(values, grid, padding_mode="border", align_corners=True)[:, 0, 0]
+    probes = route[:, :, None] + route.new_tensor(PROBES_M)
+    last = VOXEL_M * (route.new_tensor(SHAPE) - 1)
+    grid = (2 * (probes - route.new_tensor(LOW_M)) / last - 1).flip(-1)  # grid_sample counts the last first
+    field = field.to(route)[:, None]
+    read = functional.grid_sample(field, grid[:, None], padding_mode="border", align_corners=True)[:, 0, 0]
     return torch.cat([4 * read, 10 * (CLEARANCE_M - read).clamp_min(0)], dim=-1)

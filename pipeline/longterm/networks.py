@@ -129,14 +129,16 @@ class InbetweenNet(nn.Module):
         coarse: Float[Tensor, "batch frame channel"] | None = None,
     ) -> Float[Tensor, "batch frame channel"]:
         """Return the channels of all k + 1 frames: ``coarse``, or the interpolated ends, plus an offset."""
-        share = torch.linspace(0, 1, STEPS + 1, dtype=start.dtype, device=start.device)
-        share = share[None, :, None].expand(len(start), -1, 1)
+        share = torch.linspace(0, 1, STEPS + 1).to(start)[None, :, None].expand(len(start), -1, 1)
         line = torch.lerp(start[:, None], end[:, None], share)
         both = torch.cat([start, end], dim=-1)[:, None].expand(-1, STEPS + 1, -1)
         parts = [line, both, share, 4 * share * (1 - share)] + ([] if extra is None else [extra])
         features, _ = self.lstm(torch.cat(parts, dim=-1))
-        code = self.point_net(points)[:, None].expand(-1, STEPS + 1, -1)
-        offset = self.out(torch.cat([features, code], dim=-1))
+        first = self.out[0]
+        assert isinstance(first, nn.Linear)
+        of_features, of_code = first.weight.split([features.shape[-1], self.point_net.code], dim=1)
+        code = functional.linear(self.point_net(points), of_code)[:, None]  # the same in all frames
+        offset = self.out[1:](functional.linear(features.contiguous(), of_features, first.bias) + code)
         return (line if coarse is None else coarse) + end_window(line) * offset
 
 

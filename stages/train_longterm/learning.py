@@ -62,8 +62,7 @@ def train_networks(
         "route": training.fit_stages(route, clips, trainer, config.route),
         "pose": training.fit_pose(pose, training.smoothed_true_routes(clips), clips, trainer, config.pose),
     }
-    scenes = [dataset.scenes[index] for index in dataset.scene_of]
-    prior = measure_motion_prior(list(dataset.stretches), scenes)
+    prior = measure_motion_prior(list(dataset.stretches), [dataset.scenes[each] for each in dataset.scene_of])
     model = LongTerm(sizes, poses, contacts, prior, static, route, pose)
     return TrainedLongTerm(model, records, train_ablations(clips, trainer, config, sizes, route))
 
