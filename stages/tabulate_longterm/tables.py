@@ -11,7 +11,7 @@ from stages.tabulate_longterm.scores import MEDIANS, METRICS
 
 TABLE_1 = ("translation", "orientation", "pose", "mpjpe_mm", "mpvpe_mm")
 TABLE_2 = ("non_collision", "contact", "penetration_mm", "slide_m_s", "planted", "min_slide_m_s")
-LENGTHS = ("mpvpe_mm", "non_collision", "contact", "slide_m_s", "seam_worst_mm")
+LENGTHS = ("mpvpe_mm", "non_collision", "contact", "slide_m_s", "planted", "min_slide_m_s", "seam_worst_mm")
 TABLE_4 = ("end_v2v_share", "neighbor_v2v_mm", "neighbor_v2v_share", "seam_share", "seam_worst_mm")
 
 

@@ -17,7 +17,7 @@ from pipeline.longterm.local_scene import (
     read_distances,
 )
 from pipeline.longterm.motion_synthesis import LongTerm
-from pipeline.longterm.networks import GaitPhase, PointNet, gait_progress
+from pipeline.longterm.networks import GaitPhase, InbetweenNet, PointNet, end_window, gait_progress
 from pipeline.longterm.short_motions import STEPS
 from pipeline.longterm.subgoals import Subgoal, WalkableFloor, plan_waypoints, sample_visited_subgoals
 from tests.pipeline.longterm import strider
@@ -100,6 +100,20 @@ def test_stride_encoding_rotates_with_the_path_and_is_inverted(clips):
     torch.testing.assert_close(still, still[:, :1].expand_as(still))
     gone = (route[:, 1:, [0, 2]] - route[:, :-1, [0, 2]]).norm(dim=-1).sum(1)
     torch.testing.assert_close(gait_progress(route)[:, -1, 0], gone)
+
+
+def test_scene_code_is_read_in_every_frame(clips):
+    torch.manual_seed(0)
+    net, features = InbetweenNet(9, 0, SIZES, with_scene=True), []
+    net.lstm.register_forward_hook(lambda _, __, made: features.append(made[0]))
+    start, end = clips.channels[:, 0, :9], clips.channels[:, -1, :9]
+    made = net(start, end, clips.seen.points)
+    line = torch.lerp(start[:, None], end[:, None], torch.linspace(0, 1, STEPS + 1)[:, None])
+    code = net.point_net(clips.seen.points)[:, None].expand(-1, STEPS + 1, -1)
+    offset = net.out(torch.cat([features[0], code], dim=-1))
+    torch.testing.assert_close(made, line + end_window(line) * offset)
+    nothing = net(start, end, 0 * clips.seen.points)
+    assert (made - nothing)[:, 1:-1].abs().amax(-1).min() > 0
 
 
 def test_scene_changes_only_networks_with_scene_input(clips):
