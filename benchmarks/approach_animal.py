@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +112,7 @@ def remembered(cat: Policy) -> Policy:
     return deepcopy(cat, {id(each): each for each in shared})
 
 
+@cache
 def lived(name: str) -> list[Policy]:
     """Simulate a session again, and return the cat as it was after every step."""
     cats: list[Policy] = []
@@ -130,7 +132,6 @@ class TrueCats:
 
     def __init__(self, data: BehaviorData):
         self.data, self.clearance_m, self.plans_drawn = data, clearance_of(data.agent_from_bone_rest), 0
-        self.lives: dict[int, list[Policy]] = {}
 
     def begin(self, context: Context, rng: np.random.Generator, **_: Any) -> None:
         """Start cats as they were where the windows end, with the person as there."""
@@ -149,9 +150,7 @@ class TrueCats:
 
     def _cat(self, video: int, root: Float[np.ndarray, "past 4 4"], rng: np.random.Generator) -> Policy:
         """Return the cat as it was at the end of a window, with what it had in mind."""
-        if video not in self.lives:
-            self.lives[video] = lived(self.data.videos[video])
-        cats = self.lives[video]
+        cats = lived(self.data.videos[video])
         off = np.linalg.norm([cat.walker.position for cat in cats] - root[-1, [0, 2], 3], axis=1)
         ahead = np.arctan2(root[-1, 0, 2], root[-1, 2, 2])
         off += TURN_M * np.abs(rigid.wrap(np.array([cat.walker.yaw for cat in cats]) - ahead))

@@ -27,7 +27,16 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from benchmarks import command_lines
 from benchmarks.approach_animal import TrueWorld, simulated_build
-from benchmarks.approaches import OBSERVATIONS, Episodes, Policy, facing, run_episodes, stand_still, walk_to
+from benchmarks.approaches import (
+    OBSERVATIONS,
+    Episodes,
+    Policy,
+    approach_at,
+    facing,
+    run_episodes,
+    stand_still,
+    walk_to,
+)
 from pipeline.behavior.trajectories import TEST, TRAIN
 from pipeline.core.progress import log
 from pipeline.data import plots
@@ -61,15 +70,10 @@ DRAWN_EPISODES = 6
 """Episodes whose paths are drawn."""
 
 
-def slow_walk(observation: dict[str, np.ndarray]) -> Float[np.ndarray, "person 3"]:
-    """Walk to the animal slowly."""
-    return walk_to(observation, SLOW_M_S / EnvironmentConfig.speed_m_s)
-
-
 def wait_then_walk(observation: dict[str, np.ndarray]) -> Float[np.ndarray, "person 3"]:
     """Stand while the animal moves, and walk to it slowly while it rests."""
     rests = np.linalg.norm(observation["animal"][:, 5:7], axis=1) < RESTING_M_S
-    return slow_walk(observation) * rests[:, None]
+    return approach_at(SLOW_M_S)(observation) * rests[:, None]
 
 
 def random_walk(rng: np.random.Generator) -> Policy:
@@ -230,7 +234,7 @@ def main() -> None:
     print("| animal, policy | reached, % | fled, % | neither, % | seconds to reach |\n|---|---|---|---|---|")
     scripted = {
         "straight walk": walk_to,
-        "slow walk": slow_walk,
+        "slow walk": approach_at(SLOW_M_S),
         "wait, then walk slowly": wait_then_walk,
         "random": random_walk(np.random.default_rng(0)),
         "standing still": stand_still,

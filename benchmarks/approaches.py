@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.behavior.trajectories import RATE_HZ
+from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.rewards import REACHED_M
 from pipeline.environments.spaces import person_observation
 from pipeline.environments.world import CLOSE_M, FLIGHT_S, AnimalWorld
@@ -53,6 +54,12 @@ def walk_to(observation: dict[str, np.ndarray], share: float = 1.0) -> Float[np.
 def stand_still(observation: dict[str, np.ndarray]) -> Float[np.ndarray, "person 3"]:
     """Stand still."""
     return np.zeros((len(observation["animal"]), 3))
+
+
+def approach_at(speed_m_s: float) -> Policy:
+    """Return the policy of a person who walks straight up at this speed."""
+    share = speed_m_s / EnvironmentConfig.speed_m_s
+    return stand_still if speed_m_s == 0 else lambda observation: walk_to(observation, share)
 
 
 def run_episodes(world: AnimalWorld, policy: Policy, episodes: int) -> Episodes:

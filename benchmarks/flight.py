@@ -2,7 +2,7 @@
 
     python -m benchmarks.flight OUT
 
-OUT is made first (`benchmarks.approach_animal`, 4 CPU minutes), unless it is there. Prints the share of episodes in
+OUT is made first (`benchmarks.approach_animal`, 8 CPU minutes), unless it is there. Prints the share of episodes in
 which the animal begins to flee before the person reaches it, by the person's speed, and of animals that flee from a
 person who begins close by and stands. Both are judged by the same criterion, from where they go
 (`benchmarks.approaches.flights`).
@@ -15,7 +15,7 @@ import torch
 
 from benchmarks import command_lines
 from benchmarks.approach_animal import TrueWorld, simulated_build
-from benchmarks.approaches import OBSERVATIONS, Policy, flights, meet, run_episodes, stand_still, walk_to
+from benchmarks.approaches import OBSERVATIONS, approach_at, flights, meet, run_episodes, stand_still
 from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.world import AnimalWorld
@@ -25,12 +25,6 @@ CLOSE_STARTS_M = ((0.3, 0.5), (0.5, 0.7), (0.8, 1.1))
 AT_ONCE_S, LATER_S = 1.5, 6.0
 """Reaction to who stands close by, and what else it does while that person stays."""
 APPROACH_S = 20.0
-
-
-def approach_at(speed_m_s: float) -> Policy:
-    """Return the policy of a person who walks straight up at this speed."""
-    share = speed_m_s / EnvironmentConfig.speed_m_s
-    return stand_still if speed_m_s == 0 else lambda observation: walk_to(observation, share)
 
 
 def main() -> None:

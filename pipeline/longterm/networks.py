@@ -134,11 +134,8 @@ class InbetweenNet(nn.Module):
         both = torch.cat([start, end], dim=-1)[:, None].expand(-1, STEPS + 1, -1)
         parts = [line, both, share, 4 * share * (1 - share)] + ([] if extra is None else [extra])
         features, _ = self.lstm(torch.cat(parts, dim=-1))
-        first = self.out[0]
-        assert isinstance(first, nn.Linear)
-        of_features, of_code = first.weight.split([features.shape[-1], self.point_net.code], dim=1)
-        code = functional.linear(self.point_net(points), of_code)[:, None]  # the same in all frames
-        offset = self.out[1:](functional.linear(features.contiguous(), of_features, first.bias) + code)
+        code = self.point_net(points)[:, None].expand(-1, STEPS + 1, -1)
+        offset = self.out(torch.cat([features, code], dim=-1))
         return (line if coarse is None else coarse) + end_window(line) * offset
 
 

@@ -2,15 +2,18 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 ITERATIONS, MODEL_SIZE = 8, 65
 """iterations of GrabCut; size of its models: five Gaussians with weight, mean and covariance"""
 BAND, SHARPENING = 0.05, 2
 """half width of the band in which outlines are decided again, in roots of the area; iterations of GrabCut"""
+SURE = 1.0
+"""log-odds of a learned appearance above which a pixel is surely animal, though GrabCut may cut it off"""
 Color = UInt8[np.ndarray, "height width 3"]
 Trimap = UInt8[np.ndarray, "height width"]
 Region = Bool[np.ndarray, "height width"]
+LogOdds = Float[np.ndarray, "height width"]
 
 
 def sharpened(color: Color, inside: Region, rng: np.random.Generator) -> Region:
@@ -22,6 +25,11 @@ def sharpened(color: Color, inside: Region, rng: np.random.Generator) -> Region:
     probable = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD)
     trimap = np.where(core, cv2.GC_FGD, np.where(far, cv2.GC_BGD, probable)).astype(np.uint8)
     return grabcut(color, trimap, rng, SHARPENING)
+
+
+def outlined(color: Color, animal: Region, log_odds: LogOdds, rng: np.random.Generator) -> Region:
+    """Sharpen a recognized animal, but keep what surely is the animal."""
+    return sharpened(color, animal, rng) | (animal & (log_odds > SURE))
 
 
 def grabcut(color: Color, trimap: Trimap, rng: np.random.Generator, iterations: int = ITERATIONS) -> Region:

@@ -41,9 +41,8 @@ def save(network: Appearance, folder: Path) -> None:
     save_file({name: value.contiguous() for name, value in network.state_dict().items()}, folder / FILE)
 
 
-def load(folder: Path) -> Recognizer:
+def load(folder: Path) -> Appearance:
     """Read what `save` wrote, ready for recognition."""
     network = Recognizer()
     network.load_state_dict(load_file(folder / FILE))
-    fold_batch_norms(network.eval())
-    return network
+    return fold_batch_norms(network.eval())

@@ -89,8 +89,10 @@ def of_session(
         distant = times[np.abs(timestamp_s[times] - timestamp_s[frame]) > foreground.MIN_GAP_S]
         seen = [by_view[id(view)] for view in tracking.walk_views(target.view, room)]
         in_front = foreground.foreground(target, seen, [shown[other] for other in distant])
-        animal = in_front if recognizer is None else foreground.recognize(recognizer, target, in_front)
-        blobs = _blobs(animal) if in_front.mean() <= MAX_FOREGROUND else None
+        blobs = None
+        if in_front.mean() <= MAX_FOREGROUND:
+            animal = in_front if recognizer is None else foreground.recognize(recognizer, target, in_front)
+            blobs = _blobs(animal)
         camera = target.view.intrinsics, target.view.world_from_camera
         masks.append(blobs)
         contacts.append([contact.find(blob, *camera, room.caster) for blob in blobs or ()])

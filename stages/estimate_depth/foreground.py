@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.geometry import cameras
 from pipeline.segmentation.appearance import Appearance, strongest
-from pipeline.segmentation.grabcut import dilated, sharpened
+from pipeline.segmentation.grabcut import Region, dilated, outlined
 from stages.estimate_depth import views
 from stages.estimate_depth.views import View
 
@@ -31,9 +31,8 @@ MIN_SEEN, WALK_SHARE, MIN_TIMES, TIMES_SHARE = 2, 0.5, 2, 0.1
 number and share of other times that must: an animal may rest at one place for most of a recording."""
 OPENING, CLOSING = np.ones((3, 3), np.uint8), np.ones((7, 7), np.uint8)
 """Kernels against specks, and against gaps in the animal, whose stripes may look like the floor."""
-REACH_PX, SURE = 12, 1.0
-"""The animal is at most this far from foreground, pixels of small pictures: parts of it resemble the room.
-Log-odds above which GrabCut, which loses tails, does not decide again."""
+REACH_PX = 12
+"""The animal is at most this far from foreground, pixels of small pictures: parts of it resemble the room."""
 
 
 @dataclass(frozen=True)
@@ -83,14 +82,11 @@ def foreground(
     return cv2.morphologyEx(grown.astype(np.uint8), cv2.MORPH_CLOSE, CLOSING) > 0
 
 
-def recognize(
-    network: Appearance, target: ColorView, in_front: Bool[np.ndarray, "height width"]
-) -> Bool[np.ndarray, "height width"]:
-    """Return the mask of a session's animal: of what is recognized near foreground, the part with the most
-    evidence. Its shadow is foreground, too, and where the map has holes nothing is."""
+def recognize(network: Appearance, target: ColorView, in_front: Region) -> Region:
+    """Return the animal's mask: of what is recognized near foreground (as its shadow is), the surest part."""
     log_odds = network.log_odds(target.color)
     animal = strongest((log_odds > 0) & dilated(in_front, REACH_PX), log_odds)
-    return sharpened(target.color, animal, np.random.default_rng(0)) | (animal & (log_odds > SURE))
+    return outlined(target.color, animal, log_odds, np.random.default_rng(0))
 
 
 def _differing(both, limit: float) -> Bool[np.ndarray, "height width"]:

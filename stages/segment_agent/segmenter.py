@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.data.clips import Clip
 from pipeline.segmentation.appearance import Appearance, strongest
-from pipeline.segmentation.grabcut import sharpened
+from pipeline.segmentation.grabcut import SURE, outlined
 from stages.segment_agent import refine
 from stages.segment_agent.evidence import Evidence, EvidenceOf
 from stages.segment_agent.refine import ColorHistogram, Edges
@@ -24,8 +24,6 @@ APPEARANCE_ALONE, APPEARANCE_AGAINST = 3.0, 4.0
 edges are sharper), and against it anywhere"""
 DOUBT = 0.2
 """prior log-odds of background with the learned appearance"""
-SURE = 1.0
-"""log-odds above which a pixel is surely animal, with the learned appearance"""
 SMALL_PX, MIN_SUPPORT = 250, 0.7
 """masks smaller than this many pixels need this share that looks like the animal or clearly moves"""
 MIN_PRESUMED_PX = 25
@@ -111,7 +109,7 @@ class Segmenter:
                 labels, sure = self._by_appearance(window, evidence, log_ratio)
         if self.outline_rng is not None:
             part = strongest(labels == 255, log_ratio)
-            sharp = sharpened(window.color, part, self.outline_rng) | (part & (log_ratio > SURE))
+            sharp = outlined(window.color, part, log_ratio, self.outline_rng)
             labels = np.where((sharp != part) | ((labels == 255) & ~part), np.uint8(128), labels)
         inside = labels == 255
         if sure[inside].sum() < (MIN_PRESUMED_PX if sphere.presumed else 1):
