@@ -29,7 +29,7 @@ from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.homes import Habitat
 from pipeline.environments.other_home import ReconstructedHome, move_in
 from pipeline.environments.residents import Resident, folders_of
-from pipeline.environments.world import AnimalWorld, animal_seen
+from pipeline.environments.world import AnimalWorld, seen_from
 from pipeline.longterm.bodies import PosedSurface, load_body
 from stages.slice_behavior.windows import write_volumes
 
@@ -130,7 +130,8 @@ def lived(world: AnimalWorld, lives: int, seconds: float) -> dict[str, Poses]:
     begin, most = rng.uniform(0, 2 * TURN_S, lives), world.config.turn_rad_s / RATE_HZ
     for frame in range(round(seconds * RATE_HZ)):
         wander = rng.uniform([-1.0, -0.5, -1.0], [1.0, 1.5, 1.0], (lives, 3))
-        left, ahead = animal_seen(world)[:, :2].T
+        person = world.persons
+        left, ahead = seen_from(world, world.target, person.position, person.heading)[:, :2].T
         turn = np.clip(np.arctan2(left, ahead) / most, -1, 1)
         approach = np.stack([0 * turn, np.ones(lives), turn], axis=-1)
         near = (frame / RATE_HZ + begin) % (2 * TURN_S) < TURN_S
@@ -201,7 +202,8 @@ def opened(
         return world
     [(name, resident)], [observed] = residents.items(), seen.values()
     other = ReconstructedHome.load(observed, home / "feature_basis", home / "scene_template")
-    moved = move_in(ReconstructedHome.of_build(build), other, resident.habitat.data)
+    own = ReconstructedHome.of_build(build)
+    moved = move_in({name: (own, resident.habitat.data)}, other)[name]
     habitat = Habitat.of_one_home(moved.data, moved.home.scenes(), moved.share_known)
     return AnimalWorld({name: replace(resident, habitat=habitat)}, config)
 

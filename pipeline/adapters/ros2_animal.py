@@ -8,7 +8,7 @@ of a robot are. Publishes, ten times a second of the node's clock (`use_sim_time
 centers), all in the frame `map`. Needs ROS 2 (`rclpy`, `geometry_msgs`), which no wheel brings along.
 """
 
-import argparse
+import sys
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from pipeline.adapters.live_animal import ZUP_FROM_WORLD, LiveAnimal
 from pipeline.behavior.trajectories import RATE_HZ
+from pipeline.core.errors import CommandLine, exit_code
 from pipeline.geometry import rigid
 
 FRAME = "map"
@@ -65,11 +66,9 @@ class AnimalNode:
         return self.messages.Pose(position=place, orientation=turn)
 
 
-def main() -> None:
-    """Run the node until ROS shuts it down."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def main() -> int:
+    """Run the node until ROS shuts it down; return 2 for a build or options that cannot be used."""
+    parser = CommandLine(__doc__)
     parser.add_argument("build", type=Path)
     parser.add_argument("--home", type=Path)
     parser.add_argument("--seed", type=int, default=0)
@@ -87,7 +86,8 @@ def main() -> None:
     finally:
         node.destroy_node()
         rclpy.try_shutdown()
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code(main))

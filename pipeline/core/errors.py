@@ -3,6 +3,7 @@
 Any other failure is a bug of ours and shows as an `assert` or a plain traceback. Standard library only.
 """
 
+import argparse
 import contextlib
 import errno
 import os
@@ -10,6 +11,7 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
+from typing import Any, NoReturn
 
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """No space left, quota exceeded, or the shell's file size limit (`ulimit -f`)."""
@@ -32,6 +34,17 @@ class InputError(Exception):
         place = f"{printable(self.where)}: ".replace("\n", "\\n") if self.where else ""
         advice = f"\n  -> {self.remedy}" if self.remedy else ""
         return printable(f"{self.code} {place}{self.what}{advice}")
+
+
+class CommandLine(argparse.ArgumentParser):
+    """Raises RUN-004 for invalid arguments, where argparse prints its usage; help keeps its line breaks."""
+
+    def __init__(self, description: str | None, **settings: Any) -> None:
+        layout = argparse.RawDescriptionHelpFormatter
+        super().__init__(description=description, formatter_class=layout, **settings)
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError("RUN-004", message, self.prog, "see --help")
 
 
 def printable(text: str) -> str:

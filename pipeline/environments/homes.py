@@ -1,10 +1,10 @@
-"""The animal of one build in several homes, each with recorded starts and scenes.
+"""The animals of one build in several homes, each with recorded starts and scenes.
 
-`open_homes` opens the animal's own home or other builds' homes; `together` joins them, so that animals in
-different homes plan in one batch.
+`open_homes` opens their own home or other builds' homes; `together` joins them, so that animals in different
+homes plan in one batch.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -27,33 +27,39 @@ class Habitat:
     share_known: tuple[float, ...]
     """Per home, share (0..1) of its surface that looks like the animal's own home."""
 
+    @property
+    def home_of_window(self) -> Int[np.ndarray, "window"]:
+        """Index of the home of each window."""
+        return self.home_of_video[self.data.video]
+
     @classmethod
     def of_one_home(cls, data: BehaviorData, scenes: Scenes, share_known: float = 1.0) -> "Habitat":
         """Return one home as a habitat, by default the animal's own."""
         return cls(data, scenes, np.zeros(len(data.videos), int), (share_known,))
 
 
-def open_homes(build: Path, data: BehaviorData, homes: Sequence[Path]) -> Habitat:
-    """Put the animal of ``build`` and ``data`` into ``homes``, by default its own home.
+def open_homes(build: Path, animals: Mapping[str, Path], homes: Sequence[Path]) -> dict[str, Habitat]:
+    """Put all ``animals`` of a ``build``, by their folders, into ``homes`` together, by default their own.
 
-    Raises the errors of `pipeline.environments.other_home` for unusable homes.
+    Moments in other homes are those of the first animal. Raises the errors of
+    `pipeline.environments.other_home` for unusable homes.
     """
-    if not homes:
-        return _own(build, data)
-    own: ReconstructedHome | None = None
-    habitats = []
-    for home in homes:
+    data = {name: BehaviorData.load(folder / "behavior_data") for name, folder in animals.items()}
+    recorded: dict[str, tuple[ReconstructedHome, BehaviorData]] = {}
+    habitats: dict[str, list[Habitat]] = {name: [] for name in animals}
+    for home in homes or (build,):
         if home.resolve() == build.resolve():
-            habitats.append(_own(build, data))
+            for name, folder in animals.items():
+                scenes = Scenes.load(folder / "behavior_data", data[name].videos)
+                habitats[name].append(Habitat.of_one_home(data[name], scenes))
             continue
-        own = own or ReconstructedHome.of_build(build)
-        moved = move_in(own, ReconstructedHome.of_build(home), data)
-        habitats.append(Habitat.of_one_home(moved.data, moved.home.scenes(), moved.share_known))
-    return together(habitats)
-
-
-def _own(build: Path, data: BehaviorData) -> Habitat:
-    return Habitat.of_one_home(data, Scenes.load(build / "behavior_data", data.videos))
+        recorded = recorded or {
+            name: (ReconstructedHome.of_build(folder), data[name]) for name, folder in animals.items()
+        }
+        for name, moved in move_in(recorded, ReconstructedHome.of_build(home)).items():
+            here = Habitat.of_one_home(moved.data, moved.home.scenes(), moved.share_known)
+            habitats[name].append(here)
+    return {name: together(each) for name, each in habitats.items()}
 
 
 def together(habitats: Sequence[Habitat]) -> Habitat:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import numpy as np
+from jaxtyping import Bool
 
 from pipeline.behavior.avoidance import clearance_of
 from pipeline.behavior.trajectories import TRAIN, BehaviorData, Trajectory
@@ -14,19 +15,25 @@ def recorded_at(data: BehaviorData, window: int) -> tuple[Trajectory, int]:
 
 
 def moments_together(
-    data: Mapping[str, BehaviorData], leading: str, window: int, split: int = TRAIN
+    data: Mapping[str, BehaviorData],
+    leading: str,
+    window: int,
+    split: int = TRAIN,
+    here: Mapping[str, Bool[np.ndarray, "window"]] | None = None,
 ) -> dict[str, int]:
     """Return a window of each animal: the others' are the nearest in time to the ``window`` of the
     ``leading`` one, preferably of the same recording, in which bodies do not overlap.
 
-    They are of ``split``, of any for an animal that has none in it.
+    They are among those ``here``, if given: of ``split``, of any for an animal that has none in it.
     """
     windows, begin_s = {leading: window}, data[leading].begin_s[window]
     placed = data[leading].place_world[[window]]
     video = data[leading].videos[int(data[leading].video[window])]
     for name in (other for other in data if other != leading):
         mine = data[name]
-        known = mine.indices(split) if (mine.split == split).any() else np.arange(len(mine.split))
+        among = np.ones(len(mine.split), bool) if here is None else here[name]
+        in_split = among & (mine.split == split)
+        known = np.flatnonzero(in_split if in_split.any() else among)
         elsewhere = np.array(mine.videos)[mine.video[known]] != video
         order = known[np.lexsort((np.abs(mine.begin_s[known] - begin_s), elsewhere))]
         off = (placed[:, None] - mine.place_world[order])[..., [0, 2]]

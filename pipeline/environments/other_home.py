@@ -1,9 +1,8 @@
 """The animals of one build in the reconstructed home of another; both homes are in meters.
 
-`ReconstructedHome.of_build` opens the home of a finished build. `move_in` puts an animal into another home,
-`move_in_together` all animals of a home:
-features are converted to the basis that its model was trained on, recorded moments are placed on the other
-floor, and `share_known` measures how much of the other home looks like its own.
+`ReconstructedHome.of_build` opens the home of a finished build. `move_in` puts all animals of a home
+into another one: features are converted to the basis that their models were trained on, recorded moments are
+placed on the other floor, and `share_known` measures how much of the other home looks like their own.
 """
 
 import json
@@ -61,11 +60,16 @@ class ReconstructedHome:
 
     @classmethod
     def of_build(cls, build: Path) -> "ReconstructedHome":
-        """Open the home of `build/<agent>`. Raises as `load` does, ART-003 where an artifact is not there,
-        ART-007 where another version wrote it.
+        """Open the home of `build/<agent>`, or of one animal of several, `build/<agent>/animals/<name>`.
+
+        Raises as `load` does, ART-003 where an artifact is not there, ART-007 where another version wrote it.
         """
-        artifact.require(build, *ARTIFACTS, remedy="make <agent>.registration, of an agent with recordings")
-        return cls.load(*(build / name for name in ARTIFACTS))
+        home = build.parent.parent if build.parent.name == "animals" else build
+        paths = [(build if (build / name).is_dir() else home) / name for name in ARTIFACTS]
+        for path in paths:
+            remedy = "make <agent>.registration, of an agent with recordings"
+            artifact.require(path.parent, path.name, remedy=remedy)
+        return cls.load(*paths)
 
     @classmethod
     def load(cls, behavior_data: Path, feature_basis: Path, scene_template: Path) -> "ReconstructedHome":
@@ -130,12 +134,7 @@ class MovedAnimal:
     """Share (0..1) of the other home's surface cells that look like the known home's."""
 
 
-def move_in(own: ReconstructedHome, other: ReconstructedHome, data: BehaviorData) -> MovedAnimal:
-    """Put the animal of ``own`` and ``data`` into the other home, as `move_in_together` does."""
-    return move_in_together({"": (own, data)}, other)[""]
-
-
-def move_in_together(
+def move_in(
     animals: Mapping[str, tuple[ReconstructedHome, BehaviorData]], other: ReconstructedHome
 ) -> dict[str, MovedAnimal]:
     """Put all animals of a home, each as it perceives it and with its recordings, into the other home.

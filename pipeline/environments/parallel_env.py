@@ -69,7 +69,9 @@ class PersonAnimalEnv(ParallelEnv):
             self.rng = np.random.default_rng(seed)
         self.agents, self.frame = list(self.possible_agents), 0
         self.world.begin(1, self.rng, (options or {}).get("split", "train"))
-        return self._observations(), {agent: {} for agent in self.agents}
+        known = {name: float(self.world.share_known_of(name)[0]) for name in self.world.batches}
+        known[PERSON] = known[self.world.target]
+        return self._observations(), {agent: {"share_known": known[agent]} for agent in self.agents}
 
     def step(self, actions: Mapping[str, Any]):
         """Let 0.1 s pass; actions (2 or 3 in -1..1) are parts of highest speeds, or of the farthest goal."""

@@ -12,7 +12,7 @@ from pipeline.behavior import model as behavior
 from pipeline.behavior.config import Ego
 from pipeline.behavior.planning import Sampler, TorchNetworks
 from pipeline.behavior.simulator import AnimalBatch
-from pipeline.behavior.trajectories import BehaviorData, as_companions
+from pipeline.behavior.trajectories import as_companions
 from pipeline.core.config import refuse_unknown
 from pipeline.core.errors import InputError
 from pipeline.environments.config import EnvironmentConfig
@@ -35,19 +35,31 @@ class Resident:
 
     @classmethod
     def load(cls, build: Path, *, homes: Sequence[Path] = (), device: str = "cpu") -> "Resident":
-        """Open an animal's folder, in ``homes`` where there are any: builds, of which one may be its own.
+        """Open the animal of a folder alone, as `load_all` does."""
+        return cls.load_all(build, {ALONE: build}, homes=homes, device=device)[ALONE]
 
-        Raises ART-003 where it lacks the model, ART-007 where another version wrote it, SIM-006 for models
+    @classmethod
+    def load_all(
+        cls, build: Path, animals: Mapping[str, Path], *, homes: Sequence[Path], device: str
+    ) -> "dict[str, Resident]":
+        """Open animals of a build by their folders, together in ``homes`` where there are any: builds, of
+        which one may be their own. Moments in other homes are those of the first animal.
+
+        Raises ART-003 where one lacks the model, ART-007 where another version wrote it, SIM-006 for models
         without goals, and what `pipeline.environments.other_home` raises for homes that cannot be used.
         """
         one_of_several = f"give one of its animals: {build}/animals/<name>"
-        remedy = one_of_several if (build / "animals").is_dir() else "make it: make <agent>.behavior"
-        artifact.require(build, *NEEDED, remedy=remedy)
-        architecture, nets, scaling, schedule, _ = behavior.load(build / "behavior")
-        behavior.refuse_unplayable(architecture, str(build))
-        habitat = open_homes(build, BehaviorData.load(build / "behavior_data"), homes)
-        sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
-        return cls(sampler, habitat, architecture.ego)
+        several = (build / "animals").is_dir() and build in animals.values()
+        for folder in animals.values():
+            remedy = one_of_several if several else "make it: make <agent>.behavior"
+            artifact.require(folder, *NEEDED, remedy=remedy)
+        habitats, residents = open_homes(build, animals, homes), {}
+        for name, folder in animals.items():
+            architecture, nets, scaling, schedule, _ = behavior.load(folder / "behavior")
+            behavior.refuse_unplayable(architecture, str(folder))
+            sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
+            residents[name] = cls(sampler, habitats[name], architecture.ego)
+        return residents
 
     def batch(self, config: EnvironmentConfig) -> AnimalBatch:
         """Return a batch to simulate it in; it has not begun."""

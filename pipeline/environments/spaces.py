@@ -8,7 +8,7 @@ from jaxtyping import Shaped
 
 from pipeline.environments.floor import CELLS, to_local
 from pipeline.environments.rgbd import FAR_M, HEIGHT_PX, WIDTH_PX
-from pipeline.environments.world import ANIMAL_NUMBERS, AnimalWorld, animal_seen, occupancy_seen, others_seen
+from pipeline.environments.world import ANIMAL_NUMBERS, AnimalWorld, occupancy_seen, others_seen, seen_from
 
 FAR = 20.0
 """Bound of all observed numbers: meters or m/s; homes are smaller, animals slower."""
@@ -45,7 +45,7 @@ def person_observation(world: AnimalWorld) -> dict[str, Shaped[np.ndarray, "pers
     for seen in world.config.observations:
         match seen:
             case "animal":
-                parts["animal"] = animal_seen(world).clip(-FAR, FAR)
+                parts["animal"] = seen_from(world, world.target, *here).clip(-FAR, FAR)
                 if len(world.names) > 1:
                     parts["others"] = others_seen(world, world.target, *here).clip(-FAR, FAR)
             case "velocity":

@@ -18,7 +18,8 @@ from pipeline.environments.world import AnimalWorld
 class PersonStableVecEnv(VecEnv):
     """`PersonEnv` ``num_envs`` times in one process, as `stable_baselines3` wants it.
 
-    Each episode's last `info` holds `reached`, `flees`, `terminal_observation` and `TimeLimit.truncated`.
+    `reset_infos` holds `home` and `share_known`, each episode's last `info` `reached`, `flees`,
+    `terminal_observation` and `TimeLimit.truncated`.
     """
 
     def __init__(
@@ -41,6 +42,7 @@ class PersonStableVecEnv(VecEnv):
         """Begin all episodes."""
         self.frame = np.zeros(self.num_envs, int)
         self.world.begin(self.num_envs, self.rng, self.split)
+        self._inform()
         return person_observation(self.world)
 
     def step_async(self, actions: Any) -> None:
@@ -66,8 +68,14 @@ class PersonStableVecEnv(VecEnv):
         if len(ended):
             self.world.restart(ended, self.split)
             self.frame[ended] = 0
+            self._inform()
             observation = person_observation(self.world)
         return observation, reward.astype(np.float32), over | late, infos
+
+    def _inform(self) -> None:
+        """Set `reset_infos` to the home of each episode and how much of it looks known."""
+        each = zip(self.world.home.tolist(), self.world.share_known.tolist(), strict=True)
+        self.reset_infos = [{"home": home, "share_known": known} for home, known in each]
 
     def close(self) -> None:
         """Nothing to close."""

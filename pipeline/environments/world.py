@@ -66,7 +66,7 @@ class AnimalWorld:
         data, scenes = self.data, self.scenes
         tracks = [data.trajectories[name] for name in data.videos]
         roots = [track.world_from_agent[track.valid, :3, 3] for track in tracks]
-        self.floors, scene_of = [], self._scene_of_videos()
+        self.floors, scene_of = [], scenes.number(np.arange(len(roots)), len(roots)).tolist()
         for number, volume in enumerate(scenes.volumes):
             here = [root for root, scene in zip(roots, scene_of, strict=True) if scene == number]
             self.floors.append(PersonFloor.of(volume, np.concatenate(here)))
@@ -82,7 +82,7 @@ class AnimalWorld:
         config: EnvironmentConfig | None = None,
         **settings: Any,
     ) -> "AnimalWorld":
-        """Return the world of a build, or the one given, its animal in another build's home where ``home``
+        """Return the world of a build, or the one given, its animals in another build's home where ``home``
         names one, or in each of ``homes``: every episode draws one of them.
 
         ``settings`` replace fields of ``config``.
@@ -98,23 +98,20 @@ class AnimalWorld:
     def load(
         cls, build: Path, config: EnvironmentConfig, *, homes: Sequence[Path] = (), device: str = "cpu"
     ) -> "AnimalWorld":
-        """Open a finished build: its animal, in ``homes`` where there are any, or all animals of its home.
+        """Open a finished build with all animals of its home, in ``homes`` where there are any.
 
-        Raises what `Resident.load` and `folders_of` raise, ART-003 where it lacks the surfaces that `rgbd`
-        shows, and SIM-011 for several animals in ``homes``.
+        Raises what `Resident.load_all` and `folders_of` raise, and ART-003 where surfaces that `rgbd` shows
+        are lacking.
         """
         folders = folders_of(build, config.animal)
-        if homes and build not in folders.values():
-            what, remedy = "animals of a home of several live in their own", "leave `home` and `homes` out"
-            raise InputError("SIM-011", what, str(build), remedy)
-        residents = {
-            name: None if folder is None else Resident.load(folder, homes=homes, device=device)
-            for name, folder in folders.items()
-        }
-        world = cls(residents, config)
+        bodies = {name: folder for name, folder in folders.items() if folder is not None}
+        target = config.animal or next(iter(bodies))
+        leading = {target: bodies[target]} | bodies
+        residents = Resident.load_all(build, leading, homes=homes, device=device)
+        world = cls({name: residents.get(name) for name in folders}, config)
         if "rgbd" in config.observations:
-            bodies = {name: folder for name, folder in folders.items() if folder is not None}
-            world.camera = RgbdCamera.load(list(bodies.values()), homes or (bodies[world.target],))
+            shown = [bodies[target] if home.resolve() == build.resolve() else home for home in homes]
+            world.camera = RgbdCamera.load(list(bodies.values()), shown or [bodies[target]])
         return world
 
     def begin(self, count: int, rng: np.random.Generator, split: str = "train") -> None:
@@ -220,7 +217,11 @@ class AnimalWorld:
     @property
     def share_known(self) -> Float[np.ndarray, "person"]:
         """How much (0..1) of each life's home looks like the one that the animal knows."""
-        return np.array(self.habitat.share_known)[self.home]
+        return self.share_known_of(self.target)
+
+    def share_known_of(self, name: str) -> Float[np.ndarray, "person"]:
+        """Return `share_known` of any of the animals."""
+        return np.array(self.residents[name].habitat.share_known)[self.home]
 
     def pictures(self) -> list[tuple[UInt8[np.ndarray, "48 64 3"], Float[np.ndarray, "48 64"]]]:
         """Return what the persons' cameras see: color, and z-depth in meters (0 where nothing is)."""
@@ -269,7 +270,11 @@ class AnimalWorld:
         """Draw each animal's windows for some lives, and where the persons have stood, facing the target."""
         data = {name: each.habitat.data for name, each in self.residents.items()}
         chosen = self._moments(len(some), split)
-        begun = [moments_together(data, self.target, int(window), SPLITS[split]) for window in chosen]
+        home_of = {name: each.habitat.home_of_window for name, each in self.residents.items()}
+        begun: list[dict[str, int]] = []
+        for window in chosen.tolist():
+            here = {name: homes == home_of[self.target][window] for name, homes in home_of.items()}
+            begun.append(moments_together(data, self.target, window, SPLITS[split], here))
         windows = {name: np.array([row[name] for row in begun]) for name in data}
         contexts = {name: data[name].windows(each)[0] for name, each in windows.items()}
         video = contexts[self.target].video
@@ -294,7 +299,7 @@ class AnimalWorld:
         windows = self.data.indices(SPLITS.get(split, -1))
         if not len(windows):
             raise InputError("REC-002", f"no window of the split {split!r}", "reset", "train or test")
-        home = self.habitat.home_of_video[self.data.video[windows]]
+        home = self.habitat.home_of_window[windows]
         homes = np.unique(home)
         if len(homes) == 1:
             return self.rng.choice(windows, count)
@@ -319,10 +324,6 @@ class AnimalWorld:
                 break
         return place
 
-    def _scene_of_videos(self) -> Sequence[int]:
-        count = len(self.data.videos)
-        return self.scenes.number(np.arange(count), count).tolist()
-
 
 def checked(action: Any, shape: tuple[int, int]) -> Float[np.ndarray, "person command"]:
     """Return actions as numbers. Raises SIM-012 where they are not finite or of another shape."""
@@ -339,12 +340,7 @@ def checked(action: Any, shape: tuple[int, int]) -> Float[np.ndarray, "person co
 
 
 ANIMAL_NUMBERS = 7
-"""Numbers of `animal_seen`."""
-
-
-def animal_seen(world: AnimalWorld) -> Float[np.ndarray, "person 7"]:
-    """Return the animal in the person's frame: place (left, ahead), height (m), heading, velocity (m/s)."""
-    return seen_from(world, world.target, world.persons.position, world.persons.heading)
+"""Numbers of `seen_from`."""
 
 
 def others_seen(
@@ -363,8 +359,8 @@ def others_seen(
 def seen_from(
     world: AnimalWorld, name: str, place: Float[np.ndarray, "life 2"], heading: Float[np.ndarray, "life"]
 ) -> Float[np.ndarray, "life 7"]:
-    """Return an animal in the frames of places (world x and z, meters) and headings (radians), as
-    `animal_seen` does; heights are above the floor.
+    """Return an animal in the frames of places (world x and z, meters) and headings (radians): place (left,
+    ahead), height above the floor (m), heading, velocity (m/s).
     """
     past = world.batches[name].past
     root, before = past[-1].root[:, 0], past[-2].root[:, 0, :3, 3]

@@ -22,7 +22,7 @@ from typing import Any
 
 from pipeline.core import config as configuration
 from pipeline.core import devices, videos
-from pipeline.core.errors import InputError, coded_disk_errors, exit_code
+from pipeline.core.errors import CommandLine, InputError, coded_disk_errors, exit_code
 from pipeline.core.videos import Video
 from pipeline.workflow import artifact, dag, recipes
 from pipeline.workflow.dag import Need
@@ -211,8 +211,7 @@ def _settings(defaults: Any, table: str = "") -> Iterator[str]:
 def _parser(
     stage: str, doc: str | None, epilog: str | None, fields: Sequence[InputField]
 ) -> argparse.ArgumentParser:
-    prog, layout = f"python -m stages.{stage}", argparse.RawDescriptionHelpFormatter
-    parser = _Parser(prog=prog, description=doc, epilog=epilog, formatter_class=layout)
+    parser = CommandLine(doc, prog=f"python -m stages.{stage}", epilog=epilog)
 
     def path(name: str, metavar: str, text: str, *, required: bool = False) -> None:
         option = f"--{name.replace('_', '-')}"
@@ -230,13 +229,6 @@ def _parser(
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads to use (default: 1)")
     parser.add_argument("--key", help=argparse.SUPPRESS)
     return parser
-
-
-class _Parser(argparse.ArgumentParser):
-    """Rejects an invalid command line with a coded error instead of the usage."""
-
-    def error(self, message: str) -> typing.NoReturn:
-        raise InputError("RUN-004", message, self.prog, "see --help")
 
 
 def _add_option(parser: argparse.ArgumentParser, name: str, hint: Any) -> None:

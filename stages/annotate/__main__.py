@@ -6,13 +6,12 @@ until it is stopped, and the file of clicks is the user's, beside the recordings
 make annotate AGENT=luna        or: python -m stages.annotate build/luna --clicks captures/luna/clicks.json
 """
 
-import argparse
 import contextlib
 import sys
 from pathlib import Path
 
 from pipeline.core import loopback, videos
-from pipeline.core.errors import exit_code
+from pipeline.core.errors import CommandLine, exit_code
 from pipeline.workflow import artifact, dag
 from stages.annotate import serving, stage
 
@@ -22,17 +21,15 @@ PORT = 8765
 
 def main(arguments: list[str]) -> int:
     """Serve until Ctrl-C; return 2 if the build lacks what the page needs."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandLine(__doc__)
     parser.add_argument("build", type=Path, help="build/<agent>, built up to scene_template")
     parser.add_argument(
         "--clicks", type=Path, required=True, help="file to keep clicks in, captures/<agent>/clicks.json"
     )
     parser.add_argument("--port", type=int, default=PORT, help=f"port on 127.0.0.1 (default: {PORT}; 0: any)")
-    given = parser.parse_args(arguments)
 
     def program() -> int:
+        given = parser.parse_args(arguments)
         server = serving.ClickServer(_session(given.build, given.clicks), given.port)
         address = f"http://{loopback.HOST}:{server.server_address[1]}"
         print(f"open {address} ; clicks go to {given.clicks}; Ctrl-C ends", flush=True)

@@ -5,13 +5,12 @@ It has a command line of its own because it makes no artifact and runs before th
 make capture-check AGENT=luna        or: python -m stages.check_captures captures/luna
 """
 
-import argparse
 import itertools
 import sys
 from pathlib import Path
 
 from pipeline.core import config
-from pipeline.core.errors import InputError, printable
+from pipeline.core.errors import CommandLine, InputError, printable
 from pipeline.core.videos import Role
 from pipeline.workflow import captures, recipes
 from stages.check_captures import stage
@@ -20,14 +19,12 @@ from stages.check_captures.stage import CaptureVerdict
 
 def main(arguments: list[str]) -> int:
     """Print a verdict per recording; return 2 when one cannot be used or the set is not complete."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandLine(__doc__)
     parser.add_argument("folder", type=Path, help="captures/<agent>, or another folder with recordings")
     about = "recipe whose [videos] table gives roles (default: agents/<folder's name>.toml)"
     parser.add_argument("--recipe", type=Path, help=about)
-    given = parser.parse_args(arguments)
     try:
+        given = parser.parse_args(arguments)
         said, files, refused = _said(
             given.folder, given.recipe or Path("agents", f"{given.folder.name}.toml")
         )

@@ -5,24 +5,21 @@ It has a command line of its own because it makes no artifact: it looks at whate
 make gallery        or: python -m stages.compile_gallery build
 """
 
-import argparse
 import sys
 from pathlib import Path
 
-from pipeline.core.errors import exit_code
+from pipeline.core.errors import CommandLine, exit_code
 from pipeline.workflow import artifact
 from stages.compile_gallery import stage
 
 
 def main(arguments: list[str]) -> int:
     """Write `index.html` into the folder of builds; return 2 where nothing is built."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandLine(__doc__)
     parser.add_argument("build", type=Path, help="folder of builds: build")
-    given = parser.parse_args(arguments)
 
     def program() -> int:
+        given = parser.parse_args(arguments)
         index = given.build / "index.html"
         artifact.write_if_changed(index, stage.run(given.build))
         print(f"written: {index}")

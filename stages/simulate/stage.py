@@ -15,12 +15,9 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
     """
     subgoals = None if inputs.subgoals is None else subgoal_file.read(inputs.subgoals)
     of_behavior = not config.serve and subgoals is None
-    if inputs.home is not None and not (of_behavior and config.places == "none"):
-        what = "sub-goals and the live view have the animal's own home"
+    if inputs.home is not None and (not of_behavior or config.places != "none" or config.replayed):
+        what = "sub-goals, the live view and recorded clips have the animal's own home"
         raise InputError("SIM-011", what, str(inputs.home), "leave them out, or the other home")
-    if inputs.home is not None and config.replayed:
-        what = "a recorded clip would lead through the walls of another home"
-        raise InputError("SIM-011", what, ", ".join(config.replayed), "leave it out, or the other home")
     if inputs.animals is None and (config.absent or config.replayed):
         what = "animals can be left out or replayed in a home of several alone"
         raise InputError("SIM-013", what, ", ".join(config.absent + config.replayed), "leave the option out")

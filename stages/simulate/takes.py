@@ -17,7 +17,7 @@ from pipeline.behavior.trajectories import TRAIN, BehaviorData, Trajectory
 from pipeline.core import progress
 from pipeline.core.errors import InputError, other_versions_refused
 from pipeline.data import glb, ply
-from pipeline.environments.other_home import MovedAnimal, ReconstructedHome, move_in, move_in_together
+from pipeline.environments.other_home import MovedAnimal, ReconstructedHome, move_in
 from pipeline.longterm import journeys
 from pipeline.longterm.bodies import load_body
 from pipeline.longterm.config import MotionOptimizationConfig
@@ -86,7 +86,7 @@ def of_behavior(inputs: Inputs, c: Config, device: str) -> FinishedTake:
 def _elsewhere(inputs: Inputs, home: Path, data: BehaviorData, c: Config, device: str) -> FinishedTake:
     """Let the animal live in the home of another build."""
     own = _own_home(inputs, _required(inputs, "behavior_data"))
-    moved = move_in(own, ReconstructedHome.of_build(home), data)
+    moved = move_in({"": (own, data)}, ReconstructedHome.of_build(home))[""]
     simulator = _simulator(inputs, moved.data, moved.home.scenes(), _sampling(c), ReplanningConfig(), device)
     take = rollout(simulator, _observer(simulator, c), seconds=c.seconds, seed=c.seed)
     about = elsewhere.metrics(take, moved, home.name)
@@ -115,7 +115,7 @@ def of_home(inputs: Inputs, animals: Path, c: Config, device: str) -> FinishedTa
     if inputs.home is not None:
         homes = {name: _own_home(inputs, animals / name / "behavior_data") for name in names}
         recorded = {name: (homes[name], data[name]) for name in names}
-        moved = move_in_together(recorded, ReconstructedHome.of_build(inputs.home))
+        moved = move_in(recorded, ReconstructedHome.of_build(inputs.home))
     living: dict[str, Simulator | ReplayedAnimal] = {}
     for name in names:
         if name in c.replayed:

@@ -41,9 +41,7 @@ def with_filled_floor(
     # no floor is filled in under seats whose space below was not seen
     unsupported &= (masked[:, level] > 0) | ~supported.any(1)
     masked[:, level][unsupported] = FILLED
-    supported = np.any(masked >= SUPPORTED, axis=1, keepdims=True)
-    masked[np.broadcast_to(~supported, masked.shape)] = 0
-    return masked
+    return masked * (masked >= SUPPORTED).any(1, keepdims=True)
 
 
 def with_level_floor(

@@ -19,9 +19,10 @@ from pipeline.behavior.model import ROOT_CHANNELS, Architecture, Scaling, channe
 from pipeline.behavior.path_encoding import GOAL_POWER_OF, velocity_channels_from_path, with_powered_length
 from pipeline.behavior.perception import POSITION, PerceptionEnsemble, world_from_ego
 from pipeline.behavior.trajectories import RATE_HZ, anticipated_frames
+from pipeline.environments.homes import Habitat
 from pipeline.geometry import rigid, rigid_torch
 from stages.train_behavior.config import AugmentationConfig
-from stages.train_behavior.homes import TrainingHomes
+from stages.train_behavior.homes import windows_of_all
 from stages.train_behavior.scene_sampler import SceneSampler
 
 YAW_JITTER_RAD = 0.3
@@ -138,9 +139,9 @@ class TrainingBatch:
         return TrainingBatch(*(value.to(device) for value in vars(self).values()))
 
 
-def windows_from_data(homes: TrainingHomes, architecture: Architecture) -> TrainingWindows:
+def windows_from_data(homes: Habitat, architecture: Architecture) -> TrainingWindows:
     """Concatenate the frames of all recordings and index the training windows."""
-    data, index = homes.data, homes.windows()
+    data, index = homes.data, windows_of_all(homes)
     tracks = [data.trajectories[video] for video in data.videos]
     agent = np.concatenate([track.world_from_agent for track in tracks])
     observer = np.concatenate([track.world_from_camera for track in tracks])
@@ -156,7 +157,7 @@ def windows_from_data(homes: TrainingHomes, architecture: Architecture) -> Train
     tables = (torch.from_numpy(array.astype(np.float32)) for array in arrays)
     approaching = approached(now, observer[rows[:, : data.past], :3, 3], data.rate_hz)
     approaching = approaching[:0] if architecture.ablated_input == "observer" else approaching
-    known = homes.home[data.video[index]] == 0
+    known = homes.home_of_window[index] == 0
     indices = (torch.from_numpy(index) for index in (rows, number, known, approaching))
     return TrainingWindows(*tables, *indices, rate_hz=data.rate_hz, encoding=architecture.encoding)
 

@@ -4,7 +4,7 @@ Every build has bones of its own, so that bodies are trained on the animal's own
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,44 +17,29 @@ from pipeline.environments.homes import Habitat, together
 from pipeline.environments.other_home import ReconstructedHome, perceived
 
 
-@dataclass(frozen=True)
-class TrainingHomes:
-    """Training data: recordings and scenes of one or several homes."""
-
-    data: BehaviorData
-    scenes: Scenes
-    home: Int[np.ndarray, "video"]
-    """Index of each recording's home; 0 is the animal's own build."""
-
-    @classmethod
-    def of_one(cls, data: BehaviorData, scenes: Scenes) -> "TrainingHomes":
-        """Return the animal's own build alone."""
-        return cls(data, scenes, np.zeros(len(data.videos), int))
-
-    def windows(self) -> Int[np.ndarray, "window"]:
-        """Return the training windows of all homes, repeated so that all homes have as many."""
-        index = self.data.indices(TRAIN)
-        each = [index[self.home[self.data.video[index]] == number] for number in range(self.home.max() + 1)]
-        most = max(len(mine) for mine in each)
-        return np.concatenate([np.resize(mine, most) for mine in each if len(mine)])
+def windows_of_all(homes: Habitat) -> Int[np.ndarray, "window"]:
+    """Return the training windows of all homes, repeated so that all homes have as many."""
+    index = homes.data.indices(TRAIN)
+    each = [index[homes.home_of_window[index] == number] for number in range(homes.home_of_video.max() + 1)]
+    most = max(len(mine) for mine in each)
+    return np.concatenate([np.resize(mine, most) for mine in each if len(mine)])
 
 
 def with_other_homes(
     data: BehaviorData, scenes: Scenes, own: ReconstructedHome | None, others: Sequence[Path]
-) -> TrainingHomes:
-    """Add the training windows of ``others``, builds of the same animal, to those of its own build.
+) -> Habitat:
+    """Add the training windows of ``others``, builds of the same animal, to those of its own build, home 0.
 
     Raises REC-002 for another rate or past, and the errors of `pipeline.environments.other_home`.
     """
     if not others:
-        return TrainingHomes.of_one(data, scenes)
+        return Habitat.of_one_home(data, scenes)
     assert own is not None, "further homes are compared with the animal's own"
     habitats = [Habitat.of_one_home(data, scenes)]
     for build in others:
         home = perceived(own, ReconstructedHome.of_build(build))
         habitats.append(Habitat.of_one_home(_training_windows(build, data), home.scenes()))
-    habitat = together(habitats)
-    return TrainingHomes(habitat.data, habitat.scenes, habitat.home_of_video)
+    return together(habitats)
 
 
 def _training_windows(build: Path, own: BehaviorData) -> BehaviorData:

@@ -13,11 +13,11 @@ from pipeline.behavior.model import ROOT_CHANNELS, Architecture, BehaviorNets, S
 from pipeline.behavior.perception import POSITION, VolumeScene
 from pipeline.core import distributed
 from pipeline.core.training import FitRecord, fit
+from pipeline.environments.homes import Habitat
 from stages.train_behavior import batches
 from stages.train_behavior.baseline_losses import gaussian_losses, one_stage_losses
 from stages.train_behavior.batches import TrainingWindows, WindowStatistics, draw_batch
 from stages.train_behavior.config import AugmentationConfig, BehaviorOptimizerConfig, BehaviorTrainingConfig
-from stages.train_behavior.homes import TrainingHomes
 from stages.train_behavior.objective import TrainingPhase, losses
 from stages.train_behavior.scene_sampler import SceneSampler
 
@@ -48,7 +48,7 @@ class TrainedBehavior:
 
 
 def train(
-    homes: TrainingHomes,
+    homes: Habitat,
     architecture: Architecture,
     schedule: Schedule,
     settings: BehaviorTrainingConfig,

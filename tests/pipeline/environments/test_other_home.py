@@ -13,13 +13,7 @@ from pipeline.behavior.trajectories import PAST, TEST, TRAIN
 from pipeline.core.errors import InputError
 from pipeline.data import npz
 from pipeline.environments.moments import moments_together
-from pipeline.environments.other_home import (
-    ReconstructedHome,
-    change_basis,
-    move_in,
-    move_in_together,
-    share_known,
-)
+from pipeline.environments.other_home import ReconstructedHome, change_basis, move_in, share_known
 from tests.pipeline.behavior.wandering import room, wandering
 
 RAW = 40
@@ -82,7 +76,7 @@ def test_features_are_converted_to_the_other_basis():
 def test_start_states_are_on_the_other_floor_in_free_space():
     own, other = home(), home(origin=(10.0, 2.0, -7.0))
     data = wandering()
-    moved = move_in(own, other, data)
+    moved = move_in({"cat": (own, data)}, other)["cat"]
     assert set(moved.data.split) == {TRAIN, TEST}
     scenes = moved.home.scenes()
     for name, track in moved.data.trajectories.items():
@@ -96,7 +90,7 @@ def test_start_states_are_on_the_other_floor_in_free_space():
         np.testing.assert_allclose(
             np.linalg.norm(np.diff(roots, axis=0), axis=1), np.linalg.norm(np.diff(before, axis=0), axis=1)
         )
-    again = move_in(own, other, data)
+    again = move_in({"cat": (own, data)}, other)["cat"]
     np.testing.assert_array_equal(
         again.data.windows(np.arange(5))[0].world_from_agent,
         moved.data.windows(np.arange(5))[0].world_from_agent,
@@ -106,7 +100,7 @@ def test_start_states_are_on_the_other_floor_in_free_space():
 def test_animals_begin_together_as_they_were_at_home():
     own, other = home(), home(origin=(10.0, 2.0, -7.0))
     data = {name: wandering(seed) for seed, name in enumerate(("cat", "dog"))}
-    moved = move_in_together({name: (own, each) for name, each in data.items()}, other)
+    moved = move_in({name: (own, each) for name, each in data.items()}, other)
     cat, dog = (each.data for each in moved.values())
     assert cat.videos == dog.videos and set(cat.split) == {TRAIN, TEST}
     for window in range(len(cat.videos)):
@@ -161,8 +155,9 @@ def test_missing_homes_and_other_folders_are_refused(tmp_path):
     (build / "behavior_data/volume.npz").unlink()
     with pytest.raises(InputError, match="SIM-011.*each recording"):
         ReconstructedHome.of_build(build)
+    animals = {"cat": (home(), wandering())}
     with pytest.raises(InputError, match="SIM-011.*dinov2"):
-        move_in(home(), replace(other, describer=Describer("dinov2", "somewhere")), wandering())
+        move_in(animals, replace(other, describer=Describer("dinov2", "somewhere")))
     coarse = replace(other, volume=replace(other.volume, voxel_m=0.2))
     with pytest.raises(InputError, match="ART-007"):
-        move_in(home(), coarse, wandering())
+        move_in(animals, coarse)

@@ -28,6 +28,7 @@ def test_ended_episodes_return_the_terminal_observation_and_reset():
     env = PersonStableVecEnv(small_world(replace(QUICK, episode_s=0.5, reward="calm")), 3)
     env.seed(0)
     env.reset()
+    assert env.reset_infos == [{"home": 0, "share_known": 1.0}] * 3
     for frame in range(5):
         before = env.world.persons.position.copy()
         seen, _, done, info = env.step(np.zeros((3, 3)))

@@ -163,7 +163,7 @@ def test_all_animals_live_together_in_another_home(other_home, tmp_path):
 
 
 def test_what_cannot_be_in_another_home_is_refused(other_home, tmp_path):
-    with pytest.raises(InputError, match="SIM-011.*walls of another home"):
+    with pytest.raises(InputError, match="SIM-011.*recorded clips"):
         stage.run(other_home, replace(SETTINGS, replayed=("dog",)), tmp_path)
     with pytest.raises(InputError, match="SIM-011.*sub-goals"):
         stage.run(other_home, replace(SETTINGS, places="visited"), tmp_path)

@@ -18,6 +18,7 @@ from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import ABSENT_M, PAST, TEST, frames_from_seconds
 from pipeline.core import training as fit
 from pipeline.core.errors import InputError
+from pipeline.environments.homes import Habitat
 from pipeline.geometry import rigid_torch
 from stages.train_behavior import objective, outcome, pictures, training
 from stages.train_behavior.batches import (
@@ -44,7 +45,6 @@ from stages.train_behavior.export import (
     write_contract,
     write_networks,
 )
-from stages.train_behavior.homes import TrainingHomes
 from stages.train_behavior.objective import (
     goal_error,
     joint_mask,
@@ -79,7 +79,7 @@ def data():
 
 @pytest.fixture(scope="module")
 def homes(data):
-    return TrainingHomes.of_one(data, Scenes.of(room()))
+    return Habitat.of_one_home(data, Scenes.of(room()))
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.planning import TorchNetworks, observe
 from pipeline.behavior.scenes import Scenes
+from pipeline.environments.homes import Habitat
 from stages.train_behavior import outcome
 from stages.train_behavior.config import BehaviorOptimizerConfig, BehaviorTrainingConfig, ObjectiveConfig
-from stages.train_behavior.homes import TrainingHomes
 from stages.train_behavior.training import train
 from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
 from tests.simulated_device import DEVICE, is_on_device, simulated_device
@@ -60,7 +60,7 @@ def test_training_and_sampling_run_on_another_device(data, architecture, schedul
     context, _ = data.windows(np.arange(1))
     with simulated_device():
         trained = train(
-            TrainingHomes.of_one(data, scenes), architecture, schedule, settings, seed=0, device=DEVICE
+            Habitat.of_one_home(data, scenes), architecture, schedule, settings, seed=0, device=DEVICE
         )
         assert all(map(is_on_device, (*trained.nets.parameters(), *trained.nets.buffers())))
         networks = TorchNetworks(trained.nets, DEVICE)

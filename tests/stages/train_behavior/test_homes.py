@@ -9,6 +9,7 @@ import torch
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import TEST, TRAIN
 from pipeline.core.errors import InputError
+from pipeline.environments.homes import Habitat
 from pipeline.environments.other_home import ReconstructedHome
 from stages.train_behavior.batches import (
     draw_batch,
@@ -17,7 +18,7 @@ from stages.train_behavior.batches import (
     windows_from_data,
 )
 from stages.train_behavior.config import AugmentationConfig, BehaviorTrainingConfig, Config, ObjectiveConfig
-from stages.train_behavior.homes import TrainingHomes, with_other_homes
+from stages.train_behavior.homes import with_other_homes
 from stages.train_behavior.objective import sequence_rows
 from stages.train_behavior.scene_sampler import SceneSampler
 from stages.train_behavior.stage import Inputs, run
@@ -73,7 +74,7 @@ def test_bodies_are_learned_from_the_own_home_only(learned):
     drawn = AugmentationConfig(mirror=0.0)
     statistics = statistics_from_windows(windows, largest_turn_rad(drawn))
     alone = wandering()
-    own = windows_from_data(TrainingHomes.of_one(alone, Scenes.of(learned.scenes.volumes[0])), ARCHITECTURE)
+    own = windows_from_data(Habitat.of_one_home(alone, Scenes.of(learned.scenes.volumes[0])), ARCHITECTURE)
     by_itself = statistics_from_windows(own, largest_turn_rad(drawn))
     np.testing.assert_allclose(
         statistics.scaling.body_mean[6:],

@@ -11,9 +11,9 @@ import torch
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.scenes import Scenes
 from pipeline.core.training import generator_for
+from pipeline.environments.homes import Habitat
 from stages.train_behavior import baseline_losses, objective, training
 from stages.train_behavior.config import BehaviorOptimizerConfig, BehaviorTrainingConfig
-from stages.train_behavior.homes import TrainingHomes
 from tests import two_processes
 from tests.pipeline.behavior.wandering import ARCHITECTURE, room, wandering
 
@@ -24,7 +24,7 @@ def trained(family: str, batch: int, folder: Path | None = None) -> training.Tra
     """Train for six steps, half of them on goals; a quarter of the windows are mirrored without bones."""
     pace = BehaviorOptimizerConfig(steps=6, goal_steps=3, batch=batch, goal_batch=batch, rate=1e-3)
     return training.train(
-        TrainingHomes.of_one(wandering(), Scenes.of(room())),
+        Habitat.of_one_home(wandering(), Scenes.of(room())),
         replace(ARCHITECTURE, family=family),
         Schedule(),
         BehaviorTrainingConfig(pace),

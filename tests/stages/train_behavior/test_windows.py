@@ -14,11 +14,11 @@ from pipeline.behavior.path_encoding import path_from_velocity_channels, velocit
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, frames_from_seconds
 from pipeline.core.errors import InputError
+from pipeline.environments.homes import Habitat
 from stages.slice_behavior.gridding import ReconstructedMotion, trajectory_from_motion
 from stages.slice_behavior.windows import slice_windows
 from stages.train_behavior import export
 from stages.train_behavior.config import BehaviorOptimizerConfig, BehaviorTrainingConfig, Config
-from stages.train_behavior.homes import TrainingHomes
 from stages.train_behavior.refusals import check_settings
 from stages.train_behavior.training import train
 from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, wandering
@@ -67,7 +67,7 @@ def test_model_with_other_windows_is_trained_loaded_and_sampled(data, tmp_path):
     architecture = replace(ARCHITECTURE, past=data.past, future=data.future, rate_hz=data.rate_hz)
     quick = BehaviorOptimizerConfig(steps=4, goal_steps=2, batch=4, goal_batch=4)
     settings, schedule = BehaviorTrainingConfig(optimization=quick), Schedule()
-    fitted = train(TrainingHomes.of_one(data, Scenes.of(room())), architecture, schedule, settings, seed=0)
+    fitted = train(Habitat.of_one_home(data, Scenes.of(room())), architecture, schedule, settings, seed=0)
     export.write_contract(tmp_path, fitted.nets, architecture, fitted.scaling, schedule, REST)
     again, _, scaling, *_ = model.load(tmp_path)
     assert again == architecture and scaling.rate_hz == RATE_HZ
