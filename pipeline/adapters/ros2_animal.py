@@ -68,7 +68,7 @@ class AnimalNode:
 
 def main() -> int:
     """Run the node until ROS shuts it down; return 2 for a build or options that cannot be used."""
-    parser = CommandLine(__doc__)
+    parser = CommandLine(__doc__, prog="python -m pipeline.adapters.ros2_animal")
     parser.add_argument("build", type=Path)
     parser.add_argument("--home", type=Path)
     parser.add_argument("--seed", type=int, default=0)

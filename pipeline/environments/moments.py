@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Int
 
 from pipeline.behavior.avoidance import clearance_of
 from pipeline.behavior.trajectories import TRAIN, BehaviorData, Trajectory
@@ -19,19 +19,20 @@ def moments_together(
     leading: str,
     window: int,
     split: int = TRAIN,
-    here: Mapping[str, Bool[np.ndarray, "window"]] | None = None,
+    home_of: Mapping[str, Int[np.ndarray, "window"]] | None = None,
 ) -> dict[str, int]:
     """Return a window of each animal: the others' are the nearest in time to the ``window`` of the
     ``leading`` one, preferably of the same recording, in which bodies do not overlap.
 
-    They are among those ``here``, if given: of ``split``, of any for an animal that has none in it.
+    They are of its home, if homes of windows are given, and of ``split``, or of any split for an animal that
+    has none in it.
     """
     windows, begin_s = {leading: window}, data[leading].begin_s[window]
     placed = data[leading].place_world[[window]]
     video = data[leading].videos[int(data[leading].video[window])]
     for name in (other for other in data if other != leading):
         mine = data[name]
-        among = np.ones(len(mine.split), bool) if here is None else here[name]
+        among = mine.split >= 0 if home_of is None else home_of[name] == home_of[leading][window]
         in_split = among & (mine.split == split)
         known = np.flatnonzero(in_split if in_split.any() else among)
         elsewhere = np.array(mine.videos)[mine.video[known]] != video

@@ -35,11 +35,8 @@ class PersonEnv(gymnasium.Env):
         self.frame = 0
         self.world.begin(1, self.np_random, (options or {}).get("split", "train"))
         self._show()
-        info = {
-            "distance_m": float(self.world.distance_m[0]),
-            "share_known": float(self.world.share_known[0]),
-        }
-        return self._observation(), info
+        about = {"distance_m": self.world.distance_m, "share_known": self.world.share_known}
+        return self._observation(), {name: float(value[0]) for name, value in about.items()}
 
     def step(self, action: Any):
         """Let 0.1 s pass; an action (2 or 3 numbers in -1..1) is a part of the highest speeds."""

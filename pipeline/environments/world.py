@@ -271,10 +271,7 @@ class AnimalWorld:
         data = {name: each.habitat.data for name, each in self.residents.items()}
         chosen = self._moments(len(some), split)
         home_of = {name: each.habitat.home_of_window for name, each in self.residents.items()}
-        begun: list[dict[str, int]] = []
-        for window in chosen.tolist():
-            here = {name: homes == home_of[self.target][window] for name, homes in home_of.items()}
-            begun.append(moments_together(data, self.target, window, SPLITS[split], here))
+        begun = [moments_together(data, self.target, int(each), SPLITS[split], home_of) for each in chosen]
         windows = {name: np.array([row[name] for row in begun]) for name in data}
         contexts = {name: data[name].windows(each)[0] for name, each in windows.items()}
         video = contexts[self.target].video

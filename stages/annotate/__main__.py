@@ -21,7 +21,7 @@ PORT = 8765
 
 def main(arguments: list[str]) -> int:
     """Serve until Ctrl-C; return 2 if the build lacks what the page needs."""
-    parser = CommandLine(__doc__)
+    parser = CommandLine(__doc__, prog="python -m stages.annotate")
     parser.add_argument("build", type=Path, help="build/<agent>, built up to scene_template")
     parser.add_argument(
         "--clicks", type=Path, required=True, help="file to keep clicks in, captures/<agent>/clicks.json"

@@ -19,15 +19,14 @@ from stages.check_captures.stage import CaptureVerdict
 
 def main(arguments: list[str]) -> int:
     """Print a verdict per recording; return 2 when one cannot be used or the set is not complete."""
-    parser = CommandLine(__doc__)
+    parser = CommandLine(__doc__, prog="python -m stages.check_captures")
     parser.add_argument("folder", type=Path, help="captures/<agent>, or another folder with recordings")
     about = "recipe whose [videos] table gives roles (default: agents/<folder's name>.toml)"
     parser.add_argument("--recipe", type=Path, help=about)
     try:
         given = parser.parse_args(arguments)
-        said, files, refused = _said(
-            given.folder, given.recipe or Path("agents", f"{given.folder.name}.toml")
-        )
+        recipe = given.recipe or Path("agents", f"{given.folder.name}.toml")
+        said, files, refused = _said(given.folder, recipe)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

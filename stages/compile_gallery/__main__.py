@@ -15,7 +15,7 @@ from stages.compile_gallery import stage
 
 def main(arguments: list[str]) -> int:
     """Write `index.html` into the folder of builds; return 2 where nothing is built."""
-    parser = CommandLine(__doc__)
+    parser = CommandLine(__doc__, prog="python -m stages.compile_gallery")
     parser.add_argument("build", type=Path, help="folder of builds: build")
 
     def program() -> int:

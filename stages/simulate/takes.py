@@ -122,11 +122,9 @@ def of_home(inputs: Inputs, animals: Path, c: Config, device: str) -> FinishedTa
             living[name] = ReplayedAnimal(data[name])
             continue
         own = replace(inputs, behavior=animals / name / "behavior")
-        if name in moved:
-            mine, scenes = moved[name].data, moved[name].home.scenes()
-        else:
-            mine = data[name]
-            scenes = Scenes.load(animals / name / "behavior_data", mine.videos)
+        here = moved.get(name)
+        mine = here.data if here else data[name]
+        scenes = here.home.scenes() if here else Scenes.load(animals / name / "behavior_data", mine.videos)
         living[name] = _simulator(own, mine, scenes, sampling[name], ReplanningConfig(), device)
     home = SharedHome(living)
     begun = home.reset(c.seed)[names[0]].world_from_agent[:3, 3]

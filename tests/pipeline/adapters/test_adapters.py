@@ -2,6 +2,7 @@
 program.
 """
 
+import subprocess
 import sys
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -130,6 +131,16 @@ class FakeNode:
 
     def get_clock(self):
         return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=lambda: "now"))
+
+
+@pytest.mark.parametrize(
+    "program",
+    ["stages.annotate", "stages.check_captures", "stages.compile_gallery", "pipeline.adapters.ros2_animal"],
+)
+def test_invalid_arguments_are_refused_with_a_code(program):
+    failed = subprocess.run([sys.executable, "-m", program], capture_output=True, text=True, check=False)
+    assert failed.returncode == 2
+    assert failed.stderr.startswith(f"error: RUN-004 python -m {program}: ") and "usage" not in failed.stderr
 
 
 def test_missing_ros_is_one_line(monkeypatch, capsys):

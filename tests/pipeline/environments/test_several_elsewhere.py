@@ -116,7 +116,7 @@ def test_stable_baselines_tells_the_homes(homes):
     assert seen["others"].shape == (4, 1, 8) and (seen["others"][:, 0, 0] == 1).all()
 
 
-def test_one_of_several_moves_alone_and_homes_of_several_are_moved_into(homes):
+def test_one_of_several_moves_alone(homes):
     pair, other = homes
     alone = AnimalWorld.opened(pair / "animals/dog", config=QUICK, home=other)
     alone.begin(2, np.random.default_rng(0))
