@@ -51,7 +51,7 @@ def learned(builds):
 
 
 def test_training_windows_of_both_homes_and_test_windows_of_its_own(learned):
-    data, own = wandering(), learned.home[learned.data.video] == 0
+    data, own = wandering(), learned.home_of_window == 0
     assert len(learned.data.indices(TRAIN)) == 2 * len(data.indices(TRAIN))
     assert len(learned.data.indices(TEST)) == len(data.indices(TEST))
     assert own[learned.data.indices(TEST)].all() and not own[learned.data.indices(TRAIN)].all()
