@@ -63,8 +63,8 @@ def test_homes_are_sampled_with_equal_probability(learned):
     data = learned.data
     few = np.concatenate([data.indices(TRAIN)[:5], data.indices(TRAIN)[len(data.indices(TRAIN)) // 2 :]])
     some = replace(data, **{name: getattr(data, name)[few] for name in ("video", "start", "split")})
-    drawn = replace(learned, data=some).windows()
-    home = learned.home[some.video[drawn]]
+    drawn = windows_of_all(replace(learned, data=some))
+    home = learned.home_of_video[some.video[drawn]]
     assert (home == 0).sum() == (home == 1).sum() == len(few) - 5
     assert set(drawn) == set(range(len(few)))
 
