@@ -18,7 +18,7 @@ from stages.train_behavior.batches import (
     windows_from_data,
 )
 from stages.train_behavior.config import AugmentationConfig, BehaviorTrainingConfig, Config, ObjectiveConfig
-from stages.train_behavior.homes import with_other_homes
+from stages.train_behavior.homes import windows_of_all, with_other_homes
 from stages.train_behavior.objective import sequence_rows
 from stages.train_behavior.scene_sampler import SceneSampler
 from stages.train_behavior.stage import Inputs, run
