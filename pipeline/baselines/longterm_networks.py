@@ -26,7 +26,7 @@ class AblationSpec:
     """RouteNet predicts orientations; else PoseNet does"""
     paper: bool = False
     """RouteNet makes no draft and reads positions, orientations and scene points only; PoseNet has no
-    `GaitPhase` and is trained along such routes"""
+    `GaitPhase`"""
     follows_route: bool = True
     """PoseNet is conditioned on the route"""
     one: bool = False

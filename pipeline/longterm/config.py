@@ -30,8 +30,9 @@ class LongTermSizes:
 class LongTermOptimizerConfig:
     """Length and learning rate of one network's training."""
 
-    steps: int = 1500
-    """steps of Adam (the paper on 6,000 clips: 3,750 of RouteNet, 7,500 of PoseNet and the CVAE)"""
+    epochs: float = 20.0
+    """passes over the examples, which `examples.MAX_CLIPS` and `max_bodies` limit (the paper: 20 for RouteNet
+    and PoseNet, 40 for the CVAE)"""
     batch: int = 16
     """examples a step"""
     rate: float = 1e-3

@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from pipeline.core import progress
 from pipeline.geometry import rigid
@@ -44,9 +44,7 @@ def figures(prefix: str, source: MotionSource, config: Config) -> dict[str, floa
         plain[name] = scores.score_pairs(made[name], known, model)
         mpjpe_mm = plain[name][:, scores.METRICS.index("mpjpe_mm")].mean()
         progress.log(f"{prefix}: {name}, MPJPE {mpjpe_mm:.1f} mm")
-    for name, than in methods.COMPARED_WITH.items():
-        if {name, than} <= plain.keys():
-            plain[f"{name}_beyond_{than}"] = plain[name] - plain[than]
+    plain |= _differences(plain)
     some = even_runs(len(clips), 2, config.optimized_clips)
     done = {}
     optimized = methods.OPTIMIZED if source.data is None else ("ours",)
@@ -87,9 +85,22 @@ def _figures_of_lengths(
         rows = {"truth": scores.score_runs([each.truth for each in known], known, model, run, parts)}
         for name, motions in made.items():
             rows[f"{name}_opt"] = scores.score_runs(motions, known, model, run, parts, config.optimization)
+        rows |= _differences(rows, "_opt")
         found |= tables.figures(rows, episode, f"{prefix}_{seconds}s", seed=config.seed)
         progress.log(f"{prefix}: {len(episode)} motions of {seconds} s, optimized")
     return found
+
+
+def _differences(
+    rows: dict[str, Float[np.ndarray, "clip metric"]], ending: str = ""
+) -> dict[str, Float[np.ndarray, "clip metric"]]:
+    """Return what the methods are beyond those that `methods.COMPARED_WITH` names, motion by motion."""
+    pairs = ((f"{name}{ending}", f"{than}{ending}") for name, than in methods.COMPARED_WITH.items())
+    return {
+        f"{name}_beyond_{than}": rows[name] - rows[than]
+        for name, than in pairs
+        if {name, than} <= rows.keys()
+    }
 
 
 def select_runs(cuts: ClipSelection, run: int, most: int) -> ClipSelection:

@@ -16,11 +16,11 @@ from stages.tabulate_longterm.reading import MotionSource
 
 Method = Callable[[Clips], Float[Tensor, "clip frame channel"]]
 """Predicts all frames of clips from their first and last frames and the scene alone."""
-OPTIMIZED = ("ours", "base", "route_cvae", "nearest")
+OPTIMIZED = ("ours", "base", "as_paper", "route_cvae", "nearest")
 """Methods that are also evaluated after optimization."""
 WITHOUT_SCENE = {"ours": "ours_no_scene", "route_t_pose": "route_t_pose_no_scene", "base": "base_no_scene"}
 """Methods that see the scene, and their ablations without it; `route_tr_pose` has the routes of ours."""
-COMPARED_WITH = {"base": "ours", "route_cvae": "ours", "nearest": "ours"} | {
+COMPARED_WITH = {"base": "ours", "as_paper": "ours", "route_cvae": "ours", "nearest": "ours"} | {
     blind: with_scene for with_scene, blind in WITHOUT_SCENE.items()
 }
 """Pairs of methods whose difference in error per clip is reported with intervals."""

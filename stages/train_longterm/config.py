@@ -12,7 +12,7 @@ Ablations = Literal["none", "baselines", "all"]
 class Config:
     """Training of the networks, and what they learn from."""
 
-    body: LongTermOptimizerConfig = field(default_factory=lambda: LongTermOptimizerConfig(500, 32, 2e-3))
+    body: LongTermOptimizerConfig = field(default_factory=lambda: LongTermOptimizerConfig(6.0, 32, 2e-3))
     """Training of the bodies at sub-goals."""
     route: LongTermOptimizerConfig = field(default_factory=LongTermOptimizerConfig)
     """Training of RouteNet."""

@@ -60,8 +60,9 @@ def train_networks(
     records = {
         "static": training.fit_body(static, stills, dataset, contacts, trainer, config.body),
         "route": training.fit_stages(route, clips, trainer, config.route),
-        "pose": training.fit_pose(pose, training.smoothed_true_routes(clips), clips, trainer, config.pose),
     }
+    along = training.predicted_routes(route, clips)
+    records["pose"] = training.fit_pose(pose, along, clips, trainer, config.pose)
     prior = measure_motion_prior(list(dataset.stretches), [dataset.scenes[each] for each in dataset.scene_of])
     model = LongTerm(sizes, poses, contacts, prior, static, route, pose)
     return TrainedLongTerm(model, records, train_ablations(clips, trainer, config, sizes, route))
@@ -84,10 +85,7 @@ def train_ablations(
                 training.fit_stages(made.route, clips, trainer, config.route, f"{name}_route")
                 routes[key] = made.route
             made.route.load_state_dict(routes[key].state_dict())
-            if spec.paper:
-                along = training.predicted_routes(made.route, clips)
-            else:
-                along = training.smoothed_true_routes(clips)
+            along = training.predicted_routes(made.route, clips)
             training.fit_pose(made.pose, along, clips, trainer, config.pose, f"{name}_pose")
         trained[name] = made.eval()
     return trained

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.ndimage import gaussian_filter1d
 from torch import Tensor, nn
 
 from pipeline.core import distributed
@@ -17,15 +16,13 @@ from pipeline.longterm.clip_channels import Clips
 from pipeline.longterm.config import LongTermOptimizerConfig
 from pipeline.longterm.contacts import ContactVertices
 from pipeline.longterm.examples import MotionDataset, StaticBodies
-from pipeline.longterm.networks import ROOT_CHANNELS, BaseNet, PoseNet, RouteNet, StaticBody, orthonormalized
+from pipeline.longterm.networks import ROOT_CHANNELS, BaseNet, PoseNet, RouteNet, StaticBody
 from stages.train_longterm import objectives
 
 GRADIENT_NORM = 1.0
 """Maximum gradient norm."""
 SAVE_EVERY = 200
 """Steps between checkpoints: at most about a minute of training."""
-SMOOTH_FRAMES = 4.0
-"""Standard deviation of the Gaussian that makes true routes as smooth as predicted ones, frames at 30 fps."""
 CHUNK = 256
 """Batch size of inference."""
 BODY_VERTICES = 150
@@ -91,7 +88,7 @@ class NetworkTrainer:
             modules={"net": net},
             optimizer=optimizer,
             loss=step_loss,
-            steps=optimizer_config.steps,
+            steps=max(1, round(optimizer_config.epochs * examples / optimizer_config.batch)),
             seed=self.seed,
             resume=folder,
             save_every=SAVE_EVERY,
@@ -132,17 +129,10 @@ def fit_stages(
 
 
 def predicted_routes(net: RouteNet, clips: Clips) -> Float[Tensor, "clip frame 9"]:
-    """Return the routes that a RouteNet predicts, on which the paper's PoseNet is trained."""
+    """Return the routes that a RouteNet predicts for clips."""
     with torch.no_grad():
         ends, batches = clips.channels[:, [0, -1]], torch.arange(len(clips)).split(CHUNK)
         return torch.cat([net(ends[rows, 0], ends[rows, 1], clips.seen[rows]) for rows in batches])
-
-
-def smoothed_true_routes(clips: Clips) -> Float[Tensor, "clip frame 9"]:
-    """Return the true routes, smoothed like predicted ones, with exact ends."""
-    route = clips.channels[..., :ROOT_CHANNELS]
-    smooth = torch.from_numpy(gaussian_filter1d(route.numpy(), SMOOTH_FRAMES, axis=1, mode="nearest"))
-    return orthonormalized(torch.cat([route[:, :1], smooth[:, 1:-1], route[:, -1:]], dim=1))
 
 
 def fit_pose(

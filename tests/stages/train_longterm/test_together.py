@@ -18,8 +18,10 @@ NETWORKS = ("static", "route", "pose")
 
 
 def trained(batch: int) -> learning.TrainedLongTerm:
-    short = LongTermOptimizerConfig(steps=4, batch=batch)
-    config = Config(body=short, route=short, pose=short, clip_stride=40, max_bodies=60)
+    """Train for four steps on the 4 clips and 50 bodies of the data."""
+    short = LongTermOptimizerConfig(epochs=4 * batch / 4, batch=batch)
+    body = LongTermOptimizerConfig(epochs=4 * batch / 50, batch=batch)
+    config = Config(body=body, route=short, pose=short, clip_stride=40, max_bodies=60)
     return learning.train_networks(strider.dataset(count=2, seconds=4.0), config, sizes=SIZES)
 
 

@@ -7,19 +7,22 @@ from safetensors.torch import save_file
 
 from pipeline.baselines import longterm_networks
 from pipeline.core.errors import InputError
+from pipeline.longterm import examples
 from pipeline.longterm.config import LongTermSizes
 from pipeline.longterm.examples import DatasetSplit
 from pipeline.longterm.networks import PointNet
 from stages.train_longterm import learning, objectives, pictures
 from stages.train_longterm.config import Config
-from stages.train_longterm.training import LongTermOptimizerConfig
+from stages.train_longterm.training import LongTermLossWeights, LongTermOptimizerConfig, NetworkTrainer
 from tests.pipeline.longterm import strider
 
 SIZES = LongTermSizes(pose=12, latent=4, scene=16, hidden=12, width=24, points=32)
-SHORT = LongTermOptimizerConfig(steps=80, batch=16, rate=1e-2)
+SHORT = LongTermOptimizerConfig(epochs=34, batch=16, rate=1e-2)
+"""80 steps on the 38 clips of `dataset`"""
+BODY = LongTermOptimizerConfig(epochs=12, batch=16, rate=1e-2)
 
 
-SETTINGS = Config(body=SHORT, route=SHORT, pose=SHORT, clip_stride=10, max_bodies=120)
+SETTINGS = Config(body=BODY, route=SHORT, pose=SHORT, clip_stride=10, max_bodies=120)
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +43,7 @@ def test_every_network_learns(learned):
 
 
 def test_training_is_deterministic_and_ablations_are_written(dataset, learned, tmp_path):
-    one = LongTermOptimizerConfig(steps=2, batch=4)
+    one = LongTermOptimizerConfig(epochs=0.2, batch=4)
     settings = replace(SETTINGS, body=one, route=one, pose=one, ablations="all")
     first = learning.train_networks(dataset, settings, sizes=SIZES)
     second = learning.train_networks(dataset, replace(settings, ablations="none"), sizes=SIZES)
@@ -54,6 +57,22 @@ def test_training_is_deterministic_and_ablations_are_written(dataset, learned, t
     )
     for key, value in first.ablated["base"].state_dict().items():
         assert torch.equal(value, again.state_dict()[key])
+
+
+def test_training_is_longer_with_more_examples(dataset):
+    poses = examples.fit_pose_space(dataset.stretches, dataset.body.agent_from_bone_rest, SIZES.pose)
+    trainer, net = NetworkTrainer(poses, LongTermLossWeights(), 0), torch.nn.Linear(1, 1)
+    seen: list[torch.Tensor] = []
+
+    def loss(index: torch.Tensor) -> dict[str, torch.Tensor]:
+        seen.append(index)
+        return {"all": net(torch.ones(1)).sum()}
+
+    for count, steps in ((64, 12), (160, 30), (1, 1)):
+        seen.clear()
+        record = trainer.train("net", net, LongTermOptimizerConfig(epochs=3, batch=16), loss, count)
+        assert len(record.total()) == len(seen) == steps
+        assert max(int(index.max()) for index in seen) < count
 
 
 def test_point_nets_start_from_given_weights(tmp_path):
