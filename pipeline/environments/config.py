@@ -33,10 +33,8 @@ class EnvironmentConfig:
     """Highest turning speed, rad/s."""
     start_m: tuple[float, float] = (1.5, 3.5)
     """Nearest and furthest distance from the animal at which an episode begins, meters."""
-    goal_steps: int = 4
-    """Denoising steps of the animal's goals; 50 for the full sampler."""
     sequence_steps: int = 6
-    """Denoising steps of its paths and bodies; 10 for the full sampler."""
+    """Denoising steps of the animal's paths and bodies; 10 for the full sampler."""
     guidance: float = PlanSamplingConfig.guidance
     """Scale of classifier-free guidance: the interactivity."""
     candidates: int = 2
@@ -44,9 +42,10 @@ class EnvironmentConfig:
 
     @property
     def sampling(self) -> PlanSamplingConfig:
-        """How plans are sampled: of samplers in few steps, by the one that keeps the spread of goals."""
-        few = "ddpm_large", self.goal_steps, self.sequence_steps, self.guidance
-        return PlanSamplingConfig(*few, max_path_draws=1)
+        """How plans are sampled: goals by the model's own sampler, since fewer steps blur them and cost as
+        much; paths and bodies, which take most of the time, in few steps.
+        """
+        return PlanSamplingConfig(None, 0, self.sequence_steps, self.guidance, max_path_draws=1)
 
     @property
     def chaining(self) -> ReplanningConfig:

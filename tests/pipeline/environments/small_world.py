@@ -17,7 +17,7 @@ from pipeline.environments.world import AnimalWorld
 from stages.train_behavior.export import write_contract
 from tests.pipeline.behavior.wandering import ARCHITECTURE, REST, room, scaling, wandering
 
-QUICK = EnvironmentConfig(goal_steps=2, sequence_steps=2, candidates=1, start_m=(0.8, 1.5))
+QUICK = EnvironmentConfig(sequence_steps=2, candidates=1, start_m=(0.8, 1.5))
 
 
 def small_world(config=QUICK):
