@@ -18,7 +18,7 @@ from tests.pipeline.longterm import strider
 
 SIZES = LongTermSizes(pose=12, latent=4, scene=16, hidden=12, width=24, points=32)
 SHORT = LongTermOptimizerConfig(epochs=34, batch=16, rate=1e-2)
-"""80 steps on the 38 clips of `dataset`"""
+"""81 steps on the 38 clips of `dataset`"""
 BODY = LongTermOptimizerConfig(epochs=12, batch=16, rate=1e-2)
 
 
