@@ -18,7 +18,7 @@ from stages.segment_agent.config import AnimalConfig, Config, LearningConfig
 from stages.segment_agent.identities import config as identities_config
 from stages.segment_agent.identities import stage as identities
 from stages.segment_agent.segmenter import Mask
-from stages.segment_agent.windows import Sphere
+from stages.segment_agent.windows import Sphere, working_picture
 
 _spec = importlib.util.spec_from_file_location(
     "room_with_animal", Path(__file__).parent.parent / "room_with_animal.py"
@@ -243,6 +243,31 @@ def test_nothing_is_learned_if_an_animal_that_is_here_has_no_sure_bodies(network
     rows = [two_bodies([[4, -4], [-4, 1]])] * 9
     same, unknown = several.adapt(scores, portraits, rows, np.array([True, True]), OPTIONS)
     assert same is scores and not bodies.count(unknown).any()
+
+
+def test_sure_bodies_teach_how_animals_look_in_another_light(network, portraits, together, monkeypatch):
+    folder, truth = together
+    clip, light = Clip.open(folder), np.array([0.6, 0.85, 1.35])
+
+    def lit(clip, frame, height_px):
+        return np.clip(working_picture(clip, frame, height_px) * light, 0, 255).astype(np.uint8)
+
+    for module in (several, bodies):
+        monkeypatch.setattr(module, "working_picture", lit)
+    rows = []
+    for frame in range(0, 36, 2):
+        label = (truth.others[frame] + 2 * truth.masks[frame]).astype(np.uint8)
+        taught = np.full(2, frame % 4 == 0)
+        rows.append(bodies.Bodies(label, taught, (slice(None), slice(None)), 8 * np.eye(2) - 4))
+    before = several.IdentityScores(clip, network, OPTIONS.height_px)
+    config = replace(OPTIONS, learning=LearningConfig(examples=12, steps=100, batch=4, crop_px=64))
+    after, found = several.adapt(before, portraits, rows, np.array([True, True]), config)
+    assert after.adapted and not before.adapted and before.network is network
+    confused = bodies.recognize(clip, rows, before.margins)
+    assert bodies.count(confused)[1] < 4, "orange looks green in bluish light"
+    assert (bodies.count(found) > 13).all(), "of 18 frames, half of which were learned"
+    right = [row.log_odds.argmax(0).tolist() == [0, 1] for row in found]
+    assert sum(right) > 15 and sum(row.log_odds.argmax(0).tolist() == [0, 1] for row in confused) < 9
 
 
 @pytest.mark.slow
