@@ -82,12 +82,11 @@ def of_session(
     The animal is what the ``recognizer`` finds, without one all foreground. None for frames that differ
     too much from the map.
     """
-    by_view = {id(each.view): each for each in walk}
     times = subsampling.evenly(len(shown), foreground.OTHER_TIMES)
     masks, contacts = [], []
     for frame, target in enumerate(track(shown, "segmenting the foreground")):
         distant = times[np.abs(timestamp_s[times] - timestamp_s[frame]) > foreground.MIN_GAP_S]
-        seen = [by_view[id(view)] for view in tracking.walk_views(target.view, room)]
+        seen = [walk[number] for number in tracking.walk_views(target.view, room)]
         in_front = foreground.foreground(target, seen, [shown[other] for other in distant])
         blobs = None
         if in_front.mean() <= MAX_FOREGROUND:
@@ -141,10 +140,9 @@ def _with_animal(frame, target: ColorView, blobs, touched, carried, length_m, de
 
 def of_turnaround(shown: Sequence[ColorView], room: MapViews, walk: Sequence[ColorView]) -> list[FrameDepth]:
     """Return the depth of frames that circle a resting animal: from the map, in front of it by stereo."""
-    by_view = {id(each.view): each for each in walk}
     differing = []
     for frame in standing.references(len(shown)):
-        seen = [by_view[id(view)] for view in tracking.walk_views(shown[frame].view, room)]
+        seen = [walk[number] for number in tracking.walk_views(shown[frame].view, room)]
         differing.append(foreground.foreground(shown[frame], seen, []))
     in_front = standing.segment(shown, differing)
     views = [_sweep_view(each, mask) for each, mask in zip(shown, in_front, strict=True)]

@@ -86,7 +86,8 @@ def recognize(network: Appearance, target: ColorView, in_front: Region) -> Regio
     """Return the animal's mask: of what is recognized near foreground (as its shadow is), the surest part."""
     log_odds = network.log_odds(target.color)
     animal = strongest((log_odds > 0) & dilated(in_front, REACH_PX), log_odds)
-    return outlined(target.color, animal, log_odds, np.random.default_rng(0))
+    rng = np.random.default_rng(0)  # the same for every picture, so that no mask depends on the others
+    return outlined(target.color, animal, log_odds, rng)
 
 
 def _differing(both, limit: float) -> Bool[np.ndarray, "height width"]:

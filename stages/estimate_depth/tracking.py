@@ -154,8 +154,8 @@ def _hypotheses(frame, other, footage: TrackingInput, poses, room: MapViews, see
     yield poses[other]
 
 
-def walk_views(target: View, room: MapViews) -> list[View]:
-    """Return the pictures of the walk-through with most overlap with a view, at a similar scale."""
+def walk_views(target: View, room: MapViews) -> list[int]:
+    """Return which pictures of the walk-through overlap most with a view, at a similar scale."""
     rows, columns = np.nonzero(target.depth > 0)
     chosen = np.linspace(0, len(rows) - 1, PROBES).astype(int) if len(rows) else np.zeros(0, int)
     z = target.depth[rows[chosen], columns[chosen]]
@@ -171,7 +171,7 @@ def walk_views(target: View, room: MapViews) -> list[View]:
         scale = theirs[inside] / each.intrinsics[0, 0] / (z[inside] / target.intrinsics[0, 0])
         scores[number] = (same * np.minimum(scale, 1 / np.maximum(scale, 1e-6))).sum()
     best = np.argsort(-scores, kind="stable")[:WALK_VIEWS]
-    return [room.walk[number] for number in best if scores[number] > 0]
+    return [number for number in best.tolist() if scores[number] > 0]
 
 
 @dataclass(frozen=True)
@@ -194,8 +194,8 @@ def _optimize(
     at, sigma = {int(frame): number for number, frame in enumerate(frames)}, SIGMA_PX / footage.lens.focal_px
     factors: list[_FlowFactor] = []
     for number, frame in enumerate(track(frames.tolist(), "matching by flow")):
-        for walk in walk_views(seen[number], room):
-            matches = _inliers(views.flow_matches(seen[number], walk), footage.lens, seed)
+        for shown in walk_views(seen[number], room):
+            matches = _inliers(views.flow_matches(seen[number], room.walk[shown]), footage.lens, seed)
             factors.append(_FlowFactor(number, MAP, matches.pixel, matches.points_world))
         for other in (at[frame + gap] for gap in NEIGHBORS if frame + gap in at):
             matches = _inliers(views.flow_matches(seen[other], seen[number]), footage.lens, seed)
