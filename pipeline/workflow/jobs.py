@@ -300,15 +300,7 @@ def _read_by(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[I
     inputs: list[Input] = []
     arguments: list[str] = []
     deciding = [video.id] if video else []
-    for need in dag.needs_of(node, plan.flow):
-        if (dag.NODES[need.artifact].of_several or need.others) and not plan.others:
-            continue
-        if (need.alone and plan.others) or (video and need.readers and video.role not in need.readers):
-            continue
-        if need.mapped and not (video and video.mapped):
-            continue
-        if need.homes != "any" and not plan.tables[node.artifact].get(HOMES):
-            continue
+    for need in (each for each in dag.needs_of(node, plan.flow) if _is_read(plan, node, each, video)):
         if need.artifact in dag.BUILTIN.values() and not plan.builtin:
             if video:
                 scale_from = formats.scale_sources(folder, video, plan.videos)
@@ -316,21 +308,42 @@ def _read_by(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[I
                 arguments += ["--captures", str(folder)] if scale_from else []
                 deciding += [other.id for other in scale_from]
             continue
-        source = dag.NODES[need.artifact]
-        if video and source.of_several and video.role not in (source.roles or (video.role,)):
-            continue
         found = list(_inputs(plan, need, node, part))
         inputs += found
-        several = source.roles and (need.roles or not node.roles)
-        several = several or (source.trials == "each" and not isinstance(part, Trial))
-        whole = plan.home_of(need.artifact).folder / need.artifact
-        path = whole if several else Path(found[0].path, found[0].part or "")
-        path = plan.home.base.folder / "animals" if need.others else path
-        path = Path("build") if need.homes == "other" else path
-        option = [f"--{need.option or need.artifact.replace('_', '-')}", str(path)]
-        arguments += [] if option[0] in arguments else option
+        option = f"--{need.option or need.artifact.replace('_', '-')}"
+        arguments += [] if option in arguments else [option, str(_path_read(plan, node, need, part, found))]
         arguments += ["--variants", str(plan.home.base.folder / "variants")] if need.variants else []
     return inputs, arguments, deciding
+
+
+def _is_read(plan: Plan, node: Node, need: Need, video: Video | None) -> bool:
+    """Return whether a job of this home, and of its recording if it has one, reads what its node may need."""
+    source = dag.NODES[need.artifact]
+    in_home = not need.alone if plan.others else not (source.of_several or need.others)
+    in_recipe = need.homes == "any" or bool(plan.tables[node.artifact].get(HOMES))
+    if video is None:
+        return in_home and in_recipe and not need.mapped
+    roles_of_several = source.roles if source.of_several else ()
+    by_role = all(video.role in roles for roles in (need.readers, roles_of_several) if roles)
+    return in_home and in_recipe and by_role and (video.mapped or not need.mapped)
+
+
+def _path_read(
+    plan: Plan, node: Node, need: Need, part: Video | Trial | None, found: Sequence[Input]
+) -> Path:
+    """Return the path at which a job reads a need: a folder of several of the inputs ``found``, or the only
+    one.
+    """
+    if need.homes == "other":
+        return Path("build")
+    if need.others:
+        return plan.home.base.folder / "animals"
+    source = dag.NODES[need.artifact]
+    by_recording = source.roles and (need.roles or not node.roles)
+    by_trial = source.trials == "each" and not isinstance(part, Trial)
+    if by_recording or by_trial:
+        return plan.home_of(need.artifact).folder / need.artifact
+    return Path(found[0].path, found[0].part or "")
 
 
 def _inputs(plan: Plan, need: Need, node: Node, part: Video | Trial | None) -> Iterator[Input]:

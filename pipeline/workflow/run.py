@@ -11,7 +11,6 @@ meet. --attempt: of an engine that tries again; above 1, a job that ended with 2
 not run. What a job printed stands in build/<home>/logs/<job>.<number>.log. Standard library only.
 """
 
-import argparse
 import json
 import os
 import platform
@@ -30,7 +29,7 @@ from types import FrameType
 from typing import Any, TextIO
 
 from pipeline.core import processes
-from pipeline.core.errors import InputError, exit_code, printable
+from pipeline.core.errors import CommandLine, InputError, coded_disk_errors, exit_code, printable
 from pipeline.workflow import artifact, jobs, sources, stamps
 
 MIN_FREE_BYTES = 1 << 29
@@ -305,8 +304,7 @@ def _commit() -> str | None:
 
 def main(arguments: list[str]) -> int:
     """Run the command line of the runner; returns its exit code."""
-    layout = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
+    parser = CommandLine(__doc__, prog="python -m pipeline.workflow.run")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--launcher", default="")
     parser.add_argument("--attempt", type=int, default=1)
@@ -314,8 +312,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("job")
     given = parser.parse_args(arguments)
     engine = Engine(given.processes, tuple(shlex.split(given.launcher)), given.attempt)
-    return exit_code(lambda: run(given.home, given.job, engine), given.job)
+    with coded_disk_errors(given.job):
+        return run(given.home, given.job, engine)
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(exit_code(lambda: main(sys.argv[1:])))

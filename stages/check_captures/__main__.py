@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from pipeline.core import config
-from pipeline.core.errors import CommandLine, InputError, printable
+from pipeline.core.errors import CommandLine, InputError, exit_code, printable
 from pipeline.core.videos import Role
 from pipeline.workflow import captures, recipes
 from stages.check_captures import stage
@@ -23,23 +23,26 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("folder", type=Path, help="captures/<agent>, or another folder with recordings")
     about = "recipe whose [videos] table gives roles (default: agents/<folder's name>.toml)"
     parser.add_argument("--recipe", type=Path, help=about)
-    try:
+
+    def program() -> int:
         given = parser.parse_args(arguments)
-        recipe = given.recipe or Path("agents", f"{given.folder.name}.toml")
-        said, files, refused = _said(given.folder, recipe)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return _check(given.folder, given.recipe or Path("agents", f"{given.folder.name}.toml"))
+
+    return exit_code(program, "captures")
+
+
+def _check(folder: Path, recipe: Path) -> int:
+    said, files, refused = _said(folder, recipe)
     unusable = 0
     for verdict in itertools.chain(refused, stage.run(files)):
         unusable += not verdict.usable
         print(f"{printable(verdict.text)}\n", flush=True)
-    for name in captures.unknown_files(given.folder):
-        named = printable(captures.named(given.folder / name))
+    for name in captures.unknown_files(folder):
+        named = printable(captures.named(folder / name))
         known = "not a recording of a known format (CAP-003); convert other videos to .mp4"
         print(f"{named}  left alone: {known}\n")
     try:
-        captures.assign(said, {}, dict.fromkeys(said), str(given.folder))
+        captures.assign(said, {}, dict.fromkeys(said), str(folder))
     except InputError as error:
         unusable += 1
         print(f"{error.code} {error.what}\n    -> {error.remedy}")

@@ -135,7 +135,13 @@ class FakeNode:
 
 @pytest.mark.parametrize(
     "program",
-    ["stages.annotate", "stages.check_captures", "stages.compile_gallery", "pipeline.adapters.ros2_animal"],
+    [
+        "stages.annotate",
+        "stages.check_captures",
+        "stages.compile_gallery",
+        "pipeline.adapters.ros2_animal",
+        "pipeline.workflow.run",
+    ],
 )
 def test_invalid_arguments_are_refused_with_a_code(program):
     failed = subprocess.run([sys.executable, "-m", program], capture_output=True, text=True, check=False)
