@@ -308,10 +308,9 @@ def _read_by(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[I
                 arguments += ["--captures", str(folder)] if scale_from else []
                 deciding += [other.id for other in scale_from]
             continue
-        found = list(_inputs(plan, need, node, part))
-        inputs += found
+        inputs += _inputs(plan, need, node, part)
         option = f"--{need.option or need.artifact.replace('_', '-')}"
-        arguments += [] if option in arguments else [option, str(_path_read(plan, node, need, part, found))]
+        arguments += [] if option in arguments else [option, str(_path_read(plan, node, need, part))]
         arguments += ["--variants", str(plan.home.base.folder / "variants")] if need.variants else []
     return inputs, arguments, deciding
 
@@ -328,22 +327,18 @@ def _is_read(plan: Plan, node: Node, need: Need, video: Video | None) -> bool:
     return in_home and in_recipe and by_role and (video.mapped or not need.mapped)
 
 
-def _path_read(
-    plan: Plan, node: Node, need: Need, part: Video | Trial | None, found: Sequence[Input]
-) -> Path:
-    """Return the path at which a job reads a need: a folder of several of the inputs ``found``, or the only
-    one.
-    """
+def _path_read(plan: Plan, node: Node, need: Need, part: Video | Trial | None) -> Path:
+    """Return where a job reads a need: its only input, or the folder that holds several."""
     if need.homes == "other":
         return Path("build")
     if need.others:
         return plan.home.base.folder / "animals"
     source = dag.NODES[need.artifact]
     by_recording = source.roles and (need.roles or not node.roles)
-    by_trial = source.trials == "each" and not isinstance(part, Trial)
-    if by_recording or by_trial:
+    if by_recording or (source.trials == "each" and not isinstance(part, Trial)):
         return plan.home_of(need.artifact).folder / need.artifact
-    return Path(found[0].path, found[0].part or "")
+    only = next(_inputs(plan, need, node, part))
+    return Path(only.path, only.part or "")
 
 
 def _inputs(plan: Plan, need: Need, node: Node, part: Video | Trial | None) -> Iterator[Input]:
