@@ -57,8 +57,7 @@ def open_homes(build: Path, animals: Mapping[str, Path], homes: Sequence[Path]) 
             name: (ReconstructedHome.of_build(folder), data[name]) for name, folder in animals.items()
         }
         for name, moved in move_in(recorded, ReconstructedHome.of_build(home)).items():
-            here = moved.data, moved.home.scenes(), moved.share_known
-            habitats[name].append(Habitat.of_one_home(*here))
+            habitats[name].append(Habitat.of_one_home(moved.data, moved.home.scenes(), moved.share_known))
     return {name: together(each) for name, each in habitats.items()}
 
 

@@ -22,7 +22,7 @@ def moments_together(
     home_of: Mapping[str, Int[np.ndarray, "window"]] | None = None,
 ) -> dict[str, int]:
     """Return a window of each animal: the others' are the nearest in time to the ``window`` of the
-    ``leading`` one, preferably of the same recording, in which bodies do not overlap.
+    ``leading`` one, preferably of the same recording, in which bodies do not overlap, if there is one.
 
     They are of its home, if homes of windows are given, and of ``split``, or of any split for an animal that
     has none in it.

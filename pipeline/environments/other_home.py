@@ -66,8 +66,10 @@ class ReconstructedHome:
         """
         home = build.parent.parent if build.parent.name == "animals" else build
         paths = [(build if (build / name).is_dir() else home) / name for name in ARTIFACTS]
+        remedy = "make <agent>.behavior_data, of an agent with recordings"
+        if (build / "animals").is_dir():
+            remedy = f"give the home of one of its animals: {build}/animals/<name>"
         for path in paths:
-            remedy = "make <agent>.registration, of an agent with recordings"
             artifact.require(path.parent, path.name, remedy=remedy)
         return cls.load(*paths)
 
@@ -142,7 +144,7 @@ def move_in(
     Raises ART-007 and SIM-011 as `perceived` does, SIM-011 where no moment fits in.
     """
     seen = {name: perceived(own, other).fitting(own.stands_m) for name, (own, _) in animals.items()}
-    starts = place_starts(animals, next(iter(seen.values())), np.random.default_rng(0))
+    starts = place_starts(animals, seen, np.random.default_rng(0))
     return {
         name: MovedAnimal(seen[name], starts[name], share_known(own, seen[name]))
         for name, (own, _) in animals.items()
@@ -215,10 +217,11 @@ def _surface(home: ReconstructedHome) -> tuple[Float[np.ndarray, "cell 17"], Flo
 
 def place_starts(
     animals: Mapping[str, tuple[ReconstructedHome, BehaviorData]],
-    other: ReconstructedHome,
+    seen: Mapping[str, ReconstructedHome],
     rng: np.random.Generator,
 ) -> dict[str, BehaviorData]:
-    """Place recorded moments of all animals on the floor of the other home, each moved rigidly as a whole.
+    """Place recorded moments of all animals on the floor of the other home, ``seen`` with the body of each;
+    a moment moves rigidly as a whole.
 
     Each becomes a recording `<recording>-<first frame>` of the first animal, whose past frames are valid;
     the others are where they were then, or at the nearest recorded time. Animals keep their heights above
@@ -229,13 +232,13 @@ def place_starts(
     owns = {name: own for name, (own, _) in animals.items()}
     leading, splits = next(iter(data)), []
     tracks: dict[str, dict[str, Trajectory]] = {name: {} for name in data}
-    scenes, floor = other.scenes(), _floor_places(other)
+    scenes, floor = {name: home.scenes() for name, home in seen.items()}, _floor_places(seen[leading])
     for split, count in STARTS.items():
         windows = data[leading].indices(split)
         for window in windows[subsampling.evenly(len(windows), count)].tolist():
             begun = moments_together(data, leading, window, split)
             moments = {name: _cut(data[name], each) for name, each in begun.items()}
-            placed = _placed(moments, owns, other, scenes, floor, rng)
+            placed = _placed(moments, owns, seen[leading], scenes, floor, rng)
             if placed is not None:
                 begin = f"{data[leading].videos[data[leading].video[window]]}-{data[leading].start[window]}"
                 for name, track in placed.items():
@@ -274,7 +277,7 @@ def _placed(
     moments: Mapping[str, Trajectory],
     owns: Mapping[str, ReconstructedHome],
     other: ReconstructedHome,
-    scenes: Scenes,
+    scenes: Mapping[str, Scenes],
     floor: Float[np.ndarray, "place 3"],
     rng: np.random.Generator,
 ) -> dict[str, Trajectory] | None:
@@ -291,7 +294,7 @@ def _placed(
             place = target + (turn @ (now[name] - now[first])) * [1.0, 0.0, 1.0] + [0.0, height[name], 0.0]
             moved[name] = rigid.make(turn, place - turn @ now[name])
             roots = moved[name] @ moment.world_from_agent[: past[name]]
-            if scenes.inside_solid(roots[None, :, :3, 3], None).any():
+            if scenes[name].inside_solid(roots[None, :, :3, 3], None).any():
                 break
         else:
             camera = moved[first] @ moments[first].world_from_camera

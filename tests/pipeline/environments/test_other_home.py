@@ -123,6 +123,23 @@ def test_animals_begin_together_as_they_were_at_home():
         assert not moved["dog"].home.scenes().inside_solid(roots, None).any()
 
 
+def test_each_animal_begins_where_its_own_body_fits():
+    """A cat fits under a board at half height; a dog's root is above it, but its body would be in it."""
+    volume = room()
+    occupancy = volume.occupancy.copy()
+    occupancy[:22, int((0.65 - volume.origin[1]) / volume.voxel_m)] = 1
+    other, data = home(replace(volume, occupancy=occupancy)), {"cat": wandering(0), "dog": wandering(1)}
+    for track in data["dog"].trajectories.values():
+        track.world_from_agent[:, 1, 3] += 0.6
+    owns = {"cat": home(), "dog": replace(home(), stands_m=np.array([[0.62, 0.9], [0.62, 0.9]]))}
+    moved = move_in({name: (own, data[name]) for name, own in owns.items()}, other)
+    assert moved["cat"].home.marks[4:18].any() and not moved["dog"].home.marks[4:18].any()
+    for each in moved.values():
+        scenes = each.home.scenes()
+        for track in each.data.trajectories.values():
+            assert not scenes.inside_solid(track.world_from_agent[None, :PAST, :3, 3], None).any()
+
+
 def test_unseen_features_reduce_the_fraction_of_known_cells():
     own = home()
     assert share_known(own, own) == 1.0
@@ -147,8 +164,11 @@ def test_unusable_homes_are_refused(tmp_path, fault, code):
 
 
 def test_missing_homes_and_other_folders_are_refused(tmp_path):
-    with pytest.raises(InputError, match="ART-003"):
+    with pytest.raises(InputError, match="ART-003(.|\n)*make <agent>.behavior_data"):
         ReconstructedHome.of_build(tmp_path / "nowhere")
+    (tmp_path / "pair/animals/cat").mkdir(parents=True)
+    with pytest.raises(InputError, match="ART-003(.|\n)*pair/animals/<name>"):
+        ReconstructedHome.of_build(tmp_path / "pair")
     build = write(tmp_path / "other")
     other = ReconstructedHome.of_build(build)
     np.testing.assert_array_equal(other.marks, home().marks)
