@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from safetensors.torch import load_file, save_file
 
 from pipeline.behavior import model as behavior
@@ -14,7 +15,11 @@ from pipeline.behavior.model import BehaviorNets
 from pipeline.core.errors import InputError
 from pipeline.data import glb
 from pipeline.environments.world import AnimalWorld
-from pipeline.longterm.motion_synthesis import LongTerm
+from pipeline.longterm.bodies import PoseSpace
+from pipeline.longterm.config import LongTermSizes
+from pipeline.longterm.contacts import ContactVertices
+from pipeline.longterm.motion_synthesis import LongTerm, MotionPrior
+from pipeline.longterm.networks import PoseNet, RouteNet, StaticBody
 from pipeline.workflow import artifact
 from stages.export import reading
 from stages.simulate import takes
@@ -99,18 +104,27 @@ def test_sampling_settings_are_not_part_of_the_contract(build):
     behavior.load(build / "behavior")
 
 
-@pytest.mark.parametrize("key", ["rate_hz", "frames", "sizes", "motion_prior", "sees_scene", "units"])
-def test_long_term_model_with_missing_key_is_refused(key, tmp_path):
-    sizes = {"pose": 3}
-    document = {
-        "units": "metres, radians, seconds", "up": [0, 1, 0], "rate_hz": 10, "frames": 21, "bones": 3,
-        "sizes": sizes, "sees_scene": True, "motion_prior": {}, "contact_vertices": [],
-        "foot_of_contact_vertex": [],
-    }  # fmt: skip
-    save_file({}, tmp_path / "longterm.safetensors")
-    (tmp_path / "longterm.json").write_text(json.dumps({k: v for k, v in document.items() if k != key}))
-    with pytest.raises(InputError, match="ART-007"):
-        LongTerm.load(tmp_path)
+LONG_TERM_KEYS = (
+    "units", "up", "rate_hz", "frames", "bones", "sizes", "sees_scene", "motion_prior", "contact_vertices",
+    "foot_of_contact_vertex",
+)  # fmt: skip
+
+
+def test_long_term_model_with_missing_key_is_refused(tmp_path):
+    sizes = LongTermSizes(pose=3, latent=2, scene=4, hidden=4, width=4)
+    nets = StaticBody(sizes), RouteNet(sizes), PoseNet(sizes)
+    contacts = ContactVertices(np.array([4, 7]), np.array([0, 1]))
+    made = LongTerm(sizes, PoseSpace(REST, 3), contacts, MotionPrior(0.2, 0.9, 0.1, 0.1), *nets)
+    made.save(tmp_path)
+    before, written = torch.random.get_rng_state(), (tmp_path / "longterm.json").read_text()
+    assert LongTerm.load(tmp_path).contacts.vertices.tolist() == [4, 7]
+    assert torch.equal(torch.random.get_rng_state(), before), "the random state is the program's"
+    assert set(json.loads(written)) == set(LONG_TERM_KEYS)
+    for key in LONG_TERM_KEYS:
+        (tmp_path / "longterm.json").write_text(written)
+        with_json(tmp_path / "longterm.json", key)
+        with pytest.raises(InputError, match=f"ART-007.*{key}"):
+            LongTerm.load(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["agent.glb", "scene.glb", "simulator.json"])

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import assert_never
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import nn
@@ -347,7 +348,8 @@ def load(folder: Path) -> tuple[Architecture, BehaviorNets, Scaling, Schedule, F
 
     Raises InputError ART-007 for files or a contract of another version.
     """
-    with other_versions_refused("behavior model", str(folder)):
+    refused = other_versions_refused("behavior model", str(folder))
+    with refused, torch.random.fork_rng(devices=[]):  # untrained weights are drawn
         document = json.loads((folder / "behavior.json").read_text())
         shape = document["architecture"]
         architecture = Architecture(**shape | {"unet_multipliers": tuple(shape["unet_multipliers"])})

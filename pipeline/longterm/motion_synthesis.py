@@ -96,7 +96,8 @@ class LongTerm:
     @classmethod
     def load(cls, folder: Path) -> "LongTerm":
         """Read a trained model. Raises InputError ART-007 for one of another version."""
-        with other_versions_refused("model of long-term motion", str(folder)):
+        refused = other_versions_refused("model of long-term motion", str(folder))
+        with refused, torch.random.fork_rng(devices=[]):  # untrained weights are drawn
             document = json.loads((folder / "longterm.json").read_text())
             if other := [name for name, value in CONVENTIONS.items() if document[name] != value]:
                 raise ValueError(f"longterm.json says otherwise about {', '.join(other)}")
@@ -107,7 +108,7 @@ class LongTerm:
             for name, module in zip(("poses", *NETWORKS), (poses, *nets), strict=True):
                 own = {key: value for key, value in state.items() if key.startswith(f"{name}.")}
                 module.load_state_dict({key.removeprefix(f"{name}."): value for key, value in own.items()})
-            numbers = (np.array(document[name]) for name in ("contact_vertices", "foot_of_contact_vertex"))
+            numbers = [np.array(document[name]) for name in ("contact_vertices", "foot_of_contact_vertex")]
             motion_prior = MotionPrior(**document["motion_prior"])
         static, route, pose = nets
         contacts = ContactVertices(*numbers)
