@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.trajectories import TRAIN, BehaviorData
-from pipeline.geometry import rigid
+from pipeline.geometry import rigid, subsampling
 from pipeline.geometry.signed_distance import SignedDistance
 from pipeline.longterm.bodies import PoseSpace, SkinnedBody, load_body
 from pipeline.longterm.clip_channels import Clips, EncodedPlaces, encode_clips, encode_places, root_channels
@@ -136,7 +136,7 @@ def select_clips(
         count = int(moves.sum() * resting / max(1 - resting, 1e-6))
         still = rng.choice(still, min(count, len(still)), replace=False)
     chosen = np.sort(np.concatenate([np.flatnonzero(moves), still]))
-    chosen = chosen[:: max(1, int(np.ceil(len(chosen) / most)))]
+    chosen = chosen[subsampling.evenly(len(chosen), most)]
     return ClipSelection(stretch[chosen], start[chosen])
 
 

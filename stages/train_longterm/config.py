@@ -21,7 +21,7 @@ class Config:
     clip_stride: int = 3
     """Frames (30 fps) between the starts of two-second training clips."""
     max_bodies: int = 3000
-    """Static bodies to learn from at most; beyond that they are subsampled evenly."""
+    """Static bodies to learn from, about: of more frames, every second or third ... of a stretch is taken."""
     scene: bool = True
     """Whether RouteNet and PoseNet are conditioned on the scene."""
     ablations: Ablations = "none"

@@ -72,7 +72,7 @@ def train_ablations(
     clips: Clips, trainer: NetworkTrainer, config: Config, sizes: LongTermSizes, route: RouteNet
 ) -> dict[str, AblatedNetworks]:
     """Train the ablations of Table 1 that ``config`` names; those with the same RouteNet share it."""
-    routes, trained = {(True, True, False): route} if config.scene else {}, {}
+    routes, trained = {(config.scene, True, False): route}, {}
     names = {"none": (), "baselines": longterm_networks.BASELINES, "all": tuple(longterm_networks.ABLATIONS)}
     for name in names[config.ablations]:
         spec = longterm_networks.ABLATIONS[name]

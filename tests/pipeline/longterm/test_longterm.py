@@ -159,6 +159,9 @@ def test_moving_clips_are_kept_and_waypoints_are_level(dataset, model, monkeypat
         np.linalg.norm((p.world_from_agent[-1] - p.world_from_agent[0])[:3, 3]) for p in cuts.parts(dataset)
     ]
     assert min(ways) > 0.5
+    most = len(ways) - 1
+    fewer = select_clips(dataset, np.random.default_rng(0), stride=10, resting=0.0, most=most)
+    assert len(fewer.start) == most, "clips are not halved for one too many"
     monkeypatch.setattr("pipeline.longterm.examples.LEVEL_SHARE", 1.0)
     stills = sample_static_bodies(dataset, model.poses, SIZES.points, rng, most=50)
     assert len(stills.scene) <= 60

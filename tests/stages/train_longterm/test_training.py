@@ -1,3 +1,5 @@
+import os
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +13,7 @@ from pipeline.longterm import examples
 from pipeline.longterm.config import LongTermSizes
 from pipeline.longterm.examples import DatasetSplit
 from pipeline.longterm.networks import PointNet
-from stages.train_longterm import learning, objectives, pictures
+from stages.train_longterm import learning, objectives, pictures, training
 from stages.train_longterm.config import Config
 from stages.train_longterm.training import LongTermLossWeights, LongTermOptimizerConfig, NetworkTrainer
 from tests.pipeline.longterm import strider
@@ -57,6 +59,36 @@ def test_training_is_deterministic_and_ablations_are_written(dataset, learned, t
     )
     for key, value in first.ablated["base"].state_dict().items():
         assert torch.equal(value, again.state_dict()[key])
+
+
+@pytest.mark.parametrize("label", ["body", "route", "pose"])
+def test_interrupted_training_resumes_exactly(dataset, tmp_path, monkeypatch, label):
+    settings = replace(SETTINGS, **dict.fromkeys(("body", "route", "pose"), replace(SHORT, epochs=3)))
+    whole = learning.train_networks(dataset, settings, sizes=SIZES).model
+    fit, stopped_at = training.fit, 4
+
+    def interrupted(**arguments):
+        loss = arguments["loss"]
+
+        def stopping(step, generator):
+            if step == stopped_at:
+                os.kill(os.getpid(), signal.SIGTERM)
+            return loss(step, generator)
+
+        return fit(**arguments | ({"loss": stopping} if arguments["label"] == label else {}))
+
+    monkeypatch.setattr(training, "fit", interrupted)
+    monkeypatch.setattr(training, "SAVE_EVERY", 3)
+    with pytest.raises(SystemExit, match="75"):
+        learning.train_networks(dataset, settings, sizes=SIZES, resume=tmp_path)
+    stopped_at = -1
+    assert (tmp_path / label / "step000000005.pt").is_file()
+    resumed = learning.train_networks(dataset, settings, sizes=SIZES, resume=tmp_path)
+    assert all(len(record.total()) > 5 for record in resumed.records.values())
+    for name in ("static", "route", "pose"):
+        again = getattr(resumed.model, name).state_dict()
+        for key, value in getattr(whole, name).state_dict().items():
+            assert torch.equal(value, again[key]), f"{name}.{key}"
 
 
 def test_training_is_longer_with_more_examples(dataset):
