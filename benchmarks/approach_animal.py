@@ -200,7 +200,7 @@ class TrueWorld(AnimalWorld):
     def of(cls, out: Path, config: EnvironmentConfig) -> "TrueWorld":
         """Open what `simulated_build` wrote."""
         world = cls({"cat": Resident.load(out)}, config)
-        world.batches = {"cat": TrueCats(world.data)}  # pyright: ignore[reportAttributeAccessIssue]
+        world.batches = {"cat": TrueCats(world.habitat.data)}  # pyright: ignore[reportAttributeAccessIssue]
         return world
 
     @property

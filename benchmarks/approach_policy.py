@@ -145,8 +145,8 @@ def flight_rates(world: AnimalWorld, split: int) -> tuple[float, float, int]:
     """Return the flight rates of the recorded animal and of sampled plans near a person (within `CLOSE_M`), and
     the number of moments.
     """
-    windows = world.data.indices(split)
-    context, future = world.data.windows(windows)
+    windows = world.habitat.data.indices(split)
+    context, future = world.habitat.data.windows(windows)
     now, person = context.world_from_agent[:, -1, :3, 3], context.observer_world[:, -1]
     near = np.linalg.norm((now - person)[:, [0, 2]], axis=1) < CLOSE_M
     if not near.any():

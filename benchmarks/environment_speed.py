@@ -43,8 +43,8 @@ def sequential_speed(
     """Return animal-steps per second of `Simulator`."""
     single = Simulator(
         world.animals.sampler,
-        world.data,
-        world.scenes,
+        world.habitat.data,
+        world.habitat.scenes,
         world.animals.ego,
         sampling=sampling,
         chaining=chaining,

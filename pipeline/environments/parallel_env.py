@@ -11,6 +11,7 @@ from pettingzoo import ParallelEnv
 
 from pipeline.behavior.simulator import AnimalBatch
 from pipeline.behavior.trajectories import RATE_HZ
+from pipeline.core.config import refuse_unknown
 from pipeline.core.videos import PERSON
 from pipeline.environments.floor import to_local, to_world
 from pipeline.environments.rendering import bird_view, known_mode
@@ -75,6 +76,7 @@ class PersonAnimalEnv(ParallelEnv):
 
     def step(self, actions: Mapping[str, Any]):
         """Let 0.1 s pass; actions (2 or 3 in -1..1) are parts of highest speeds, or of the farthest goal."""
+        refuse_unknown(actions, self.agents, where="step: actions", kind="agent")
         for name, batch in self.world.batches.items():
             if name in actions:
                 batch.command(self._goal_world(batch, actions[name]))

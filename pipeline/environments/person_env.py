@@ -15,8 +15,8 @@ from pipeline.environments.world import AnimalWorld
 class PersonEnv(gymnasium.Env):
     """The agent is a person or a robot, the animal of a build is the world; a step is 0.1 s.
 
-    `reset(options={"split": "test"})` begins at windows of the test recording. `info` holds `distance_m`,
-    `reached`, `flees` and `plans_per_step`.
+    `reset(options={"split": "test"})` begins at windows of the test recording. `info` holds `distance_m` and
+    `home`, of `reset` also `share_known`, of `step` `reached`, `flees` and `plans_per_step`.
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": RATE_HZ}  # noqa: RUF012
@@ -35,8 +35,8 @@ class PersonEnv(gymnasium.Env):
         self.frame = 0
         self.world.begin(1, self.np_random, (options or {}).get("split", "train"))
         self._show()
-        about = {"distance_m": self.world.distance_m, "share_known": self.world.share_known}
-        return self._observation(), {name: float(value[0]) for name, value in about.items()}
+        about = "distance_m", "share_known", "home"
+        return self._observation(), {name: getattr(self.world, name)[0].item() for name in about}
 
     def step(self, action: Any):
         """Let 0.1 s pass; an action (2 or 3 numbers in -1..1) is a part of the highest speeds."""

@@ -65,6 +65,7 @@ class PictureWindow:
         import matplotlib.pyplot as plt  # late: only `render_mode="human"` needs a window
         from matplotlib.backends.registry import BackendFilter, backend_registry
 
+        self.library = plt
         interactive = backend_registry.list_builtin(BackendFilter.INTERACTIVE)
         self.visible = plt.get_backend().lower() in {name.lower() for name in interactive}
         self.figure = plt.figure(figsize=(5, 5))
@@ -72,14 +73,10 @@ class PictureWindow:
 
     def show(self, picture: UInt8[np.ndarray, "400 400 3"]) -> None:
         """Replace the picture."""
-        import matplotlib.pyplot as plt
-
         self.image.set_data(picture)
         if self.visible:
-            plt.pause(1e-3)
+            self.library.pause(1e-3)
 
     def close(self) -> None:
         """Close the window."""
-        import matplotlib.pyplot as plt
-
-        plt.close(self.figure)
+        self.library.close(self.figure)

@@ -40,7 +40,8 @@ class PersonStableVecEnv(VecEnv):
 
     def reset(self) -> dict[str, Float[np.ndarray, "person ..."]]:
         """Begin all episodes."""
-        self.frame = np.zeros(self.num_envs, int)
+        self.frame, self.split = np.zeros(self.num_envs, int), self._options[0].get("split", self.split)
+        self._reset_options()
         self.world.begin(self.num_envs, self.rng, self.split)
         self._inform()
         return person_observation(self.world)

@@ -3,8 +3,7 @@
 `AnimalWorld.load` opens a build, `begin` starts lives, `restart` some, `step` advances all by 0.1 s. Actions
 move persons; behavior models move animals, each through an `AnimalBatch` of its own, which replans only when
 a plan ends or someone perceived has moved noticeably, at the rate `plans_per_step`. The animals of a life
-perceive each other. What a person meets is one of them, the ``target``: `animals`, `data` and `scenes` are
-its.
+perceive each other. What a person meets is one of them, the ``target``: `animals` and `habitat` are its.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,9 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.behavior.model import bones_from_channels
-from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import AnimalBatch
-from pipeline.behavior.trajectories import RATE_HZ, TEST, TRAIN, BehaviorData, Context
+from pipeline.behavior.trajectories import RATE_HZ, TEST, TRAIN, Context
 from pipeline.core.config import from_table
 from pipeline.core.errors import InputError
 from pipeline.environments.config import EnvironmentConfig
@@ -63,7 +61,7 @@ class AnimalWorld:
         self.target = config.animal or next(iter(self.residents))
         self.batches = {name: each.batch(config) for name, each in self.residents.items()}
         self.camera: RgbdCamera | None = None
-        data, scenes = self.data, self.scenes
+        data, scenes = self.habitat.data, self.habitat.scenes
         tracks = [data.trajectories[name] for name in data.videos]
         roots = [track.world_from_agent[track.valid, :3, 3] for track in tracks]
         self.floors, scene_of = [], scenes.number(np.arange(len(roots)), len(roots)).tolist()
@@ -77,7 +75,7 @@ class AnimalWorld:
         build: "str | Path | AnimalWorld",
         *,
         home: str | Path | None = None,
-        homes: Sequence[str | Path] = (),
+        homes: str | Path | Sequence[str | Path] = (),
         device: str = "cpu",
         config: EnvironmentConfig | None = None,
         **settings: Any,
@@ -87,7 +85,8 @@ class AnimalWorld:
 
         ``settings`` replace fields of ``config``.
         """
-        given = [Path(each) for each in (*(() if home is None else (home,)), *homes)]
+        several = [homes] if isinstance(homes, str | Path) else homes
+        given = [Path(each) for each in (home, *several) if each is not None]
         if isinstance(build, AnimalWorld):
             assert not (given or config or settings), "a world that is open has its homes and settings"
             return build
@@ -117,8 +116,7 @@ class AnimalWorld:
     def begin(self, count: int, rng: np.random.Generator, split: str = "train") -> None:
         """Begin ``count`` lives; ``rng`` draws windows, starts and all plans from here on."""
         self.rng, self.steps = rng, 0
-        zeros = np.zeros((count, 2))
-        self.persons = Persons(zeros.copy(), np.zeros(count), zeros.copy())
+        self.persons = Persons(np.zeros((count, 2)), np.zeros(count), np.zeros((count, 2)))
         self.video = np.zeros(count, int)
         for name, context in self._drawn(np.arange(count), split).items():
             self.batches[name].begin(context, rng, companions=context.companions)
@@ -159,18 +157,8 @@ class AnimalWorld:
 
     @property
     def habitat(self) -> Habitat:
-        """Where these live."""
+        """Where these live: recorded moments to begin from, and their scenes."""
         return self.residents[self.target].habitat
-
-    @property
-    def data(self) -> BehaviorData:
-        """Moments to begin from."""
-        return self.habitat.data
-
-    @property
-    def scenes(self) -> Scenes:
-        """Scenes of these moments."""
-        return self.habitat.scenes
 
     @property
     def action_size(self) -> int:
@@ -207,7 +195,7 @@ class AnimalWorld:
     @property
     def scene(self) -> Int[np.ndarray, "person"]:
         """Number of each life's scene."""
-        return self.scenes.number(self.video, len(self.video))
+        return self.habitat.scenes.number(self.video, len(self.video))
 
     @property
     def home(self) -> Int[np.ndarray, "person"]:
@@ -284,7 +272,7 @@ class AnimalWorld:
             ahead = here[self.target] - self.persons.position[row]
             self.persons.heading[row] = np.arctan2(ahead[0], ahead[1])
             self.persons.velocity[row] = 0.0
-        observer = np.repeat(self.eyes[some][:, None], self.data.past, axis=1)
+        observer = np.repeat(self.eyes[some][:, None], self.habitat.data.past, axis=1)
         seen: dict[str, Any] = {"observer_world": observer, "observer_rotation": None}
         return {
             name: replace(context, companions=companions_of(name, past), **seen)
@@ -293,7 +281,7 @@ class AnimalWorld:
 
     def _moments(self, count: int, split: str) -> Int[np.ndarray, "some"]:
         """Draw windows; where there are several homes, each is as likely as another."""
-        windows = self.data.indices(SPLITS.get(split, -1))
+        windows = self.habitat.data.indices(SPLITS.get(split, -1))
         if not len(windows):
             raise InputError("REC-002", f"no window of the split {split!r}", "reset", "train or test")
         home = self.habitat.home_of_window[windows]
@@ -307,16 +295,13 @@ class AnimalWorld:
         self, here: Mapping[str, Float[np.ndarray, "2"]], floor: PersonFloor
     ) -> Float[np.ndarray, "2"]:
         """Draw a free place around the target, on no other animal; the last drawn where none is free."""
-        near, far = self.config.start_m
+        near, far = sorted(self.config.start_m)
         animal = place = here[self.target]
+        others = [(at, self.batches[name].clearance_m) for name, at in here.items() if name != self.target]
         for _ in range(START_DRAWS):
             angle, distance = self.rng.uniform(0, 2 * np.pi), self.rng.uniform(near, far)
             place = animal + distance * np.array([np.sin(angle), np.cos(angle)])
-            apart = (
-                np.linalg.norm(place - root) >= self.batches[name].clearance_m
-                for name, root in here.items()
-                if name != self.target
-            )
+            apart = (np.linalg.norm(place - at) >= clearance_m for at, clearance_m in others)
             if not floor.blocks(place[None])[0] and all(apart):
                 break
         return place

@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -84,7 +85,9 @@ def test_animal_can_live_in_another_home(build, tmp_path):
     wandering().save(own / "behavior_data")
     env = gymnasium.make(NAME, build=str(own), home=str(other), config=QUICK)
     _, info = env.reset(seed=0, options={"split": "test"})
-    assert info["share_known"] == 1.0, "the same room"
+    assert info["share_known"] == 1.0 and info["home"] == 0, "the same room"
+    single = gymnasium.make(NAME, build=str(own), homes=str(other), config=QUICK)
+    assert single.unwrapped.world.floors[0].floor_m == env.unwrapped.world.floors[0].floor_m
     for _ in range(15):
         seen, *_ = env.step(env.action_space.sample())
     assert env.observation_space.contains(seen)
@@ -105,6 +108,24 @@ def test_animal_can_live_in_another_home(build, tmp_path):
 def test_invalid_settings_are_refused(build, settings):
     with pytest.raises(InputError, match="REC-00[12]"):
         AnimalWorld.opened(build, **settings)
+
+
+def test_opening_a_build_leaves_the_random_state_of_the_program(build):
+    states = torch.random.get_rng_state(), np.random.get_state()[1], torch.get_num_threads()
+    AnimalWorld.load(build, QUICK).begin(1, np.random.default_rng(0))
+    assert torch.equal(torch.random.get_rng_state(), states[0])
+    np.testing.assert_array_equal(np.random.get_state()[1], states[1])
+    assert torch.get_num_threads() == states[2]
+
+
+def test_start_distances_may_be_given_in_any_order():
+    starts = []
+    for order in ((0.8, 1.5), (1.5, 0.8)):
+        world = small_world(replace(QUICK, start_m=order))
+        world.begin(9, np.random.default_rng(0))
+        starts.append(world.distance_m)
+    np.testing.assert_array_equal(*starts)
+    assert (starts[0] > 0.7).all() and (starts[0] < 1.6).all()
 
 
 def test_an_unknown_split_is_refused():

@@ -159,6 +159,15 @@ def test_camera_sees_all_animals():
         assert seen.sum() > 10 and 0.8 < depth_m[seen].mean() < 1.2, "meters"
 
 
+def test_actions_of_unknown_agents_are_refused(pair):
+    from pipeline.environments.parallel_env import PersonAnimalEnv
+
+    env = PersonAnimalEnv(AnimalWorld.load(pair, QUICK))
+    env.reset(seed=0)
+    with pytest.raises(InputError, match="REC-001.*'dgo'"):
+        env.step({"person": np.zeros(3), "dgo": np.zeros(2)})
+
+
 def test_unknown_animals_are_refused(pair):
     with pytest.raises(InputError, match="REC-001.*'bird'\n.*cat, dog"):
         AnimalWorld.opened(pair, config=QUICK, animal="bird")

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.behavior.trajectories import TEST
 from tests.pipeline.environments.small_world import QUICK, small_world
 
 pytest.importorskip("stable_baselines3")
@@ -37,3 +38,14 @@ def test_ended_episodes_return_the_terminal_observation_and_reset():
     assert np.abs(env.world.persons.position - before).max() > 0.1, "other starts"
     for row, each in enumerate(info):
         assert not np.allclose(each["terminal_observation"]["animal"], seen["animal"][row])
+
+
+def test_the_split_may_be_given_as_an_option():
+    from pipeline.environments.stable_baselines import PersonStableVecEnv
+
+    env = PersonStableVecEnv(small_world(), 6)
+    data = env.world.habitat.data
+    tested = {int(video) for video in data.video[data.split == TEST]}
+    env.set_options({"split": "test"})
+    env.reset()
+    assert env.split == "test" and set(env.world.video.tolist()) <= tested
