@@ -106,13 +106,11 @@ class LongTerm:
             seen = document["sees_scene"]
             nets = StaticBody(sizes), RouteNet(sizes, with_scene=seen), PoseNet(sizes, with_scene=seen)
             for name, module in zip(("poses", *NETWORKS), (poses, *nets), strict=True):
-                own = {key: value for key, value in state.items() if key.startswith(f"{name}.")}
-                module.load_state_dict({key.removeprefix(f"{name}."): value for key, value in own.items()})
+                own = [key for key in state if key.startswith(f"{name}.")]
+                module.eval().load_state_dict({key.removeprefix(f"{name}."): state[key] for key in own})
             numbers = [np.array(document[name]) for name in ("contact_vertices", "foot_of_contact_vertex")]
             motion_prior = MotionPrior(**document["motion_prior"])
-        static, route, pose = nets
-        contacts = ContactVertices(*numbers)
-        return cls(sizes, poses, contacts, motion_prior, static.eval(), route.eval(), pose.eval())
+        return cls(sizes, poses, ContactVertices(*numbers), motion_prior, *nets)
 
     def bodies(
         self,

@@ -1,6 +1,9 @@
 """Environments: checks of the libraries, seeding, collision of persons with walls, and batching."""
 
+import contextlib
+import os
 import shutil
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -116,6 +119,29 @@ def test_opening_a_build_leaves_the_random_state_of_the_program(build):
     assert torch.equal(torch.random.get_rng_state(), states[0])
     np.testing.assert_array_equal(np.random.get_state()[1], states[1])
     assert torch.get_num_threads() == states[2]
+
+
+FORKED = """
+import sys, gymnasium, numpy as np, torch
+torch.set_num_threads(2)
+torch.ones(400_000).exp().sum()
+how = {"build": sys.argv[1], "sequence_steps": 2, "candidates": 1, "vectorization_mode": "async"}
+how |= {"num_envs": 2, "vector_kwargs": {"context": "fork"}}
+envs = gymnasium.make_vec("pipeline.environments:AgentToSim/Cat-v0", **how)
+envs.reset(seed=0)
+envs.step(np.zeros((2, 3), np.float32))
+envs.close()
+assert torch.get_num_threads() == 2, "the setting of the program"
+"""
+
+
+def test_forked_environments_do_not_hang_in_threads_of_pytorch(build):
+    running = subprocess.Popen([sys.executable, "-c", FORKED, str(build)], start_new_session=True)
+    try:
+        assert running.wait(120) == 0
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(running.pid, signal.SIGKILL)
 
 
 def test_start_distances_may_be_given_in_any_order():
