@@ -97,7 +97,7 @@ def test_floor_behind_a_moved_box_is_chosen_by_the_animals_size(height_m):
     assert np.median(off) < 0.08, "meters; the other surface is about 0.4 away"
 
 
-def test_sitting_animal_that_faces_the_camera_is_not_turned():
+def test_sitting_animal_that_faces_the_camera_is_pitched_and_not_turned():
     """It is pitched by 30 degrees, so head and dark chest are seen, and neither back nor tail."""
     pitch = rigid.rotation_from_vector(np.array([-np.deg2rad(30), 0, 0]))
     truth = standing(0.0, np.pi / 2)
@@ -107,3 +107,7 @@ def test_sitting_animal_that_faces_the_camera_is_not_turned():
     turn = np.rad2deg(rigid.wrap(rigid.yaw(roots[placed]) - rigid.yaw(truth[placed])))
     assert placed.mean() > 0.8
     assert np.abs(turn).max() < 45, "degrees"
+    tilt = np.rad2deg(np.arccos(np.clip(roots[placed, 1, 1], -1, 1)))
+    assert tilt.min() > 8, "degrees, of 30; depth from the contact alone leaves it upright"
+    off = np.linalg.norm(roots[placed, :3, 3] - truth[placed, :3, 3], axis=1)
+    assert np.median(off) < 0.15, "meters; 0.22 by the contact alone, on which a standing animal fits"
