@@ -71,7 +71,8 @@ def depth_of(
     height = eye[1] + z * rays[:, 1] - point_world[1]
     above = point_world[1] + back_m - eye[1]
     over = above / np.where(rays[:, 1] < -1e-6, rays[:, 1], np.nan)
-    z = np.where((height > back_m) & (above < 0) & np.isfinite(over), over, z)
+    on_back = ~(np.abs(height) <= back_m)  # also where a camera that looks down sees only the back
+    z = np.where(on_back & (above < 0) & np.isfinite(over), over, z)
     depth = np.zeros(mask.shape, np.float32)
     depth[rows, columns] = np.where(np.isfinite(z) & (z > 0), z, 0)
     return depth

@@ -12,8 +12,9 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import KDTree
 
 from pipeline.data.clips import Clip
-from pipeline.geometry import cameras, contact, rigid, subsampling
+from pipeline.geometry import cameras, contact, picture_fit, rigid, subsampling
 from pipeline.geometry.meshes import Mesh, RayCaster
+from pipeline.geometry.picture_fit import BodyPicture, ColoredBody
 from pipeline.geometry.size import body_length_m
 
 UP = np.array([0.0, 1.0, 0.0])
@@ -32,6 +33,9 @@ kernel (animals jump and lie down), and largest cost, body lengths."""
 COLOR_WEIGHT, OUTSIDE_WEIGHT, TRUNCATION = 0.1, 0.0833, 1.5
 """Cost of a full-scale color difference, and of a template wholly outside the mask, body lengths; truncation
 of distances, in reaches."""
+PICTURE_COST, CONTACT_WEIGHT, TILT_COST = 0.0533, 0.2, 0.00333
+"""Without measured depth: cost of a typical picture (body lengths), weight of distances from the box that
+stands at the contact point, which has no head and no legs, and cost of a tilt by one sigma (body lengths)."""
 POINT_WEIGHT = 0.15
 """Weight of the point-to-point term relative to point-to-plane; prevents sliding."""
 PRIOR_POINTS, POINT_SIGMA, DAMPING = 20, 0.05, 1e-6
@@ -64,6 +68,8 @@ class AgentModel:
     """`body_length_m` of the template."""
     stand_m: float
     """Height of the root above the paws."""
+    body: ColoredBody | None = None
+    """What pictures without measured depth are compared with."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +83,13 @@ class StandingSurface:
         """Return the height of the first surface below each point, or of the floor, world y."""
         hits = self.caster.cast(points_world, np.broadcast_to([0.0, -1.0, 0.0], points_world.shape))
         return np.where(hits.face >= 0, points_world[:, 1] - hits.distance, self.floor_m)
+
+    def floor_alone(self) -> "StandingSurface":
+        """Return the floor plane without what the map shows on it."""
+        (left, _, front), (right, _, back) = (pick(self.caster.mesh.vertices, 0) for pick in (np.min, np.max))
+        corners = [(x, self.floor_m, z) for x in (left, right) for z in (front, back)]
+        mesh = Mesh(np.array(corners, np.float32), np.array([[0, 1, 2], [2, 1, 3]], np.int32))
+        return StandingSurface(RayCaster(mesh), self.floor_m)
 
 
 @dataclass(frozen=True)
@@ -94,6 +107,8 @@ class AgentObservation:
     """Root height if the animal stands on the surface below, world y; NaN where there is none."""
     share: float
     """Visible share: mask area over the silhouette's area in full view at this distance."""
+    picture: BodyPicture | None = None
+    """The picture, if depth is not measured."""
 
 
 def make_model(mesh: Mesh, rng: np.random.Generator) -> AgentModel:
@@ -141,6 +156,7 @@ def observe(
     column, row = np.clip(pixel.astype(int), 0, limit).T
     full_px = FULL_VIEW * model.length_m**2 * (clip.intrinsics[frame, 0, 0] / np.median(z)) ** 2
     points_world = rigid.apply(world_from_camera, points)
+    view = mask, depth, clip.intrinsics[frame], world_from_camera
     inner = points_world[::STANDING_STEP] + _offset_to_center(points_world, world_from_camera[:3, 3], model)
     return AgentObservation(
         frame=frame,
@@ -152,6 +168,7 @@ def observe(
         intrinsics=clip.intrinsics[frame],
         standing_m=float(np.median(standing.below(inner))) + model.stand_m,
         share=float(min(1.0, inside.sum() / full_px)),
+        picture=picture_fit.body_picture(clip.color(frame), *view) if clip.mapped else None,
     )
 
 
@@ -210,8 +227,10 @@ def fit_fine(
 ) -> Float[np.ndarray, "pose 4 4"]:
     """Fit to convergence with and without the standing prior, and return the pose of lower cost.
 
-    With ``tilt`` the root may tilt.
+    With ``tilt`` the root may tilt. Without measured depth, the picture decides.
     """
+    if observation.picture is not None:
+        return np.stack([_searched(observation, model, pose) for pose in world_from_agent])
     reach, prior = np.full(rounds, REACH), TILT_SIGMA_RAD if tilt else UPRIGHT_SIGMA_RAD
     standing, free = (
         _fit(observation, model, world_from_agent, reach, prior, stands=stands) for stands in (True, False)
@@ -233,6 +252,10 @@ class PosePrior:
         offset = rigid.log(rigid.inverse(self.world_from_agent) @ world_from_agent)
         return offset / np.repeat(self.sigma, 3)
 
+    def cost(self, world_from_agent: Float[np.ndarray, "pose 4 4"]) -> Float[np.ndarray, "pose"]:
+        """Return the cost of the deviation, body lengths."""
+        return DEPARTURE_COST * (self.twist(world_from_agent) ** 2).sum(-1)
+
 
 @dataclass(frozen=True)
 class PriorFit:
@@ -248,15 +271,30 @@ class PriorFit:
 def fit_near(observation: AgentObservation, model: AgentModel, prior: PosePrior, *, rounds: int) -> PriorFit:
     """Fit from a predicted pose with and without the standing prior, and return the lower total cost."""
     reach, start = np.full(rounds, REACH), prior.world_from_agent[None]
+    if observation.picture is not None:
+        pose = _searched(observation, model, prior.world_from_agent, prior)
+        own = float(cost(observation, model, pose[None])[0])
+        return PriorFit(pose, own, own + float(prior.cost(pose[None])[0]))
     fits = (
         _fit(observation, model, start, reach, TILT_SIGMA_RAD, stands=stands, near=prior)
         for stands in (True, False)
     )
     poses = np.concatenate(list(fits))
     own = cost(observation, model, poses)
-    total = own + DEPARTURE_COST * (prior.twist(poses) ** 2).sum(-1)
+    total = own + prior.cost(poses)
     best = int(total.argmin())
     return PriorFit(poses[best], float(own[best]), float(total[best]))
+
+
+def _searched(observation, model, start, near=None):
+    """Minimize the cost, with the priors of tilt and of a predicted pose, by pattern search."""
+
+    def objective(pose: Float[np.ndarray, "4 4"]) -> float:
+        tilt_rad = np.arccos(np.clip(pose[1, 1], -1, 1))
+        total = cost(observation, model, pose[None])[0] + TILT_COST * (tilt_rad / TILT_SIGMA_RAD) ** 2
+        return float(total if near is None else total + near.cost(pose[None])[0])
+
+    return picture_fit.search(start, objective, observation.world_from_camera[:3, 3], model.length_m)
 
 
 def _fit(observation, model, world_from_agent, reaches, prior, *, stands=True, near=None):
@@ -326,16 +364,23 @@ def _add_standing_prior(poses, hessian, gradient, standing_m, length_m):
 def cost(
     observation: AgentObservation, model: AgentModel, world_from_agent: Float[np.ndarray, "pose 4 4"]
 ) -> Float[np.ndarray, "pose"]:
-    """Return each pose's cost, body lengths: truncated distance, standing, color, template outside mask."""
+    """Return each pose's cost, body lengths: truncated distance, standing, color, template outside mask.
+
+    Without measured depth, outline and colors of the rendered template replace the last two.
+    """
     local = rigid.apply(rigid.inverse(world_from_agent), observation.points_world[None])
     distance, nearest = model.tree.query(local)
     seen, expected = observation.color - observation.color.mean(0), model.color[nearest]
     color_error = np.abs(seen - (expected - expected.mean(1, keepdims=True))).mean((1, 2))
     height = np.nan_to_num(world_from_agent[:, 1, 3] - observation.standing_m) / model.length_m
     standing_error = height**2 / (height**2 + STAND_REACH**2)
-    geometry = np.minimum(distance / model.length_m, TRUNCATION * REACH).mean(1) + STAND_COST * standing_error
+    gap = np.minimum(distance / model.length_m, TRUNCATION * REACH).mean(1)
+    if observation.picture is not None:
+        assert model.body is not None, "pictures without measured depth need a colored body"
+        shown = np.array([model.body.misfit(observation.picture, pose) for pose in world_from_agent])
+        return CONTACT_WEIGHT * gap + STAND_COST * standing_error + PICTURE_COST * shown
     outside = _outside_share(observation, model, world_from_agent)
-    return geometry + COLOR_WEIGHT * color_error + OUTSIDE_WEIGHT * outside
+    return gap + STAND_COST * standing_error + COLOR_WEIGHT * color_error + OUTSIDE_WEIGHT * outside
 
 
 def _outside_share(observation, model, world_from_agent):

@@ -1,18 +1,20 @@
 """The animal's root pose in every frame: hypotheses by shape and localizer, Viterbi decoding, smoothing.
 
-Depth alone does not distinguish front from back; over time only one of the two walks head first. In the
-paper's form the localizer's pose of every frame is its root.
+Depth alone does not distinguish front from back; over time only one of the two walks head first. Where depth
+is not measured, outline and colors of the rendered template decide, also whether the animal stands on the map
+or on the floor behind it. In the paper's form the localizer's pose of every frame is its root.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import assert_never
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from pipeline.core.progress import track
 from pipeline.data.clips import Clip, Masks
-from pipeline.geometry import rigid
+from pipeline.geometry import picture_fit, rigid, subsampling, viterbi
 from pipeline.geometry.meshes import Mesh
 from pipeline.localization.localizer import Localizer
 from stages.register_videos import agent_fit, headings
@@ -25,6 +27,11 @@ MAX_HYPOTHESES, MIN_HEADING_DIFFERENCE_DEG = 5, 25.0
 """Largest number of hypotheses per frame, and least difference of their headings, degrees."""
 COST_SCALE = 0.00667
 """Fit cost that counts as one unit of the Viterbi cost, body lengths."""
+NEAR, SURFACE_CHANGE = 0.1, 4.0
+"""Distance between positions on the map and on the floor behind it that makes a difference, body lengths;
+cost of a change between them, units."""
+CALIBRATION_FRAMES = 24
+"""Frames from which typical residuals of pictures without depth are learned."""
 FINE_ROUNDS = 12
 """Gauss-Newton steps of the remaining hypotheses."""
 LOCALIZER_EVERY_FRAMES, LOCALIZER_WEIGHT = 2, 8.0
@@ -70,10 +77,14 @@ def find_roots(
     """Estimate the animal's root pose in every frame that shows it."""
     model, roots = agent_fit.make_model(mesh, rng), Roots.unseen(len(clip))
     poses, cost, share = roots.world_from_agent, roots.cost, roots.share
+    surface: dict[int, StandingSurface] = {}
 
     def observe(frame: int) -> AgentObservation | None:
-        return agent_fit.observe(clip, masks[frame], frame, world_from_camera[frame], model, standing)
+        below = surface.get(frame, standing)
+        return agent_fit.observe(clip, masks[frame], frame, world_from_camera[frame], model, below)
 
+    if clip.mapped:
+        model = _with_body(mesh, model, observe, np.flatnonzero(masks.visible), config)
     frames, hypotheses = track(np.flatnonzero(masks.visible).tolist(), "placing the animal"), []
     observations = (seen for frame in frames if (seen := observe(frame)) is not None)
     match config.initialization:
@@ -90,6 +101,15 @@ def find_roots(
             assert_never(config.initialization)
     if not hypotheses:
         return roots
+    if clip.mapped:
+        floor = standing.floor_alone()
+        surface, behind = dict.fromkeys([each.frame for each in hypotheses], floor), {}
+        for index, each in enumerate(hypotheses):
+            seen = observe(each.frame)
+            if seen is not None and _apart_m(seen, each) > NEAR * model.length_m:
+                behind[each.frame] = _hypotheses(clip, seen, model, localizer, index, config)
+        hypotheses = _standing_on(hypotheses, behind)
+        surface = {each.frame: floor for each in hypotheses if each is behind.get(each.frame)}
     path = headings.choose_hypotheses(clip.timestamp_s, hypotheses, model.length_m)
     for each, chosen in track(list(zip(hypotheses, path, strict=True)), "refining the animal"):
         frame, observation = each.frame, observe(each.frame)
@@ -101,6 +121,40 @@ def find_roots(
     poses, cost = Tracker(clip.timestamp_s, poses, cost, share, observe, model).track()
     smoothed = smooth(clip.timestamp_s, poses, cost, share, config.smooth_s, model.length_m)
     return Roots(smoothed, np.isfinite(cost), cost, share)
+
+
+def _apart_m(seen: AgentObservation, other: RootHypotheses) -> float:
+    return float(np.linalg.norm(np.median(seen.points_world, axis=0) - other.center_world))
+
+
+def _standing_on(mapped: list[RootHypotheses], behind: dict[int, RootHypotheses]) -> list[RootHypotheses]:
+    """Choose between the map's surface and the floor behind it (by frame), by a Viterbi path over costs.
+
+    What was moved since the walk-through is still in the map. At the wrong depth, the animal's size is wrong.
+    """
+    pairs = [(each, behind.get(each.frame, each)) for each in mapped]
+    cost = np.array([[each.cost.min() for each in pair] for pair in pairs])
+    cost[0, 1] += SURFACE_CHANGE
+    path = viterbi.viterbi_decode(cost, lambda _: SURFACE_CHANGE * (1 - np.eye(2)))
+    return [pair[state] for pair, state in zip(pairs, path, strict=True)]
+
+
+def _with_body(
+    mesh: Mesh,
+    model: AgentModel,
+    observe: Callable[[int], AgentObservation | None],
+    visible: Int[np.ndarray, "visible"],
+    config: RootConfig,
+) -> AgentModel:
+    """Add the colored body; learn its typical residuals from rough fits to some of the visible frames."""
+    body, pictures, poses = picture_fit.colored_body(mesh), [], []
+    for frame in visible[subsampling.evenly(len(visible), CALIBRATION_FRAMES)].tolist():
+        seen = observe(frame)
+        if seen is not None and seen.picture is not None:
+            fits = agent_fit.fit_coarse(seen, model, agent_fit.initial_poses(seen, model, config.headings))
+            poses.append(fits[np.argmin([body.misfit(seen.picture, fit) for fit in fits])])
+            pictures.append(seen.picture)
+    return replace(model, body=picture_fit.calibrated(body, pictures, np.array(poses)) if poses else body)
 
 
 def _hypotheses(

@@ -2,7 +2,7 @@ import numpy as np
 import trimesh
 
 from pipeline.geometry import contact, rigid
-from pipeline.geometry.meshes import Mesh, RayCaster
+from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 
 SIZE = (120, 160)
 INTRINSICS = np.array([[120.0, 0, 80], [0, 120.0, 60], [0, 0, 1]])
@@ -18,8 +18,6 @@ def caster(*meshes: trimesh.Trimesh) -> RayCaster:
 
 
 def render(scene: RayCaster) -> np.ndarray:
-    from pipeline.geometry.meshes import render_view
-
     return render_view(scene, CAMERA, INTRINSICS, *SIZE)[0]
 
 
@@ -33,6 +31,19 @@ def test_depth_of_a_box_on_the_floor():
     assert ((depth > 0) == mask).all()
     assert np.abs(depth - true)[mask].max() < 0.06
     assert np.median(np.abs(depth - true)[mask]) < 0.03
+
+
+def test_depth_seen_from_above_is_that_of_the_back():
+    """The lowest pixels are its far side's if the phone looks straight down or beyond: there is no front."""
+    eye = np.array([0.0, 1.5, 0.02])
+    camera = rigid.look_at(eye, np.array([0.0, 0.0, 0.15]), np.array([0.0, 0.0, -1.0]))
+    true, floor = (render_view(scene, camera, INTRINSICS, *SIZE)[0] for scene in (caster(BOX), caster()))
+    mask = true < floor - 1e-3
+    touched = contact.find(mask, INTRINSICS, camera, caster())
+    depth = contact.depth_of(mask, touched.point_world, 0.3, INTRINSICS, camera)
+    assert ((depth > 0) == mask).all()
+    assert np.median(np.abs(depth - true)[mask]) < 0.03
+    assert depth.max() < floor.max() + 0.05, "nothing is below the floor"
 
 
 def test_no_contact_at_picture_borders_or_in_front_of_walls():
