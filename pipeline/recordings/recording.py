@@ -86,11 +86,8 @@ def pose_from_matrix(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float
     rotation = world_from_camera[:, :3, :3]
     with np.errstate(all="ignore"):
         off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max((1, 2))
-        good = (
-            np.isfinite(world_from_camera).all((1, 2))
-            & (off < ORTHONORMAL)
-            & (np.linalg.det(np.nan_to_num(rotation)) > 0)
-        )
+        rigid_motion = (off < ORTHONORMAL) & (np.linalg.det(np.nan_to_num(rotation)) > 0)
+        good = np.isfinite(world_from_camera).all((1, 2)) & rigid_motion
     if good.any():
         pose[good, :4] = np.roll(rigid.quaternion_from_rotation(rotation[good]), -1, axis=1)
         pose[good, 4:] = world_from_camera[good, :3, 3]

@@ -31,10 +31,9 @@ def write(folder: Path, recording: Recording, config: Config) -> None:
         statistics.append(extraction.picture_statistics(color))
         if row in shown:
             strip.append(thumbnail(color))
-    if len(rows) - len(chosen) > MAX_LOST * len(rows):
-        raise errors.damaged(
-            recording.where, f"{len(rows) - len(chosen)} of {len(rows)} pictures cannot be decoded"
-        )
+    damaged = len(rows) - len(chosen)
+    if damaged > MAX_LOST * len(rows):
+        raise errors.damaged(recording.where, f"{damaged} of {len(rows)} pictures cannot be decoded")
     if len(chosen) < extraction.MIN_FRAMES:
         what = f"{len(chosen)} pictures, {extraction.MIN_FRAMES} are the least"
         raise errors.no_frames(recording.where, what)

@@ -48,13 +48,8 @@ def run(
             plan, frames, summary = photogrammetry.map_pictures(recording, sources, config, Path(workspace))
     else:
         reach = {"max_depth_m": config.max_depth_m}
-        found, plan = calibration.understand(
-            recording,
-            given.read(inputs.depth),
-            rate_hz=config.rate_hz,
-            max_side_px=config.max_side_px,
-            **reach,
-        )
+        options = {"rate_hz": config.rate_hz, "max_side_px": config.max_side_px, **reach}
+        found, plan = calibration.understand(recording, given.read(inputs.depth), **options)
         if found.estimate is not None:
             progress.log(f"{recording.where}: {calibration.describe(found.estimate)}")
         for remark in found.recording.remarks[len(recording.remarks) :]:

@@ -150,9 +150,8 @@ def _bag_of_words_similarity(
 ) -> Float[np.ndarray, "key key"]:
     """Return the cosine of word histograms, words weighted by rarity (Sivic and Zisserman 2003)."""
     everything = np.concatenate(descriptors)
-    sample = everything[
-        np.random.default_rng(seed).permutation(len(everything))[: DESCRIPTORS_PER_WORD * words]
-    ]
+    order = np.random.default_rng(seed).permutation(len(everything))
+    sample = everything[order[: DESCRIPTORS_PER_WORD * words]]
     if len(sample) < words:
         return np.zeros((len(descriptors), len(descriptors)))
     cv2.setRNGSeed(seed)

@@ -60,9 +60,8 @@ def write_frames(
         if frame.depth_valid < config.min_depth_valid:
             continue
         name = f"{len(statistics):06d}"
-        (folder / "color" / f"{name}.jpg").write_bytes(
-            frame.jpeg or images.encode_jpeg(frame.color, config.jpeg_quality)
-        )
+        jpeg = frame.jpeg or images.encode_jpeg(frame.color, config.jpeg_quality)
+        (folder / "color" / f"{name}.jpg").write_bytes(jpeg)
         images.write_depth(folder / "depth" / f"{name}.exr", frame.depth)
         images.write_gray(folder / "confidence" / f"{name}.png", frame.confidence)
         statistics.append((frame.sharpness, frame.brightness, frame.depth_valid))
