@@ -89,6 +89,8 @@ class DepthCalibration:
     clear: tuple[str, ...] = ()
     """`camera` and `delay`, as far as they differ clearly from what is stated"""
     used: tuple[str, ...] = ()
+    applied_s: float = 0.0
+    """given delay, which was applied before the rest of it was estimated"""
 
 
 def understand(
@@ -136,7 +138,7 @@ def calibrate(recording: Recording, given: GivenCalibration = NOTHING) -> DepthC
     given_camera = given.describes_camera or recording.depth_camera is not None
     fixed = {"camera": given_camera, "delay": given.delay_s is not None}
     used = tuple(name for name in clear if not fixed[name])
-    return DepthCalibration(_changed(recording, found, used), found, clear, used)
+    return DepthCalibration(_changed(recording, found, used), found, clear, used, given.delay_s or 0.0)
 
 
 def _changed(recording: Recording, found: DepthEstimate, parts: Sequence[str]) -> Recording:
@@ -207,15 +209,15 @@ def describe(found: DepthEstimate, parts: Sequence[str] = PARTS) -> str:
     return ", ".join(said)
 
 
-def as_given(recording: Recording, found: DepthEstimate, parts: Sequence[str] = PARTS) -> dict[str, str]:
-    """Return the keys of `given.GivenCalibration`, as TOML, that describe an estimate of a recording."""
-    said = {}
-    if "camera" in parts:
-        lens = _scaled(np.median(_depth_intrinsics(recording), axis=0), found.focal)
+def as_given(found: DepthCalibration) -> dict[str, str]:
+    """Return the keys of `given.GivenCalibration`, as TOML, that state what is clear."""
+    said, estimate = {}, found.estimate
+    if estimate is not None and "camera" in found.clear:
+        lens = _scaled(np.median(_depth_intrinsics(found.recording), axis=0), estimate.focal)
         said["depth_intrinsics"] = [round(float(each), 2) for each in lens[[0, 1, 0, 1], [0, 1, 2, 2]]]
-        said["depth_from_color"] = [round(float(each), 5) for each in found.depth_from_color.ravel()]
-    if "delay" in parts:
-        said["delay_s"] = round(found.delay_s, 3)
+        said["depth_from_color"] = [round(float(each), 5) for each in estimate.depth_from_color.ravel()]
+    if estimate is not None and "delay" in found.clear:
+        said["delay_s"] = round(found.applied_s + estimate.delay_s, 3)
     return {key: str(value) for key, value in said.items()}
 
 

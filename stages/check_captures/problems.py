@@ -91,8 +91,7 @@ def _remedies(seen: CaptureMeasurements, role: Role) -> dict[str, str]:
         found["CAP-057"] = "they were not taken at one time: shift the time stamps (numbers) of one by that"
     depth = seen.sample.calibration
     if depth is not None and depth.estimate is not None and depth.clear:
-        given = as_given(recording, depth.estimate, depth.clear)
-        keys = ", ".join(f"{key} = {value}" for key, value in given.items())
+        keys = ", ".join(f"{key} = {value}" for key, value in as_given(depth).items())
         found["CAP-060"] = f"to fix this, write {Path(recording.where).name}.depth.toml: {keys}"
         if depth.used != depth.clear:
             found["CAP-060"] = f"check what is given (is depth_from_color the inverse?); these fit: {keys}"

@@ -130,10 +130,19 @@ def test_what_is_given_is_kept():
     assert not right.read_depth(FRAMES - 1).any(), "there is no depth of that time"
 
 
+def test_what_fits_includes_the_delay_that_is_given():
+    stated = GivenCalibration(registered=True, delay_s=0.1)
+    recording = recordings.with_given(_recording(delay_s=0.3), stated)
+    found = recordings.calibrate(recording, stated)
+    assert found.clear == ("delay",) and found.used == () and found.estimate is not None
+    keys = recordings.as_given(found)
+    assert float(keys["delay_s"]) == pytest.approx(0.3, abs=0.02)
+
+
 def test_estimate_is_said_in_the_keys_of_the_file(tmp_path):
     recording = _recording()
     found = recordings.DepthEstimate(0.9, rigid.make(np.eye(3), np.array([0.025, 0, 0])), 0.1, np.zeros(8))
-    keys = recordings.as_given(recording, found)
+    keys = recordings.as_given(recordings.DepthCalibration(recording, found, recordings.PARTS))
     (tmp_path / "a.depth.toml").write_text("\n".join(f"{key} = {value}" for key, value in keys.items()))
     said = given.read(tmp_path / "a.depth.toml")
     camera = given.described(recording, said).depth_camera
