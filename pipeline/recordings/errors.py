@@ -1,5 +1,7 @@
 """The errors that several readers of recordings raise."""
 
+from collections.abc import Collection
+
 from pipeline.core.errors import InputError
 
 
@@ -35,3 +37,10 @@ def refuse_other_size(shape: tuple[int, ...], size: tuple[int, int] | None, wher
     """Raise CAP-008 for a depth picture whose (height, width) is not ``size``, if given."""
     if size is not None and shape != size:
         raise wrong_depth(where, f"{shape[1]} x {shape[0]} instead of {size[1]} x {size[0]}")
+
+
+def refuse_numbers_from_1(numbers: Collection[int], frames: int, what: str, where: str) -> None:
+    """Raise CAP-004 if ``frames`` frames are numbered from 1: each would get the data of its neighbor."""
+    if frames and (min(numbers, default=0), max(numbers, default=0)) == (1, frames):
+        counted = f"{what} is numbered from 1 to {frames}, frames from 0"
+        raise InputError("CAP-004", counted, where, "number it, and what belongs to it, from 0")

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.core.errors import InputError
 from pipeline.core.videos import VIDEO_SUFFIXES
 from pipeline.data import images
 from pipeline.recordings import errors, text_files
@@ -36,9 +35,7 @@ def open_recording(path: Path) -> Recording:
     if len(index) == 0:
         why = "no depth picture carries the number of a video frame, counted from 0"
         raise errors.no_frames(container.where, why)
-    if (min(depth), max(depth)) == (1, len(movie)):
-        what = f"depth is numbered from 1 to {len(movie)}, the video's frames from 0"
-        raise InputError("CAP-004", what, container.where, "number depth/ and poses.txt from 0")
+    errors.refuse_numbers_from_1(depth, len(movie), "depth/", container.where)
     if max(depth) + 1 < 0.5 * len(movie):
         why = f"{len(movie)} video frames, but depth up to number {max(depth)}: name it by the frame"
         raise errors.broken_metadata(container.where, why)
@@ -51,7 +48,7 @@ def open_recording(path: Path) -> Recording:
         index=index,
         timestamp_s=movie.timestamp_s[index] - movie.timestamp_s[index[0]],
         intrinsics=intrinsics,
-        pose=_poses(container, index),
+        pose=_poses(container, index, len(movie)),
         color_size=movie.size,
         depth_size=size,
         read_color=movie.read,
@@ -92,13 +89,12 @@ def _depth(
     return depth
 
 
-def _poses(container: FolderContainer, index: np.ndarray) -> Float[np.ndarray, "frame 7"] | None:
+def _poses(container: FolderContainer, index: np.ndarray, frames: int) -> Float[np.ndarray, "frame 7"] | None:
     if "poses.txt" not in container.names:
         return None
     table = text_files.table(container, "poses.txt", 8)
-    row = {int(number): i for i, number in enumerate(table[:, 0]) if np.isfinite(number)}
-    pose = np.full((len(index), 7), np.nan)
-    for frame, number in enumerate(index):
-        if int(number) in row:
-            pose[frame] = table[row[int(number)], [4, 5, 6, 7, 1, 2, 3]]
-    return pose
+    pose = {row[0]: row[[4, 5, 6, 7, 1, 2, 3]] for row in table if np.isfinite(row[0])}
+    if any(number % 1 for number in pose):
+        raise errors.broken_metadata(container.place("poses.txt"), "column 1 must be the frame's number")
+    errors.refuse_numbers_from_1(pose, frames, "poses.txt", container.where)
+    return np.array([pose.get(number, np.full(7, np.nan)) for number in index.tolist()])

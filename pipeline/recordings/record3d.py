@@ -74,6 +74,7 @@ def _open(container: Container, layout: _Layout) -> Recording:
     index = np.array(sorted(stored & pictures), int)
     if len(index) == 0:
         raise errors.no_frames(container.where, "none has color and depth")
+    errors.refuse_numbers_from_1(stored, metadata.declared_frames(), "each file", container.where)
     timestamp_s = metadata.timestamp_s(index)
     index, timestamp_s = index[np.isfinite(timestamp_s)], timestamp_s[np.isfinite(timestamp_s)]
     intrinsics, pose = metadata.intrinsics(index), metadata.pose(index)
@@ -222,14 +223,13 @@ def _depth_size(container: Container, layout: _Layout, metadata: _Metadata, firs
     size = metadata.depth_size()
     if size is not None:
         return size
+    name = layout.depth % first
     if layout is _FOLDER and isinstance(container, FolderContainer):
-        height, width = images.read_depth(container.path(layout.depth % first), channel="R").shape
+        height, width = images.read_depth(container.path(name), channel="R").shape
         return height, width
-    floats = len(_decompress(container, layout.depth % first, 4 * max(DEPTH_SIZES))) // 4
+    floats = len(_decompress(container, name, 4 * max(DEPTH_SIZES))) // 4
     if floats not in DEPTH_SIZES:
-        raise errors.wrong_depth(
-            container.place(layout.depth % first), f"{floats} values fit no known depth camera"
-        )
+        raise errors.wrong_depth(container.place(name), f"{floats} values fit no known depth camera")
     height, width = DEPTH_SIZES[floats]  # upright
     return (height, width) if metadata.color_size[0] >= metadata.color_size[1] else (width, height)
 

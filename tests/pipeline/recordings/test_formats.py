@@ -183,7 +183,7 @@ def test_depth_that_is_numbered_from_1_is_refused(tmp_path):
     path = made_formats.video_and_depth(tmp_path / "a", walk(6))
     for number in range(5, -1, -1):
         (path / f"depth/{number:06d}.png").rename(path / f"depth/{number + 1:06d}.png")
-    with pytest.raises(InputError, match=r"CAP-004(.|\n)*number depth/ and poses.txt from 0"):
+    with pytest.raises(InputError, match=r"CAP-004(.|\n)*depth/ is numbered from 1 to 6(.|\n)*from 0"):
         open_recording(path)
 
 

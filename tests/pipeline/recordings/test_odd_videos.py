@@ -1,6 +1,8 @@
 """Recordings in odd but real forms: cut off, wide colors, missing files, varying times."""
 
+import zipfile
 from fractions import Fraction
+from pathlib import Path
 
 import av
 import numpy as np
@@ -41,12 +43,12 @@ def test_a_matroska_that_was_cut_off_lacks_what_its_header_declares(tmp_path, en
 
 def test_a_matroska_that_declares_no_duration_is_complete(tmp_path):
     """As a browser records; FFmpeg estimates one from the rate of uncompressed sound, far too long."""
-    made = walk(180)
+    made = walk(360)
     with av.open(str(tmp_path / "live.mkv"), "w", options={"live": "1"}) as written:
         track = written.add_stream("mjpeg", rate=30)
         track.height, track.width, track.pix_fmt, track.bit_rate = 64, 48, "yuvj420p", 2_000_000
         sound = written.add_stream("pcm_s16le", rate=48_000)
-        for number in range(180):
+        for number in range(360):
             frame = av.VideoFrame.from_ndarray(made.color(number), format="rgb24")
             frame.pts, frame.time_base = number, Fraction(1, 30)
             written.mux(track.encode(frame))
@@ -54,7 +56,7 @@ def test_a_matroska_that_declares_no_duration_is_complete(tmp_path):
             silence.rate, silence.pts = 48_000, 1600 * number
             written.mux(sound.encode(silence))
     with av.open(str(tmp_path / "live.mkv")) as read:
-        assert read.duration > 6.5e6, "microseconds"
+        assert read.duration > 12.6e6, "microseconds"
     assert open_recording(tmp_path / "live.mkv").incomplete == 0
 
 
@@ -163,3 +165,32 @@ def test_depth_of_every_second_frame_is_complete(tmp_path):
         file.unlink()
     recording = open_recording(path)
     assert (len(recording.index), recording.incomplete) == (20, 0.0)
+
+
+def test_record3d_files_that_are_numbered_from_1_are_refused(tmp_path):
+    """Renamed by another program: every frame would get the time and pose of its neighbor."""
+    made = walk(20)
+    with zipfile.ZipFile(made.write(tmp_path / "a.r3d")) as archive:
+        whole = {name: archive.read(name) for name in archive.namelist() if name != "metadata"}
+    later = {name: f"rgbd/{int(Path(name).stem) + 1}{Path(name).suffix}" for name in whole}
+    made.members = {name: None for name in whole} | {later[name]: whole[name] for name in whole}
+    with pytest.raises(InputError, match="CAP-004.*each file is numbered from 1 to 20"):
+        open_recording(made.write(tmp_path / "a.r3d"))
+    made.members |= {"rgbd/20.jpg": None, "rgbd/20.depth": None}
+    assert open_recording(made.write(tmp_path / "a.r3d")).index.tolist() == list(range(1, 20))
+
+
+@pytest.mark.parametrize(
+    ("numbered", "what"),
+    [
+        (lambda number: str(number + 1), "poses.txt is numbered from 1 to 40"),
+        (lambda number: f"{number / 15:.4f}", "column 1 must be the frame's number"),
+    ],
+)
+def test_poses_of_other_frames_are_refused(tmp_path, numbered, what):
+    path = made_formats.video_and_depth(tmp_path / "a", walk(40))
+    rows = [row.split() for row in (path / "poses.txt").read_text().split("\n")]
+    text = "\n".join(" ".join([numbered(int(row[0])), *row[1:]]) for row in rows)
+    (path / "poses.txt").write_text(text)
+    with pytest.raises(InputError, match=f"CAP-004.*{what}"):
+        open_recording(path)
