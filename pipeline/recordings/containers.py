@@ -131,7 +131,7 @@ class FolderContainer(Container):
     def path(self, name: str) -> Path:
         """Return the path of a regular file. Raises CAP-001 for links, pipes and missing names."""
         if name not in self.names:
-            raise errors.damaged(self.place(name), "there is no such regular file")
+            raise errors.damaged(self.place(name), "there is no such file; links are not followed")
         return self._folder / name
 
     def read(self, name: str, max_bytes: int = MAX_MEMBER_BYTES) -> bytes:

@@ -62,9 +62,8 @@ def _meters_per_unit(table: dict[str, Any], container: Container) -> float:
         raise InputError("CAP-010", what, container.where, remedy)
     scale = table.get("integer_depth_scale")
     if not isinstance(scale, int | float) or not 0 < scale < 1:
-        raise errors.broken_metadata(
-            container.where, "'integer_depth_scale' (meters per unit of depth) is missing"
-        )
+        why = "'integer_depth_scale' (meters per unit of depth) is missing"
+        raise errors.broken_metadata(container.where, why)
     if LARGEST_UNIT * scale < MIN_REACH_M:
         what = f"depth beyond {LARGEST_UNIT * scale:.3g} m was written as if it were near"
         remedy = "stream again with a depth_scale of 10, if need be as the default of nerfcapture_dataset.py"

@@ -82,7 +82,8 @@ def open_recording(path: Path) -> Recording:
 def _camera(container: FolderContainer, name: str) -> dict[str, float]:
     try:
         table = container.table(name)
-        return {key: float(table[key]) for key in (*COEFFICIENTS, "width", "height", *MATRIX)}
+        camera = {key: float(table[key]) for key in (*COEFFICIENTS, *MATRIX)}
+        return camera | {key: int(table[key]) for key in ("width", "height")}
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise errors.broken_metadata(container.place(name), f"not a camera ({error!r})") from error
 

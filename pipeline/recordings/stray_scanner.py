@@ -3,7 +3,6 @@
 Timestamps are the odometry's (the video's are synthetic); focal lengths are per frame if available.
 """
 
-import csv
 import io
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,7 +48,7 @@ def open_recording(path: Path) -> Recording:
     rows = read_odometry(container.text("odometry.csv"), container.place("odometry.csv"))
     depth = container.numbered("depth")
     if not depth:
-        raise errors.no_depth(container.where, "the folder depth/ is empty")
+        raise errors.no_depth(container.where, "depth/ holds no numbered pictures (links are not followed)")
     complete = depth.keys() & set(movie.complete.tolist())
     valid = np.array([int(number) in complete for number in rows.frame], bool)
     if not valid.any():
@@ -90,7 +89,7 @@ def read_odometry(text: str, where: str) -> OdometryTable:
 
     Rows without a later time than all before, and a last one that was cut off, are left out.
     """
-    lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines())]
+    lines = [[cell.strip() for cell in row.split(",")] for row in text.splitlines()]
     lines = [row for row in lines if any(row)]
     header = tuple(cell.lower() for cell in lines[0]) if lines else ()
     if {"timestamp", *POSE} <= set(header):
@@ -106,6 +105,7 @@ def read_odometry(text: str, where: str) -> OdometryTable:
     except (ValueError, IndexError) as error:
         raise errors.broken_metadata(where, f"a row is cut or no numbers ({error})") from error
     timestamp_s = column.get("timestamp", np.arange(len(lines)))
+    timestamp_s = np.where(np.isfinite(timestamp_s), timestamp_s, np.nan)
     later = timestamp_s > np.fmax.accumulate(np.r_[-np.inf, timestamp_s[:-1]])
     if later.sum() < MIN_TIMED * len(lines):
         raise errors.broken_metadata(where, "the times must increase")

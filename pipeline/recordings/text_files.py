@@ -65,7 +65,9 @@ def read_intrinsics(
 def read_coefficients(container: Container, name: str) -> Float[np.ndarray, "4"]:
     """Read (fx, fy, cx, cy) from a file with these four numbers or a matrix. Raises CAP-004."""
     try:
-        numbers = np.array([float(cell) for cell in container.text(name).replace(",", " ").split()])
+        numbers = np.array(
+            [float(cell) for cell in " ".join(lines(container, name)).replace(",", " ").split()]
+        )
     except ValueError as error:
         raise errors.broken_metadata(container.place(name), "it holds more than numbers") from error
     if len(numbers) == 4:

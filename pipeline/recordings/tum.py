@@ -51,10 +51,10 @@ def open_recording(path: Path) -> Recording:
     present = np.array([set(pair) <= container.names for pair in pairs], bool)
     if not present.any():
         absent = [name for pair in pairs for name in pair if name not in container.names]
-        why = (
-            f"{len(absent)} of {2 * len(pairs)} listed files do not exist, e.g. {absent[0]}" if absent else ""
+        named = f"{len(absent)} of {2 * len(pairs)} listed files do not exist, e.g. {' '.join(absent[:1])}"
+        raise errors.no_frames(
+            container.where, named if absent else "no color picture has depth within 20 ms"
         )
-        raise errors.no_frames(container.where, why or "no color picture has depth within 20 ms")
     paired, pairs = paired[present], [pair for pair, there in zip(pairs, present, strict=True) if there]
     color_size, depth_size = container.color(pairs[0][0]).shape[:2], container.meters(pairs[0][1]).shape
     default = DEFAULT if color_size == DEFAULT_SIZE else None
@@ -103,7 +103,7 @@ def _listed(container: FolderContainer, name: str) -> list[tuple[float, str]]:
             time_s = float(cells[0])
             if not np.isfinite(time_s):
                 raise ValueError(time_s)
-            found.append((time_s, cells[1]))
+            found.append((time_s, cells[1].removeprefix("./")))
         except (ValueError, IndexError) as error:
             why = f"{line[:QUOTED]!r} is no time and file name"
             raise errors.broken_metadata(container.place(name), why) from error

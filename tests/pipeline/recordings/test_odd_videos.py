@@ -194,3 +194,54 @@ def test_poses_of_other_frames_are_refused(tmp_path, numbered, what):
     (path / "poses.txt").write_text(text)
     with pytest.raises(InputError, match=f"CAP-004.*{what}"):
         open_recording(path)
+
+
+@pytest.mark.parametrize("size", [100, 200_000])
+def test_zeros_after_the_odometry_cost_nothing(tmp_path, size):
+    """As after a copy that ended in a crash."""
+    path = made_formats.stray(tmp_path / "a", walk(12))
+    (path / "odometry.csv").write_bytes((path / "odometry.csv").read_bytes() + b"\n" + b"\0" * size)
+    assert len(open_recording(path).index) == 12
+
+
+def test_an_infinite_time_costs_its_row_only(tmp_path):
+    path = made_formats.stray(tmp_path / "a", walk(12))
+    rows = [row.split(", ") for row in (path / "odometry.csv").read_text().split("\n")]
+    rows[5][0] = "inf"
+    (path / "odometry.csv").write_text("\n".join(", ".join(row) for row in rows))
+    recording = open_recording(path)
+    assert recording.index.tolist() == [i for i in range(12) if i != 4]
+    assert np.isfinite(recording.timestamp_s).all()
+
+
+@pytest.mark.parametrize("width", ["NaN", "Infinity"])
+def test_polycam_pictures_of_impossible_size_are_refused(tmp_path, width):
+    path = made_formats.polycam(tmp_path / "a", walk(12))
+    file = sorted((path / "keyframes/cameras").iterdir())[3]
+    file.write_text(file.read_text().replace('"width": 48', f'"width": {width}'))
+    with pytest.raises(InputError, match="CAP-004.*not a camera"):
+        open_recording(path)
+
+
+def test_intrinsics_may_hold_comments(tmp_path):
+    made = walk(6)
+    path = made_formats.video_and_depth(tmp_path / "a", made)
+    (path / "intrinsics.txt").write_text("# fx fy cx cy\n" + (path / "intrinsics.txt").read_text())
+    np.testing.assert_allclose(open_recording(path).intrinsics[0], made.intrinsics)
+
+
+def test_tum_lists_may_name_files_from_here(tmp_path):
+    path = made_formats.tum(tmp_path / "a", walk(6))
+    for name in ("rgb", "depth"):
+        text = (path / f"{name}.txt").read_text()
+        (path / f"{name}.txt").write_text(text.replace(f" {name}/", f" ./{name}/"))
+    assert len(open_recording(path).index) == 6
+
+
+@pytest.mark.parametrize(("name", "code"), [("rgb.mp4", "CAP-001"), ("depth", "CAP-006")])
+def test_links_inside_a_recording_are_named_as_such(tmp_path, name, code):
+    path = made_formats.stray(tmp_path / "a", walk(6))
+    (path / name).rename(tmp_path / name)
+    (path / name).symlink_to(tmp_path / name)
+    with pytest.raises(InputError, match=f"{code}.*links are not followed"):
+        open_recording(path)
