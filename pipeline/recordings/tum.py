@@ -44,9 +44,10 @@ def open_recording(path: Path) -> Recording:
     ticks, depth_ticks = (np.array([time for time, _ in files]) for files in (color, depth_files))
     step = float(np.median(np.diff(ticks, prepend=ticks[0])))
     per_second = next((each for each in TIME_UNITS if step <= LONGEST_STEP_S * each), max(TIME_UNITS))
-    times = ticks / per_second
-    partner = partners(times, depth_ticks / per_second)
-    paired = np.flatnonzero(partner >= 0)
+    times, depth_times = ticks / per_second, depth_ticks / per_second
+    partner = partners(times, depth_times)
+    nearest = subsampling.nearest(times, depth_times[partner]) == np.arange(len(times))
+    paired = np.flatnonzero((partner >= 0) & nearest)  # no two color pictures have the same depth
     pairs = [(color[i][1], depth_files[partner[i]][1]) for i in paired]
     present = np.array([set(pair) <= container.names for pair in pairs], bool)
     if not present.any():

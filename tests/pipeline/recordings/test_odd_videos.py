@@ -245,3 +245,16 @@ def test_links_inside_a_recording_are_named_as_such(tmp_path, name, code):
     (path / name).symlink_to(tmp_path / name)
     with pytest.raises(InputError, match=f"{code}.*links are not followed"):
         open_recording(path)
+
+
+def test_tum_color_at_twice_the_rate_of_depth_is_that_of_its_time(tmp_path):
+    """Half of the color pictures are 13 ms before the nearest depth, 4 ms after another color picture."""
+    made = walk(40, rate_hz=60.0)
+    path = made_formats.tum(tmp_path / "a", made)
+    rows = (path / "depth.txt").read_text().split("\n")
+    (path / "depth.txt").write_text("\n".join(rows[2::2]))
+    recording = open_recording(path)
+    np.testing.assert_allclose(recording.timestamp_s, made.timestamp_s[1::2] - made.timestamp_s[1], atol=1e-5)
+    assert recording.incomplete == 0
+    for number in range(20):
+        np.testing.assert_allclose(recording.read_depth(number), made.depth(2 * number + 1), atol=1e-3)
