@@ -23,6 +23,69 @@ console.log(JSON.stringify(keys.map(asked)));
 """
 )
 
+REFUSED = (
+    READ.partition("const { keys }")[0].replace("readState", "defaults, writeState")
+    + """
+const { seeds } = JSON.parse(await new Response(process.stdin).text());
+const contract = { controls: { interactivity: {}, samples: {}, steps: {} } };
+let [written, refusals] = ['', 1];
+globalThis.location = { pathname: '/', search: '' };
+globalThis.history = {
+  replaceState: (state, title, address) => {
+    if (refusals-- > 0) throw new Error('SecurityError');
+    written += address;
+  },
+};
+for (const seed of seeds.slice(0, 1)) writeState({ ...defaults(contract), seed }, contract);
+const first = written;
+await new Promise((done) => setTimeout(done, 1500));
+const later = written;
+writeState({ ...defaults(contract), seed: seeds[1] }, contract);
+console.log(JSON.stringify([Number(first === '') + Number(later === '#seed=3'), Number(written.endsWith('#seed=4'))]));
+"""
+)
+FILMED = (
+    f"import {{ Film }} from '{SOURCES}/film.js';"
+    + """
+const { kinds } = JSON.parse(await new Response(process.stdin).text());
+const canvas = { captureStream: () => ({ getTracks: () => [] }) };
+let number = 0;
+class Recorder {
+  constructor(stream, { mimeType }) {
+    const name = ['first', 'second'][number++];
+    Object.assign(this, { stream, mimeType, name });
+  }
+  start() {}
+  stop() {
+    setTimeout(() => {
+      this.ondataavailable({ data: new Blob([this.name]) });
+      this.onstop();
+    });
+  }
+}
+globalThis.MediaRecorder = Recorder;
+const found = [];
+for (const kind of kinds) {
+  Recorder.isTypeSupported = (asked) => asked === kind;
+  number = 0;
+  const film = new Film(canvas);
+  film.start();
+  const stopped = film.stop();
+  film.start();
+  const { blob, ending } = await stopped;
+  found.push([ending, blob.type, await blob.text()]);
+}
+console.log(JSON.stringify(found));
+"""
+)
+NAMED = (
+    f"import {{ fileStem }} from '{SOURCES}/take.js';"
+    + """
+const { names } = JSON.parse(await new Response(process.stdin).text());
+console.log(JSON.stringify(names.map(fileStem)));
+"""
+)
+
 
 def test_markup_in_names_is_escaped():
     marks = "@@ASSETS@@ @@SCRIPT@@ @@NAME@@"
@@ -59,5 +122,29 @@ def test_positions_outside_the_room_are_ignored():
         "aim=99,99",
         "aim=1,0.5;0,-7",
         "route=0,0;3,0",
+        "at=1.5,0.5",
+        "at=99,99",
+        "at=1,0.5;0,0",
     ]
-    assert run_node(ASKED, keys=places).tolist() == [0, 0, 0, 1, 1, 1]
+    assert run_node(ASKED, keys=places).tolist() == [0, 0, 0, 1, 1, 1, 0, 1, 1]
+
+
+@needs_node
+def test_refused_addresses_are_written_later():
+    """Browsers refuse more than some hundred changes of the address in some seconds."""
+    assert run_node(REFUSED, seeds=[3, 4]).tolist() == [2, 1], "attempts; of them with the last seed written"
+
+
+@needs_node
+def test_films_are_named_after_what_the_browser_records():
+    """Safari records MP4. A film that is stopped is whole although the next one has begun."""
+    assert run_node(FILMED, kinds=["video/webm", "video/mp4"]).tolist() == [
+        ["webm", "video/webm", "first"],
+        ["mp4", "video/mp4", "first"],
+    ]
+
+
+@needs_node
+def test_files_are_named_after_animals_of_any_script():
+    names = ["M\u00e4uschen", "\u732b", "a/b: c", "luna-2"]
+    assert run_node(NAMED, names=names).tolist() == ["M\u00e4uschen", "\u732b", "a_b_c", "luna-2"]

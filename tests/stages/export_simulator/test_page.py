@@ -329,6 +329,10 @@ def _check_downloads(page: Page, folder: Path) -> None:
     np.testing.assert_allclose(place, np.stack([table[axis] for axis in "xyz"], -1), atol=2e-5)
     assert len(animation.channels) == 2 * (1 + small_world.BONES)
     assert len(trimesh.load(folder / "take.glb").geometry) == 1
+    page.evaluate("ats.reset()")
+    for kind in ("csv", "glb"):
+        page.click(f"#{kind}")
+        assert "nothing yet" in page.inner_text("#help"), "a model without keys would be invalid"
     page.evaluate("ats.play()")
 
 

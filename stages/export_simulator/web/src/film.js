@@ -1,6 +1,7 @@
-// A film of the view as WebM, from one press of the button to the next.
+// A film of the view, from one press of the button to the next: WebM or, where the browser records no WebM, MP4.
 
-const KINDS = ['video/webm;codecs=vp9', 'video/webm;codecs=vp8', 'video/webm'];
+const WEBM = 'video/webm';
+const KINDS = [`${WEBM};codecs=vp9`, `${WEBM};codecs=vp8`, WEBM, 'video/mp4'];
 
 export class Film {
   constructor(canvas) {
@@ -19,23 +20,25 @@ export class Film {
 
   start() {
     const mimeType = KINDS.find((kind) => MediaRecorder.isTypeSupported(kind));
-    this.pieces = [];
+    const pieces = [];
     this.recorder = new MediaRecorder(this.canvas.captureStream(30), {
       mimeType,
       videoBitsPerSecond: 6_000_000,
     });
+    this.pieces = pieces;
     this.recorder.ondataavailable = ({ data }) => {
-      if (data.size) this.pieces.push(data);
+      if (data.size) pieces.push(data);
     };
     this.recorder.start(1000);
   }
 
-  // The film as a blob.
+  // The film: {blob, ending of its file's name}.
   stop() {
-    const { recorder } = this;
+    const { recorder, pieces } = this;
+    const [type] = (recorder.mimeType || WEBM).split(';');
     this.recorder = null;
     return new Promise((done) => {
-      recorder.onstop = () => done(new Blob(this.pieces, { type: 'video/webm' }));
+      recorder.onstop = () => done({ blob: new Blob(pieces, { type }), ending: type.split('/')[1] });
       recorder.stop();
       recorder.stream.getTracks().forEach((track) => track.stop());
     });

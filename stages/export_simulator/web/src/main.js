@@ -28,7 +28,7 @@ import {
 } from './state.js';
 import { Stops, meters, placesText } from './stops.js';
 import { Tags } from './tags.js';
-import { save } from './take.js';
+import { fileStem, save } from './take.js';
 import { rootOf } from './timeline.js';
 
 const AGAIN_MS = 1000; // after a plan that failed, the next is asked for
@@ -116,6 +116,13 @@ class Simulator {
     if (this.state.moved) panel.help('The furniture you moved is not in this file: the link keeps it.', 6);
   }
 
+  // Save what the selected animal has done; a model without keys would be no valid file.
+  keepTake(written, ending) {
+    const { take, name } = this.selected;
+    if (!take.rows.length) return panel.help(`${name} has done nothing yet that can be kept.`, 4);
+    this.keep(written(take), `${this.fileName}.${ending}`);
+  }
+
   // Let the state say who is selected and what everybody does.
   appoint() {
     const doings = readDoings(this.state.does, this.contract) ?? {};
@@ -158,8 +165,8 @@ class Simulator {
       hold: (tool) => this.hold(tool),
       undo: () => this.mover.undo(),
       restore: () => this.mover.restore(),
-      csv: () => this.keep(this.selected.take.csv(), `${this.fileName}.csv`),
-      glb: () => this.keep(this.selected.take.glb(this.selected.model), `${this.fileName}.glb`),
+      csv: () => this.keepTake((take) => take.csv(), 'csv'),
+      glb: () => this.keepTake((take) => take.glb(this.selected.model), 'glb'),
       film: () => this.shoot(),
       toml: () => this.keep(this.selected.stops.toml, `${this.fileName}_subgoals.toml`),
       link: panel.copyLink,
@@ -393,7 +400,7 @@ class Simulator {
   }
 
   get fileName() {
-    return `${this.selected.name.replace(/[^\w-]+/g, '_')}_seed${this.state.seed}`;
+    return `${fileStem(this.selected.name)}_seed${this.state.seed}`;
   }
 
   eyes() {
@@ -406,7 +413,8 @@ class Simulator {
       return panel.showFilm(true, true);
     }
     panel.showFilm(false, true);
-    save(await this.film.stop(), `${this.fileName}.webm`);
+    const { blob, ending } = await this.film.stop();
+    save(blob, `${this.fileName}.${ending}`);
   }
 
   // A take of `stages.simulate` plays beside, as a recorded clip does.

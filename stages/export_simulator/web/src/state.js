@@ -4,6 +4,7 @@ export const SPEEDS = [1, 0.3]; // seconds of the animal's life a second
 export const VIEWS = ['room', 'animal', 'you'];
 export const AWAY = 'off'; // what an animal does that is switched off
 const LARGEST_SEED = 999999;
+const AGAIN_MS = 1000; // after which an address is written that the browser refused
 const SWITCHES = ['scene', 'observer', 'companions', 'past', 'goal', 'goals', 'path', 'outline'];
 
 // Every setting with its default; those of the behavior model come with the contract.
@@ -55,7 +56,7 @@ export function readState(contract, clips, hash = location.hash) {
     replay: (text) => (clips.some((clip) => clip.name === text) ? text : null),
     aim: places,
     route: places,
-    at: (text) => (readPoint(text) ? text : null),
+    at: (text) => (readPlaces(text).length === 1 ? places(text) : null),
     animal: among((contract.animals ?? []).map(({ name }) => name)),
     does: (text) => (readDoings(text, contract) ? text : null),
     moved: (text) => (readMoves(text).length ? text : null),
@@ -74,7 +75,13 @@ export function writeState(state, contract) {
   const usual = defaults(contract);
   const changed = Object.entries(state).filter(([key, value]) => key in usual && value !== usual[key]);
   const hash = new URLSearchParams(changed.map(([key, value]) => [key, String(value)])).toString();
-  history.replaceState(null, '', hash ? `#${hash}` : location.pathname + location.search);
+  clearTimeout(writeState.again);
+  try {
+    history.replaceState(null, '', hash ? `#${hash}` : location.pathname + location.search);
+  } catch {
+    // Safari and Firefox allow only so many changes in some seconds, as a dragged slider makes
+    writeState.again = setTimeout(() => writeState(state, contract), AGAIN_MS);
+  }
 }
 
 // 'name:off,name:clip,...', what animals do instead of living, to an object; null where it is something else.

@@ -81,6 +81,9 @@ export class Take {
   }
 }
 
+// A name as part of a file's name: letters and digits of any script.
+export const fileStem = (name) => name.replace(/[^\p{L}\p{M}\p{N}_-]+/gu, '_');
+
 export function save(blob, name) {
   const link = Object.assign(document.createElement('a'), {
     href: URL.createObjectURL(blob),
