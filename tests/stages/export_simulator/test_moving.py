@@ -109,6 +109,20 @@ def _check_refusals(page: Page, before: Any) -> None:
     assert page.evaluate("Math.hypot(...ats.furniture().held.by)") == 1, "one voxel"
     page.keyboard.press("Escape")
     assert page.evaluate("ats.furniture()") == before
+    _check_a_tool_put_away_while_dragging(page, before)
+
+
+def _check_a_tool_put_away_while_dragging(page: Page, before: Any) -> None:
+    """The piece goes back, the rest of the drag does nothing, and the view can be turned again."""
+    page.keyboard.press("m")
+    page.mouse.move(*page.evaluate("p => ats.screen(p)", TOP))
+    page.mouse.down()
+    page.mouse.move(*page.evaluate("p => ats.screen(p)", [TOP[0] - 0.5, *TOP[1:]]), steps=3)
+    assert page.evaluate("ats.furniture().held") is not None
+    page.keyboard.press("Escape")
+    page.mouse.move(*page.evaluate("p => ats.screen(p)", [TOP[0] - 0.9, *TOP[1:]]), steps=3)
+    page.mouse.up()
+    assert page.evaluate("ats.furniture()") == before
 
 
 def test_animal_and_person_walk_around_moved_furniture(furnished: Path, chromium: Browser) -> None:

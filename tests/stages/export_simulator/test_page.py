@@ -288,6 +288,13 @@ def _check_a_drawn_path(page: Page) -> None:
     page.click("#pen")
     page.mouse.move(*page.evaluate("p => ats.screen(p)", stroke[0].tolist()))
     page.mouse.down()
+    page.mouse.move(*page.evaluate("p => ats.screen(p)", stroke[-1].tolist()), steps=4)
+    page.keyboard.press("Escape")
+    page.mouse.up()
+    assert page.evaluate("ats.state().route") is None, "a stroke that was given up"
+    page.click("#pen")
+    page.mouse.move(*page.evaluate("p => ats.screen(p)", stroke[0].tolist()))
+    page.mouse.down()
     for point in stroke[1:]:
         page.mouse.move(*page.evaluate("p => ats.screen(p)", point.tolist()))
     page.mouse.up()
@@ -387,6 +394,12 @@ def test_keys_work_while_the_panel_has_focus(simulator: Path, chromium: Browser)
             "space is the box's"
         )
         _check_a_key_walks(page, "ArrowUp")
+        page.locator("#view").focus()
+        for _ in range(2):
+            page.keyboard.down("Space")
+        page.keyboard.up("Space")
+        assert page.inner_text("#play") == "go on", "once, although the key repeats"
+        page.keyboard.press("Space")
         page.locator("#seed").focus()
         page.keyboard.down("w")
         _check_nobody_walks(page)

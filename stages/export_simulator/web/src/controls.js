@@ -69,8 +69,10 @@ export class Controls {
       this.down.set(event.code, key);
       event.preventDefault();
     } else if (key === ' ') {
-      this.on.play();
+      if (!event.repeat) this.on.play();
       event.preventDefault();
+    } else if (event.repeat) {
+      // what follows happens once, however long a key is held
     } else if (key === 'r') this.on.reset();
     else if (key === 'h' || key === '?') this.on.how();
     else if (key === 'c') this.on.call();
@@ -112,9 +114,10 @@ export class Controls {
     this.room.canvas.setPointerCapture(event.pointerId);
   }
 
-  // A second finger means that the view is to be moved.
+  // Let go of what the pointer does: a second finger means that the view is to be moved.
   cancel() {
     if (this.lifted !== null) this.on.release(false);
+    if (this.stroke) this.on.stroke(null);
     Object.assign(this, { press: null, dragging: false, stroke: null, lifted: null });
     this.room.orbit.enabled = true;
   }

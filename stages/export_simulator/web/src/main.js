@@ -184,7 +184,7 @@ class Simulator {
       how: panel.howTo,
       announce: () => panel.say(this.whereabouts()),
       ...this.mover.hands,
-      stroke: (points) => this.selected.overlays.ask(points),
+      stroke: (points) => (points ? this.selected.overlays.ask(points) : this.showCommands()),
       drawn: (points) => this.follow(points),
       carry: (point) => {
         this.observer.target = point;
@@ -385,6 +385,7 @@ class Simulator {
   // Take a tool in hand, 'pen' or 'pins', or put away the one that is held.
   hold(tool) {
     if (this.mover.held) this.mover.cancel();
+    this.controls.cancel();
     this.controls.tool = this.controls.tool === tool ? null : tool;
     panel.showTool(this.controls.tool);
   }

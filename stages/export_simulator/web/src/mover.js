@@ -115,6 +115,7 @@ export class Mover {
 
   // Carry it to where the pointer is on the floor, or by voxels.
   drag([x, z]) {
+    if (!this.held) return; // a key has set it down
     const { from, grasp } = this.held;
     const { voxel } = this.furniture.grid;
     this.held.by = [
@@ -145,6 +146,7 @@ export class Mover {
   // Set it down. Where that cannot be it goes back to where it was taken up.
   drop() {
     const { held } = this;
+    if (!held) return;
     const refused = this.refusal(held);
     this.cancel();
     if (String(held.by) === String(held.from)) return;
@@ -281,6 +283,7 @@ export class Mover {
   read(entries) {
     const { grid, owner, pieces } = this.furniture;
     const before = this.text;
+    if (this.held) this.cancel();
     this.by.clear();
     this.past = [];
     let lost = 0;
