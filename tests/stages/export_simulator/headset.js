@@ -29,6 +29,7 @@
       Object.assign(this.renderState, state);
     }
     async requestReferenceSpace(kind) {
+      if (headset.refuses) throw new Error('no floor');
       headset.asked.push(kind);
       queueMicrotask(() => {
         const event = new Event('inputsourceschange');

@@ -148,6 +148,13 @@ def test_headset_controls_the_person(simulator: Path, chromium: Browser) -> None
     address = (simulator / "index.html").as_uri()
     with browser.shown(chromium, address, script=HEADSET) as (page, wrong):
         before = page.evaluate("ats.state()")
+        page.evaluate("headset.refuses = true")
+        page.click("#headset")
+        page.wait_for_function("document.querySelector('#help').textContent.includes('no floor')")
+        assert page.evaluate("headset.session.ended"), "nobody is left in an empty headset"
+        _frames(page, 2)
+        assert np.allclose(page.evaluate("ats.state().eye"), before["eye"], atol=1e-2), "meters"
+        page.evaluate("headset.refuses = false")
         page.click("#headset")
         page.wait_for_function("ats.state().headset && headset.asked[0] === 'local-floor'")
         _frames(page, 6)
@@ -173,10 +180,13 @@ def test_headset_controls_the_person(simulator: Path, chromium: Browser) -> None
         page.evaluate("headset.session.hand.gamepad.axes = [0, 0, 0, 1]")
         _frames(page, 6)
         assert np.linalg.norm(np.subtract(page.evaluate("ats.state().observer"), stepped["observer"])) > 0.05
+        page.set_viewport_size({"width": 640, "height": 360})
         page.evaluate("headset.session.end()")
         page.wait_for_function("!ats.state().headset")
         _frames(page, 2)
         assert np.allclose(page.evaluate("ats.state().eye"), before["eye"], atol=1e-2), "meters"
+        drawn = page.evaluate("[view.width, view.height].map((size) => size / ats.state().pixelRatio)")
+        assert np.allclose(drawn, [640, 360], atol=2), "pixels of a window whose size changed meanwhile"
         assert wrong == []
 
 

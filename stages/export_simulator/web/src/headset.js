@@ -25,6 +25,8 @@ export class Headset {
     Object.assign(this, { room, observer, floor, on, eye: observer.eye, presenting: false });
     this.rig = new THREE.Group();
     this.hands = [0, 1].map((index) => this.hand(room.renderer.xr.getController(index)));
+    // after three.js has restored what it changed, the size of the canvas among it
+    room.renderer.xr.addEventListener('sessionend', () => this.left());
   }
 
   hand(controller) {
@@ -51,7 +53,6 @@ export class Headset {
     if (this.presenting) return this.session.end();
     const { renderer, scene, camera, cutaway } = this.room;
     this.session = await navigator.xr.requestSession('immersive-vr', { requiredFeatures: ['local-floor'] });
-    this.session.addEventListener('end', () => this.left());
     this.before = { place: camera.position.clone(), turn: camera.quaternion.clone(), fov: camera.fov };
     this.rig.position.set(this.observer.place[0], this.floor, this.observer.place[1]);
     const { animal, place } = this.observer;
@@ -64,7 +65,12 @@ export class Headset {
     cutaway.uniforms.cutRadius.value = 0;
     renderer.xr.enabled = true;
     renderer.xr.setReferenceSpaceType('local-floor');
-    await renderer.xr.setSession(this.session);
+    try {
+      await renderer.xr.setSession(this.session);
+    } catch (error) {
+      await this.session.end().catch(() => {}); // it may have ended by itself
+      throw error;
+    }
     this.presenting = true;
     this.tracked = false;
     this.on.change(true);
@@ -79,6 +85,7 @@ export class Headset {
     camera.quaternion.copy(this.before.turn);
     camera.fov = this.before.fov;
     this.observer.eye = this.eye;
+    renderer.setPixelRatio(this.room.steadiness.ratio);
     this.room.resize();
     this.on.change(false);
   }
