@@ -130,6 +130,9 @@ def test_page_is_accessible_to_screen_readers(simulator: Path, chromium: Browser
     """Controls have names; position and arrival of the animal are announced."""
     with browser.shown(chromium, (simulator / "index.html").as_uri()) as (page, wrong):
         assert page.evaluate(NAMELESS) == []
+        page.keyboard.press("Tab")
+        assert page.evaluate("document.activeElement.id") == "view"
+        assert page.evaluate("getComputedStyle(view).outlineStyle") == "solid", "one sees where the focus is"
         page.locator("#view").press("l")
         x, _, z = page.evaluate("ats.state().animal")[:3]
         distance = np.hypot(*np.subtract([x, z], page.evaluate("ats.state().observer")))

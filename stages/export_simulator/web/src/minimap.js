@@ -106,14 +106,19 @@ export class Minimap {
   cross([x, z]) {
     const { pen } = this;
     const [px, py] = this.pixel(x, z);
-    pen.strokeStyle = '#2d2b28';
-    pen.lineWidth = 2.5;
     pen.beginPath();
     for (const side of [-1, 1]) {
       pen.moveTo(px - 6, py - 6 * side);
       pen.lineTo(px + 6, py + 6 * side);
     }
-    pen.stroke();
+    // the rim is seen on a dark page
+    for (const [color, width] of [
+      ['#fff', 5],
+      ['#2d2b28', 2.5],
+    ]) {
+      Object.assign(pen, { strokeStyle: color, lineWidth: width });
+      pen.stroke();
+    }
   }
 
   // A round body with a nose for the animal, a triangle for the person; both point where they look.

@@ -62,12 +62,9 @@ export class Room {
       this.redraw();
     });
     this.renderer.localClippingEnabled = true;
-    const [most, least, wanted] = PIXELS[this.software ? 'software' : 'graphics'];
-    this.steadiness = new Steadiness(
-      this.software ? most : Math.min(most, devicePixelRatio),
-      least,
-      wanted,
-      (ratio) => this.renderer.setPixelRatio(ratio),
+    const [, least, wanted] = this.pixels;
+    this.steadiness = new Steadiness(this.mostPixels, least, wanted, (ratio) =>
+      this.renderer.setPixelRatio(ratio),
     );
     this.renderer.setPixelRatio(this.steadiness.ratio);
     this.scene = new THREE.Scene();
@@ -97,6 +94,16 @@ export class Room {
   // Draw the still of the room anew.
   redraw() {
     if (this.backdrop) this.backdrop.key = '';
+  }
+
+  get pixels() {
+    return PIXELS[this.software ? 'software' : 'graphics'];
+  }
+
+  // Drawn per pixel at most, on the screen where the window is now.
+  get mostPixels() {
+    const [most] = this.pixels;
+    return this.software ? most : Math.min(most, devicePixelRatio);
   }
 
   // The longer side of the room, meters.
@@ -295,6 +302,7 @@ export class Room {
   resize() {
     if (this.renderer.xr.isPresenting) return; // a headset has a size of its own
     const [width, height] = [innerWidth, innerHeight];
+    this.steadiness.most = this.mostPixels;
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
     // Leave the panel's side free: look a little to the right of the middle.
