@@ -86,6 +86,20 @@ console.log(JSON.stringify(names.map(fileStem)));
 """
 )
 
+VISITED = (
+    f"import {{ Stops }} from '{SOURCES}/stops.js';"
+    + """
+const { visits } = JSON.parse(await new Response(process.stdin).text());
+const points = [[1, 0, 0.5], [0, 0], [1, 0, 0.5]];
+const stops = new Stops(points, null, (point) => 0.2 + (point[2] ?? 0));
+const reached = visits.map((place, i) => {
+  if (i === 4) stops.clear(points[2], [1.5, 0.2, 0]);
+  return Number(stops.visit(place));
+});
+console.log(JSON.stringify(reached));
+"""
+)
+
 
 def test_markup_in_names_is_escaped():
     marks = "@@ASSETS@@ @@SCRIPT@@ @@NAME@@"
@@ -148,3 +162,10 @@ def test_films_are_named_after_what_the_browser_records():
 def test_files_are_named_after_animals_of_any_script():
     names = ["M\u00e4uschen", "\u732b", "a/b: c", "luna-2"]
     assert run_node(NAMED, names=names).tolist() == ["M\u00e4uschen", "\u732b", "a_b_c", "luna-2"]
+
+
+@needs_node
+def test_goals_on_furniture_are_not_reached_from_beneath():
+    """Goals are on a table 0.5 m above the floor, on the floor, and again on the table, beside which a plan ends."""
+    visits = [[1, 0.2, 0], [1, 0.6, 0], [0, 0.2, 0], [1, 0.2, 0], [1.5, 0.2, 0.1]]
+    assert run_node(VISITED, visits=visits).tolist() == [0, 1, 1, 0, 1]

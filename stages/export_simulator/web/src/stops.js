@@ -27,16 +27,19 @@ export class Stops {
   }
 
   // Note where the animal arrives that goes to a stop: in furniture it may not be.
-  clear(stop, [x, , z]) {
-    this.nearest.set(stop, [x, z]);
+  clear(stop, place) {
+    this.nearest.set(stop, place);
   }
 
-  // Note where the animal is; true when a stop has just been reached.
-  visit([x, , z]) {
-    const goal = this.nearest.get(this.next) ?? this.next;
-    const near = goal && Math.hypot(goal[0] - x, goal[1] - z) < ARRIVED_M;
+  // Note where the root is; true when a stop has just been reached: one on furniture not from beneath.
+  visit([x, y, z]) {
+    const { next } = this;
+    if (!next) return false;
+    const goal = this.nearest.get(next) ?? [next[0], next[2] ? this.rootAt(next) : y, next[1]];
+    const level = !next[2] || Math.abs(goal[1] - y) < ARRIVED_M;
+    const near = level && Math.hypot(goal[0] - x, goal[2] - z) < ARRIVED_M;
     if (near) this.reached += 1;
-    return Boolean(near);
+    return near;
   }
 
   // A goal as the file has it: on the floor without a height, on furniture with the root's.
