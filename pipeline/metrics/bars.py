@@ -1,20 +1,20 @@
 """Comparison of the metrics of `metrics.json` with the targets of this project.
 
-A bar is a limit, or another metric to beat. Metrics that were not measured have a reason.
+A bar is a limit, or another metric to beat. Metrics that were not measured have a reason; those that failed
+miss their bar.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from pipeline.data.qa import Check
 from pipeline.metrics.intervals import finite
+from pipeline.metrics.metrics import FAILED, Metrics
+from pipeline.metrics.words import SUBJECTS
 
 Verdict = Literal["ok", "fail", "none"]
-BASELINES = (
-    ("location_prior", "the location prior"),
-    ("stand_still", "standing still"),
-    ("constant_velocity", "constant velocity"),
-)
+BASELINES = ("location_prior", "stand_still", "constant_velocity")
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ class Judged:
 def beaten(metric: str, words: str) -> list[Bar]:
     """Return bars for our metric to be below that of every simple baseline."""
     return [
-        Bar(metric, f"{words}: below {baseline}", "lower", metric.replace("/ats/", f"/{key}/"), "m")
-        for key, baseline in BASELINES
+        Bar(metric, f"{words}: below {SUBJECTS[key]}", "lower", metric.replace("/ats/", f"/{key}/"), "m")
+        for key in BASELINES
     ]
 
 
@@ -86,10 +86,20 @@ def _judged(bar: Bar, metrics: Mapping[str, float | None], reasons: Mapping[str,
         other = finite(metrics.get(limit))
         limit = None if other is None else bar.factor * other
     if value is None or limit is None:
-        missing = bar.metric if value is None else str(bar.limit)
-        return Judged(bar, value, limit, "none", reasons.get(missing, "not measured"))
+        reason = reasons.get(bar.metric if value is None else str(bar.limit), "not measured")
+        failed = value is None and reason.startswith(FAILED)
+        return Judged(bar, value, limit, "fail" if failed else "none", reason)
     holds = {"<": value < limit, "≤": value <= limit, "≥": value >= limit}[bar.sign]
     return Judged(bar, value, limit, "ok" if holds else "fail", "")
+
+
+def checks(metrics: Metrics, *begin: str) -> list[Check]:
+    """Return the bars of metrics whose names begin so as checks; none for what was not measured."""
+    return [
+        Check(row.bar.metric, row.value, row.bar.unit, row.limit, better=row.bar.better)
+        for row in judge(metrics.values, metrics.reasons)
+        if row.verdict != "none" and row.bar.metric.startswith(begin)
+    ]
 
 
 def worst(judged: Sequence[Judged]) -> Literal["ok", "fail"]:

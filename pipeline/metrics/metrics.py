@@ -3,14 +3,16 @@
 import json
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
-from pipeline.data.qa import Check
 from pipeline.metrics.intervals import Interval, names_of
+
+FAILED = "failed: "
+"""Begins the reason of a metric that would be infinite, because what it measures failed too often."""
 
 
 @dataclass(frozen=True)
@@ -25,11 +27,11 @@ class Metrics:
     """drawn from numbers alone, by caption"""
 
     def put(self, name: str, value: float, why_unknown: str = "too few frames could be measured") -> None:
-        """Record a metric; if it is not finite, None with the given reason."""
+        """Record a metric; None with the given reason if it is NaN, or infinite, which is a failure."""
         if math.isfinite(value):
             self.values[name] = float(value)
         else:
-            self.skip([name], why_unknown)
+            self.skip([name], (FAILED if math.isinf(value) else "") + why_unknown)
 
     def put_mean(self, name: str, interval: Interval) -> None:
         """Record a mean with the bounds of its 95 % interval."""
@@ -56,11 +58,6 @@ class Metrics:
         self.reasons.update(other.reasons)
         self.pictures.update(other.pictures)
         self.charts.update(other.charts)
-
-    def judged(self, limits: Iterable[Check]) -> list[Check]:
-        """Return the checks with their metrics as values, without those not measured."""
-        known = [limit for limit in limits if self.values.get(limit.name) is not None]
-        return [replace(limit, value=self.values[limit.name]) for limit in known]
 
     @classmethod
     def read(cls, folder: Path) -> "Metrics":

@@ -62,6 +62,7 @@ STEMS = {
     "ssim": "SSIM",
     "test_windows": "test windows",
     "translation": "position error",
+    "unknown_share": "share of the animal's pixels that masks leave unknown",
     "videos_registered": "sessions registered",
     "videos_total": "sessions",
     "within_2deg_5cm_share": "share within 2 deg and 5 cm",

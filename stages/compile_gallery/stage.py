@@ -13,6 +13,7 @@ from PIL import Image
 from pipeline.core.errors import InputError
 from pipeline.data import qa
 from pipeline.metrics import bars, words
+from pipeline.metrics.metrics import Metrics
 
 _WORDS = {"ok": "all checks fine", "warn": "checks to look at", "fail": "checks failed", "none": "no checks"}
 PICTURES = ("*simulator/qa/visits*.webp", "simulator/qa/heat_maps.webp", "splats/qa/frames.webp")
@@ -91,8 +92,9 @@ def card(folder: Path, root: Path) -> Card:
     contract = json.loads((folder / simulator / "simulator.json").read_bytes())
     files = [*folder.glob("*/qa.json"), *folder.glob("*/*/qa.json")]
     states = [check["status"] for file in files for check in json.loads(file.read_bytes())["checks"]]
-    file = folder / "evaluation/metrics.json"
-    metrics = json.loads(file.read_bytes()) if file.is_file() else {}
+    evaluation = folder / "evaluation"
+    metrics = Metrics.read(evaluation) if (evaluation / "metrics.json").is_file() else Metrics()
+    states += [bars.worst(bars.judge(metrics.values, metrics.reasons))] if states else []
     pictures = [file for name in PICTURES for file in sorted(folder.glob(name))]
     pages = [(_SIMULATORS[simulator], folder / simulator / "index.html")]
     pages.append(("report", folder / "report/index.html"))
@@ -100,13 +102,16 @@ def card(folder: Path, root: Path) -> Card:
     pages += [(f"in the home of {home.parents[1].name}", home) for home in homes]
     checks = json.loads((folder / simulator / "qa.json").read_bytes())["checks"]
     figures = [Figure(one["name"], one["value"], one["unit"]) for one in checks if one["name"] in _CHECKS]
-    measured = [(words.describe(key), value) for key in METRICS if (value := metrics.get(key)) is not None]
+    known = ((key, metrics.values.get(key)) for key in METRICS)
+    measured = [(words.describe(key), value) for key, value in known if value is not None]
     figures += [Figure(found.text, value, found.unit) for found, value in measured]
     return Card(
         name=folder.name if folder.parent.name == "animals" else str(contract["name"]),
         folder=folder.relative_to(root).as_posix(),
         thumbnail=_thumbnail(pictures[0]) if pictures else None,
-        status=qa.worst([*states, bars.worst(bars.judge(metrics, {}))]) if states else "none",
+        status=qa.worst([*states, bars.worst(bars.judge(metrics.values, metrics.reasons))])
+        if states
+        else "none",
         figures=tuple(figures),
         links=tuple(Link(to, page.relative_to(root).as_posix()) for to, page in pages if page.is_file()),
         home=simulator == "home_simulator",

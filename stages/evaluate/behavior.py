@@ -25,12 +25,6 @@ Scores = dict[str, Float[np.ndarray, "window"]]
 """Scores of one method by the names of `SCORES`"""
 
 
-def baselines(data: BehaviorData) -> dict[str, Predictor]:
-    """Fit the simple baselines to the training windows."""
-    context, future = data.windows(data.indices(TRAIN), bones=False)
-    return {name: method.fit(context, future) for name, method in BASELINES.items()}
-
-
 def behavior_metrics(data: BehaviorData, ours: Predictor, config: Config) -> Metrics:
     """Score all methods on the test windows, with intervals, and intervals of paired differences."""
     metrics, test = Metrics(), data.indices(TEST)
@@ -46,10 +40,9 @@ def behavior_metrics(data: BehaviorData, ours: Predictor, config: Config) -> Met
     metrics.put("behavior/plan_windows", len(plans))
     metrics.put("behavior/plan_trials", 1)
     episode = episodes(data.start[test], data.video[test], data.past + data.future)
-    judged = {
-        name: _scores(method, data, test, test[plans], config)
-        for name, method in ({OURS: ours} | baselines(data)).items()
-    }
+    known = data.windows(data.indices(TRAIN), bones=False)
+    methods = {OURS: ours} | {name: baseline.fit(*known) for name, baseline in BASELINES.items()}
+    judged = {name: _scores(each, data, test, test[plans], config) for name, each in methods.items()}
     episode_of = {name: episode if name in GOAL_SCORES else episode[plans] for name in SCORES}
     _report(metrics, judged, episode_of, config)
     return metrics

@@ -26,6 +26,8 @@ class Overlaps:
     resting: Bool[np.ndarray, "frame"]
     confidence: Float[np.ndarray, "frame"]
     """that the masks report"""
+    unknown: Float[np.ndarray, "frame"]
+    """share of the true agent's pixels that the mask calls unknown, which the overlap leaves out"""
     swapped: Bool[np.ndarray, "frame"] | None = None
     """whether the mask covers more of the other animals than of the agent; None where there are no others"""
 
@@ -42,19 +44,21 @@ def overlaps(masks: Masks, truth: RecordingTruth) -> Overlaps:
         union = ((ours | true) & counts).sum()
         iou = (ours & true & counts).sum() / union if union else 0.0
         others = 0 if truth.others is None else (ours & truth.others[frame]).sum()
-        rows.append((iou, not truth.moving[frame], masks.confidence[frame], others > (ours & true).sum()))
-    iou, resting, confidence, swapped = np.array(rows, float).reshape(-1, 4).T
-    return Overlaps(iou, resting > 0, confidence, None if truth.others is None else swapped > 0)
+        unknown, swapped = mean(~counts[true]), others > (ours & true).sum()
+        rows.append((iou, not truth.moving[frame], masks.confidence[frame], unknown, swapped))
+    iou, resting, confidence, unknown, swapped = np.array(rows, float).reshape(-1, 5).T
+    return Overlaps(iou, resting > 0, confidence, unknown, None if truth.others is None else swapped > 0)
 
 
 def mask_metrics(sessions: Sequence[Overlaps], turnaround: Overlaps | None) -> Metrics:
     """Summarize overlaps of all sessions; the turnaround, which is easier, is separate."""
-    metrics, none = Metrics(), [Overlaps(np.zeros(0), np.zeros(0, bool), np.zeros(0))]
-    iou, resting, confidence = (
+    metrics, none = Metrics(), [Overlaps(np.zeros(0), np.zeros(0, bool), np.zeros(0), np.zeros(0))]
+    iou, resting, confidence, unknown = (
         np.concatenate([getattr(each, name) for each in sessions or none])
-        for name in ("iou", "resting", "confidence")
+        for name in ("iou", "resting", "confidence", "unknown")
     )
     metrics.put("masks/iou_mean", mean(iou), "the animal is never visible")
+    metrics.put("masks/unknown_share", mean(unknown[np.isfinite(unknown)]), "the animal is never visible")
     metrics.put("masks/iou_resting", mean(iou[resting]), "the animal never rests in view")
     swapped = [each.swapped for each in sessions if each.swapped is not None]
     if swapped:
@@ -110,9 +114,8 @@ def people_metrics(
         metrics.put("people/position_median_m", median(error[found]), "nobody was found")
         metrics.put("people/heading_known", mean(known), "nobody was found")
         metrics.put("people/heading_median_deg", median(turn[known]), "nobody walks")
-        metrics.put(
-            "people/height_median_m", median(height[np.isfinite(height)]), "no head is ever in the picture"
-        )
+        height = height[np.isfinite(height)]
+        metrics.put("people/height_median_m", median(height), "no head is ever in the picture")
         share = unseen / tracked_frames if tracked_frames else np.nan
         metrics.put("people/unseen", share, "nobody was found")
     return metrics
@@ -130,10 +133,8 @@ def flow_metrics(sessions: Sequence[ComparedFlow]) -> Metrics:
     metrics, why = Metrics(), "no truth for neighboring frames"
     ours, zero, agent = [], [], []
     for found, true, masks in sessions:
-        stride = masks.shape[1] // found.shape[1]
-        covered = masks[:, stride // 2 :: stride, stride // 2 :: stride][
-            :, : found.shape[1], : found.shape[2]
-        ]
+        stride, (rows, columns) = masks.shape[1] // found.shape[1], found.shape[1:3]
+        covered = masks[:, stride // 2 :: stride, stride // 2 :: stride][:, :rows, :columns]
         for first, flow in zip(true.first, true.flow, strict=True):
             known = np.isfinite(flow).all(-1)
             error = np.linalg.norm(found[first].astype(np.float32) - flow, axis=-1)

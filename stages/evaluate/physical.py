@@ -2,13 +2,15 @@
 slide.
 
 Both are measured in the same test windows, at 30 fps, with contact vertices that were found in the training
-sessions. The foot that moves least, of those near the scene, should stand; its speed is the slide.
+sessions. The foot that moves least, of those near the scene, should stand; its speed is the slide. Where the
+recorded animal has a foot near the scene and the planned one never does, the slide is infinite.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.baselines.predictors import Predictor
 from pipeline.behavior.trajectories import RATE_HZ, TEST, TRAIN, BehaviorData
@@ -22,10 +24,11 @@ from pipeline.metrics.metrics import Metrics, median
 
 WINDOWS = 48
 """Test windows that are scored; of 16, foot skate varies by a quarter from one draw to the next."""
-MEASURES = ("penetration_m", "foot_slide_m_s", "non_collision_share", "contact_share")
+MEANS = {"penetration_m": "penetration_m", "non_collision_share": "non_collision", "contact_share": "contact"}
+"""Metrics that are averaged over windows, with the attribute of `Plausibility` of each."""
 NAMES = (
     "behavior/physical_windows",
-    *(f"behavior/{kind}/{measure}" for kind in ("recorded", "ats") for measure in MEASURES),
+    *(f"behavior/{kind}/{measure}" for kind in ("recorded", "ats") for measure in (*MEANS, "foot_slide_m_s")),
 )
 
 
@@ -48,21 +51,23 @@ def physical_metrics(data: BehaviorData, ours: Predictor, reconstruction: Path, 
     rotation, path, bones = made.rotation, made.path, made.agent_from_bone
     assert rotation is not None and path is not None and bones is not None, "whole plans are judged"
     planned = rigid.make(rotation[:, 0], path[:, 0]), bones[:, 0]
+    slide = {}
     for kind, pair in (("recorded", (future.world_from_agent, future.agent_from_bone)), ("ats", planned)):
-        _put(metrics, kind, meter, [BodyMotion(*motion) for motion in zip(*pair, strict=True)])
+        motions = [BodyMotion(*motion) for motion in zip(*pair, strict=True)]
+        slide[kind] = _put(metrics, kind, meter, motions)
+    stands = np.isfinite(slide["recorded"])
+    for kind, why in (("recorded", "no foot comes near the scene"), ("ats", "most plans have none near it")):
+        counted = np.nan_to_num(slide[kind][stands], nan=np.inf)
+        metrics.put(f"behavior/{kind}/foot_slide_m_s", median(counted), why)
     return metrics
 
 
-def _put(metrics: Metrics, kind: str, meter: PlausibilityMeter, motions: Sequence[BodyMotion]) -> None:
+def _put(
+    metrics: Metrics, kind: str, meter: PlausibilityMeter, motions: Sequence[BodyMotion]
+) -> Float[np.ndarray, "window"]:
+    """Put means over windows, and return the slide in each; NaN where no foot comes near the scene."""
     resampled = [resample_motion(np.arange(len(motion)) / RATE_HZ, motion) for motion in motions]
     found = [meter.plausibility(motion, meter.stance(motion)) for motion in resampled]
-    slide = np.array([each.min_slide_m_s for each in found])
-    no_foot = "no foot ever comes near the scene"
-    metrics.put(f"behavior/{kind}/foot_slide_m_s", median(slide[np.isfinite(slide)]), no_foot)
-    means = {
-        "penetration_m": "penetration_m",
-        "non_collision_share": "non_collision",
-        "contact_share": "contact",
-    }
-    for measure, name in means.items():
+    for measure, name in MEANS.items():
         metrics.put(f"behavior/{kind}/{measure}", float(np.mean([getattr(each, name) for each in found])))
+    return np.array([each.min_slide_m_s for each in found])

@@ -36,14 +36,13 @@ FARTHEST_M = 1.2 * heldout.RANGE_M
 """z at which rendered rays end: a wall at the end of the measured range is behind nothing"""
 SCENE_POINTS, AGENT_POINTS = 20_000, 1_000
 """on each surface, whose distance from the other is measured; of the agent's in every frame"""
-SURFACE_NAMES = tuple(
+NAMES = heldout.NAMES + tuple(
     f"reconstruction/{name}"
     for name in (
         "agent_root_m_median", "agent_root_deg_median", "agent_track_m_median", "agent_track_m_p90",
         "scene_chamfer_m", "agent_chamfer_m", "agent_chamfer_share",
     )
 )  # fmt: skip
-NAMES = heldout.NAMES + SURFACE_NAMES
 
 
 def reconstruction_metrics(

@@ -24,10 +24,8 @@ def reliability_metrics(
     error = float((count * np.abs(confidence - accuracy)).sum() / count.sum()) if count.sum() else np.nan
     metrics.put(f"{name}/calibration_error", error)
     if count.sum():
-        caption = (
-            f"{name.replace('/agent', ' of the animal')}: share that was right by confidence; area: frames"
-        )
-        metrics.charts[caption] = _chart(confidence, accuracy, count)
+        caption = f"{name.replace('/agent', ' of the animal')}: share that was right by confidence"
+        metrics.charts[f"{caption}; area: frames"] = _chart(confidence, accuracy, count)
     return metrics
 
 

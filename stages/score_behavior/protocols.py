@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Int, Shaped
 
-from pipeline.baselines.predictors import Ats, Samples
+from pipeline.baselines.predictors import WINDOWS_AT_ONCE, Ats, Samples
 from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
 from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.trajectories import TEST, BehaviorData, Context, Future
@@ -18,7 +18,6 @@ from pipeline.geometry import rigid
 from pipeline.metrics.scores import GOAL_SCORES, PLAN_SCORES, SCORES
 from stages.score_behavior.config import Config
 
-WINDOWS_AT_ONCE = 32
 NETWORK_TRIALS = 2
 """trials of goals by the networks alone"""
 

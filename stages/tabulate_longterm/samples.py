@@ -35,8 +35,7 @@ def figures(
     assert data is not None, "only recorded motion has samples of the behavior model"
     windows = np.flatnonzero(data.split != TRAIN)
     windows = windows if len(windows) else np.flatnonzero(data.split == TRAIN)
-    count = min(config.samples, len(windows))
-    windows = windows[subsampling.evenly(len(windows), count)]
+    windows = windows[subsampling.evenly(len(windows), config.samples)]
     both = rows(source.world, data, windows, model, behavior_data, config, device)
     episode = episodes(data.start[windows], data.video[windows], FUTURE)
     found: dict[str, float | None] = {"longterm_samples/windows": float(len(windows))}

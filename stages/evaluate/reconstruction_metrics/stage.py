@@ -5,19 +5,14 @@ from pathlib import Path
 from pipeline.core import devices
 from pipeline.core.videos import Video
 from pipeline.data import qa
+from pipeline.metrics import bars
 from pipeline.metrics.metrics import Metrics
 from stages.evaluate.config import Config
 from stages.evaluate.reading import BuildFolders
 from stages.evaluate.reconstruction_metrics import measuring
 
-LIMITS = (
-    qa.Check("registration/rotation_deg_median", None, "deg", 1.0),
-    qa.Check("registration/translation_m_median", None, "m", 0.04),
-    qa.Check("masks/iou_mean", None, "", 0.75, better="higher"),
-    qa.Check("reconstruction/depth_acc_all", None, "", 0.88, better="higher"),
-    qa.Check("reconstruction/agent_root_m_median", None, "m", 0.08),
-)
-"""What the quality page judges, without values."""
+JUDGED = ("registration/", "masks/", "reconstruction/")
+"""Beginnings of the metrics whose bars the quality page shows."""
 
 
 def run(
@@ -36,7 +31,7 @@ def run(
         out,
         good="errors of a few centimeters and of less than a degree, and masks that follow the animal",
         bad="an error far above its limit: what is made after it is no better",
-        checks=metrics.judged(LIMITS),
+        checks=bars.checks(metrics, *JUDGED),
         pictures=[
             qa.Picture(f"{kind}_{n}", image, caption)
             for kind, shown in (("chart", metrics.charts), ("view", metrics.pictures))

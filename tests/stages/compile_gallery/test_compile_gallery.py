@@ -9,6 +9,7 @@ import pytest
 
 from pipeline.core.errors import InputError
 from pipeline.data import qa
+from pipeline.metrics.metrics import Metrics
 from stages.compile_gallery import __main__ as program
 from stages.compile_gallery import stage
 
@@ -37,7 +38,7 @@ def write_build(folder: Path, name: str, goal_m: float | None, megabytes: float)
     (folder / "evaluation").mkdir()
     goals = {"behavior/ats/goal_minde_m": goal_m, "behavior/stand_still/goal_minde_m": 0.45}
     metrics = goals | {"registration/translation_m_median": None}
-    (folder / "evaluation/metrics.json").write_text(json.dumps(metrics))
+    Metrics(metrics).write(folder / "evaluation", "metrics.json")
 
 
 def test_every_finished_simulator_has_a_card(tmp_path: Path) -> None:

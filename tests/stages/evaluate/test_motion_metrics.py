@@ -1,12 +1,13 @@
 """Metrics of physical plausibility on constructed cases."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.baselines.predictors import Samples
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, Context, Future
+from pipeline.metrics import bars
 from stages.evaluate import physical
 from tests.stages.export_simulator import small_world
 
@@ -54,3 +55,24 @@ def test_body_below_the_floor_penetrates(tmp_path: Path) -> None:
         tracks, small_world.rest(), videos, starts, np.full(4, TRAIN, np.uint8), tuple(tracks)
     )
     assert set(physical.physical_metrics(nobody, sunk, tmp_path, seed=0).values.values()) == {None}
+
+
+def test_plans_without_a_foot_on_the_ground_fail(tmp_path: Path) -> None:
+    small_world.write_surfaces(tmp_path)
+    lower = 0.05 * np.eye(4)[:, 1:2] @ np.eye(4)[3:]
+    walks = [small_world.trajectory(120, seed) for seed in range(2)]
+    tracks = {
+        f"v{2 + number:03d}": replace(walk, world_from_agent=walk.world_from_agent - lower)
+        for number, walk in enumerate(walks)
+    }
+    starts, videos = np.array([0, 20, 0, 20], np.int32), np.array([0, 0, 1, 1], np.int32)
+    split = np.array([TRAIN, TRAIN, TEST, TEST], np.uint8)
+    data = BehaviorData(tracks, small_world.rest(), videos, starts, split, tuple(tracks))
+    future = data.windows(data.indices(TEST))[1]
+    found = {
+        depth_m: physical.physical_metrics(data, Sunk(future, depth_m), tmp_path, seed=0)
+        for depth_m in (0.0, -0.3)
+    }
+    for depth_m, status in ((0.0, "ok"), (-0.3, "warn")):
+        assert found[depth_m].values["behavior/recorded/foot_slide_m_s"] is not None
+        assert [each.status for each in bars.checks(found[depth_m], "behavior/ats/foot")] == [status]

@@ -40,10 +40,10 @@ def test_empty_measurements_have_no_error():
 
 def test_mask_confidence_is_compared_with_iou():
     iou = np.array([0.9, 0.8, 0.2, 0.1])
-    overlaps = Overlaps(iou, np.zeros(4, bool), np.array([1.0, 1.0, 0.0, 0.0]))
+    overlaps = Overlaps(iou, np.zeros(4, bool), np.array([1.0, 1.0, 0.0, 0.0]), np.zeros(4))
     honest = mask_metrics([overlaps], None)
     assert honest.values["masks/calibration_error"] == 0 and honest.values["masks/confidence_mean"] == 0.5
-    boasting = mask_metrics([Overlaps(iou, np.zeros(4, bool), np.ones(4))], None)
+    boasting = mask_metrics([Overlaps(iou, np.zeros(4, bool), np.ones(4), np.zeros(4))], None)
     assert boasting.values["masks/calibration_error"] == pytest.approx(0.5)
     assert len(boasting.charts) == 1
 

@@ -11,10 +11,10 @@ from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, Future, Tr
 from pipeline.fields.skinning import SkinnedShape
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh, RayCaster
-from pipeline.metrics import scores
+from pipeline.metrics import bars, scores
 from pipeline.metrics.intervals import bootstrapped, episodes
 from pipeline.metrics.metrics import Metrics, median, percentile
-from pipeline.metrics.pose_errors import constant_between, pose_errors
+from pipeline.metrics.pose_errors import PoseErrors, constant_between, pose_errors
 from pipeline.metrics.surface_distance import TriangleSurface
 from stages.evaluate import behavior, heldout, registration, surfaces
 from stages.evaluate.config import Config
@@ -76,7 +76,23 @@ def test_infinite_failures_stay_infinite_in_percentiles():
     metrics = Metrics()
     metrics.put("x", percentile(errors, 95), "why")
     assert metrics.values["x"] is None
-    assert metrics.reasons["x"] == "why"
+    assert metrics.reasons["x"] == "failed: why"
+    metrics.put("y", float("nan"), "why")
+    assert metrics.reasons["y"] == "why"
+
+
+def test_failed_metrics_miss_their_bars_and_unmeasured_ones_do_not():
+    failed, unmeasured = Metrics(), Metrics()
+    refused = PoseErrors(np.full(9, np.inf), np.full(9, np.inf))
+    nothing = PoseErrors(np.zeros(0), np.zeros(0))
+    for metrics, errors in ((failed, refused), (unmeasured, nothing)):
+        registration.put_cameras(metrics, errors)
+        metrics.add(registration.root_metrics("reconstruction", [errors]))
+    judged = ("registration/", "reconstruction/")
+    assert [check.status for check in bars.checks(failed, *judged)] == ["warn"] * 3
+    assert bars.checks(unmeasured, *judged) == []
+    assert bars.worst(bars.judge(failed.values, failed.reasons)) == "fail"
+    assert bars.worst(bars.judge(unmeasured.values, unmeasured.reasons)) == "ok"
 
 
 def view(color, depth, true_color, true_depth, agent):

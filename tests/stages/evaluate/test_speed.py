@@ -12,6 +12,7 @@ from pipeline.baselines.predictors import Ats
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.trajectories import BehaviorData
+from pipeline.metrics import bars
 from pipeline.metrics.metrics import Metrics
 from stages.evaluate import speed, stage
 from stages.evaluate.config import Config
@@ -73,7 +74,18 @@ def test_plans_are_timed_on_the_cpu(monkeypatch: pytest.MonkeyPatch, tmp_path: P
 def test_feet_that_slide_more_than_in_recorded_motion_are_a_warning():
     def check(planned, recorded):
         values = {"behavior/ats/foot_slide_m_s": planned, "behavior/recorded/foot_slide_m_s": recorded}
-        return stage.foot_skate(Metrics(values))
+        return bars.checks(Metrics(values), stage.FOOT_SKATE)
 
     assert [each.status for each in check(0.42, 0.21) + check(0.044, 0.030)] == ["warn", "ok"]
     assert check(None, None) == [], "no window"
+
+
+def test_baselines_that_may_be_as_good_are_a_warning():
+    def statuses(mean, high):
+        names = [f"behavior/ats_minus_{baseline}/goal_minde_m" for baseline in bars.BASELINES]
+        values = {name: mean for name in names} | {f"{name}_ci95_high": high for name in names}
+        return {each.status for each in stage.better_than_baselines(Metrics(values))}
+
+    assert statuses(-0.2, -0.1) == {"ok"} and statuses(-0.2, 0.1) == {"warn"}
+    assert statuses(-0.2, None) == {"ok"} and statuses(0.2, None) == {"warn"}, "a single episode"
+    assert statuses(None, None) == set(), "no window"

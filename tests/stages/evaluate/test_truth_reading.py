@@ -64,7 +64,7 @@ def test_masks_are_compared_where_known(folder):
     out.mkdir()
     for i, true in enumerate(truth.masks):
         label = np.where(true, 255, 0).astype(np.uint8)
-        label[0] = 128
+        label[[0, 4]] = 128
         if i == 4:
             label[:] = 0
         images.write_gray(out / f"{i:06d}.png", label)
@@ -79,6 +79,7 @@ def test_masks_are_compared_where_known(folder):
     metrics = perception.mask_metrics([found], None)
     assert metrics.values["masks/iou_mean"] == pytest.approx(0.8)
     assert metrics.values["masks/iou_resting"] == 1.0
+    assert metrics.values["masks/unknown_share"] == pytest.approx(4 / 5 / 6), "a row of six of four masks"
     assert metrics.values["masks/iou_turnaround"] is None
     assert "masks/identity_swaps" not in metrics.values, "nobody else is there"
     others = np.roll(truth.masks, 6, axis=1) & ~truth.masks
