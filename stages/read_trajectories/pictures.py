@@ -35,7 +35,7 @@ def checks(motion: MeasuredMotion) -> list[Check]:
         return float(np.quantile((change / np.maximum(step, 1e-6))[known], 0.99)) if known.any() else None
 
     turned = rigid.rotation_angle(rotation[:-1], rotation[1:])
-    voxel, inside = motion.volume.voxel(np.nan_to_num(motion.world_from_agent[:, :3, 3]))
+    voxel, inside = motion.volume.voxel(motion.world_from_agent[motion.arrays()["agent_visible"], :3, 3])
     solid = (motion.volume.occupancy[tuple(voxel.T)] == 1) & inside
     return [
         Check("seconds", float(step[step < 1.0].sum()), "s", 20, 6.4, "higher"),

@@ -23,8 +23,8 @@ AXIS_M = 0.03
 """length of a bone's drawn axes"""
 FARTHEST_PX = 1 << 20
 """drawn points are clamped here, in sixteenths of a pixel, to avoid integer overflow in OpenCV"""
-SESSIONS, FRAMES = 4, 4
-"""sessions that are compared, and frames of each"""
+FRAMES = 16
+"""frames that are compared, of all sessions alike"""
 
 
 def report_quality(
@@ -35,11 +35,11 @@ def report_quality(
     masks: Mapping[str, Path],
     records: Mapping[str, FitRecord],
 ) -> None:
-    """Write qa.json: agreement with the sensor on a few frames of the first sessions, with pictures."""
-    rows, pictures = [], []
-    for id, motion in list(motions.items())[:SESSIONS]:
+    """Write qa.json: agreement with the sensor on a few frames of every session, with pictures."""
+    rows, pictures, each = [], [], -(-FRAMES // max(len(motions), 1))
+    for id, motion in motions.items():
         clip, labels = Clip.open(frames[id]), Masks.open(masks[id])
-        renderer, chosen = Renderer(reconstruction, id), chosen_frames(motion, FRAMES)
+        renderer, chosen = Renderer(reconstruction, id), chosen_frames(motion, each)
         compared = [compare(renderer, clip, labels[frame], motion, frame) for frame in chosen]
         rows += [metrics for metrics, _ in compared]
         if compared and len(pictures) < 3:

@@ -214,6 +214,17 @@ def test_headings_in_degrees_are_refused(tmp_path, unit, status):
     assert found["turning, 99 % below"] == status
 
 
+def test_unseen_rows_do_not_dilute_the_share_in_obstacles(tmp_path):
+    folder = tmp_path / "clip"
+    folder.mkdir()
+    seen, unseen = ("1.05,0.25,0.55,0", ",,,")
+    table(folder / "trajectory.csv", [f"a,{0.1 * i},{unseen if i % 2 else seen}" for i in range(41)])
+    (folder / "obstacles.csv").write_text("x,z,bottom,top\n1.05,0.55,0,0.5\n")
+    checks = pictures.checks(read(folder, READING))
+    (solid,) = [check for check in checks if check.name == "positions in obstacles"]
+    assert solid.value == 1 and solid.status == "fail"
+
+
 def test_unknown_joints_are_refused(tmp_path):
     joints = skeleton_motion()
     joints[7, 2] = np.nan
