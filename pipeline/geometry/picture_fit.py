@@ -144,7 +144,7 @@ def _moved(pose, step, eye_world):
     away = (pose[:3, 3] - eye_world) * (1, 0, 1)
     away /= max(float(np.linalg.norm(away)), 1e-6)
     side = np.cross(away, (0.0, 1.0, 0.0))
-    turn, pitch = rigid.rotation_from_yaw(step[3]), rigid.exp(np.array([step[4], 0, 0, 0, 0, 0]))[:3, :3]
+    turn, pitch = rigid.rotation_from_yaw(step[3]), rigid.rotation_from_vector(np.array([step[4], 0, 0]))
     shift = step[0] * side + step[1] * away + step[2] * np.array([0.0, 1.0, 0.0])
     return rigid.make(turn @ pose[:3, :3] @ pitch, pose[:3, 3] + shift)
 

@@ -79,8 +79,8 @@ def find_roots(
     poses, cost, share = roots.world_from_agent, roots.cost, roots.share
     surface: dict[int, StandingSurface] = {}
 
-    def observe(frame: int) -> AgentObservation | None:
-        below = surface.get(frame, standing)
+    def observe(frame: int, below: StandingSurface | None = None) -> AgentObservation | None:
+        below = below or surface.get(frame, standing)
         return agent_fit.observe(clip, masks[frame], frame, world_from_camera[frame], model, below)
 
     if clip.mapped:
@@ -102,10 +102,9 @@ def find_roots(
     if not hypotheses:
         return roots
     if clip.mapped:
-        floor = standing.floor_alone()
-        surface, behind = dict.fromkeys([each.frame for each in hypotheses], floor), {}
+        floor, behind = standing.floor_alone(), {}
         for index, each in enumerate(hypotheses):
-            seen = observe(each.frame)
+            seen = observe(each.frame, floor)
             if seen is not None and _apart_m(seen, each) > NEAR * model.length_m:
                 behind[each.frame] = _hypotheses(clip, seen, model, localizer, index, config)
         hypotheses = _standing_on(hypotheses, behind)
