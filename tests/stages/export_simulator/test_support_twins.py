@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,8 @@ from pipeline.behavior.path_encoding import REST_SPEED_M_S
 from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.scenes import SceneConstraint, Scenes
 from pipeline.behavior.support import Support, mark_supported
-from pipeline.behavior.trajectories import RATE_HZ
+from pipeline.behavior.trajectories import RATE_HZ, PoseFrames, blended_frames
+from pipeline.geometry import rigid
 from stages.export_simulator.reading import support_contract
 
 SOURCES = Path(__file__).parents[3] / "stages/export_simulator/web/src"
@@ -97,6 +99,12 @@ def test_page_and_python_project_points_to_the_same_free_space(free):
     assert same.mean() > 0.7
 
 
+def each_row(*frames: PoseFrames) -> Iterator[list[PoseFrames]]:
+    """Yield the frames of one plan after the other."""
+    for row in range(len(frames[0].root)):
+        yield [PoseFrames(each.root[row], each.bones[row]) for each in frames]
+
+
 @needs_node
 def test_page_and_python_project_blends_of_plans_to_the_same_free_space():
     """Two plans pass pillars on different sides; a new one fades in over four ticks from tick 5."""
@@ -109,17 +117,16 @@ def test_page_and_python_project_blends_of_plans_to_the_same_free_space():
     begin, end = rng.uniform([-1, 0.2, -1], [1, 0.4, 1], (2, 80, 2, 1, 3))
     plans = begin + (end - begin) * np.linspace(0, 1, frames)[:, None]
     plans = scenes.out_of_solid(plans, None).astype(np.float32)
-    linear = np.arange(1, 5)[:, None] / 4
-    share = linear**2 * (3 - 2 * linear)
-    old, new = plans[:, 0, 5:9].astype(float), plans[:, 1, :4].astype(float)
-    blend = old + share * (new - old)
+    roots = rigid.make(np.eye(3), plans.astype(float))
+    old, new = (PoseFrames(part, np.zeros((80, 7, 0))) for part in (roots[:, 0, 5:], roots[:, 1, :7]))
+    blend = np.stack([blended_frames(*both, 4).root[..., :3, 3] for both in each_row(old, new)])
     theirs = page_answers(
         """(() => {
           const rows = path.map((plan) => plan.map((place) => Float32Array.of(...place, 1, 0, 0, 0)));
-          const timeline = new Timeline([rows[0][0]], 0, (place) => space.cleared(place));
+          const timeline = new Timeline([rows[0][0]], 4, 0, (place) => space.cleared(place));
           timeline.follow(0, rows[0], -9);
           timeline.follow(5, rows[1], 5);
-          return [6, 7, 8, 9].map((tick) => Array.from(timeline.at(tick).subarray(0, 3)));
+          return [6, 7, 8, 9, 10, 11, 12].map((tick) => Array.from(timeline.at(tick).subarray(0, 3)));
         })()""",
         scene,
         allowed,

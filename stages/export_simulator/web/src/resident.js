@@ -98,7 +98,9 @@ export class Resident {
 
   // A line in time whose blends of plans stay where plans do.
   timed(past, tick) {
-    return new Timeline(past, tick, (place) => this.whereAllowed(place));
+    return new Timeline(past, this.contract.replanning.blend_frames, tick, (place) =>
+      this.whereAllowed(place),
+    );
   }
 
   whereAllowed(place) {

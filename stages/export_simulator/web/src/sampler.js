@@ -308,30 +308,27 @@ export class Sampler {
     const { avoid_solid: chosen } = this.contract.sampling; // else the first goal and path are taken
     const count = chosen ? CANDIDATES : 1;
     const tried = given ? Array(count).fill(0) : (chosen ? this.insideFirst(goals) : [0]).slice(0, count);
-    const targets = Float32Array.from(
-      tried.flatMap((index) => Array.from(scaled.subarray(3 * index, 3 * index + 3))),
-    );
-    const paths = await this.paths(codes, targets, {
-      ...options,
-      keepGoal,
-      commanded,
-      draws: this.contract.sampling.max_path_draws,
-      noise: options.draw(this.pathChannels * this.frames * tried.length),
-    });
-    if (commanded)
-      for (let i = 0; i < tried.length; i++)
-        this.bendToGoal(
-          paths.subarray(3 * this.frames * i, 3 * this.frames * (i + 1)),
-          scaled,
-          question.raised,
-        );
+    const towards = async (numbers) => {
+      const targets = Float32Array.from(
+        numbers.flatMap((i) => Array.from(scaled.subarray(3 * i, 3 * i + 3))),
+      );
+      const paths = await this.paths(codes, targets, {
+        ...options,
+        keepGoal,
+        commanded,
+        draws: this.contract.sampling.max_path_draws,
+        noise: options.draw(this.pathChannels * this.frames * numbers.length),
+      });
+      const each = numbers.map((_, i) => paths.subarray(3 * this.frames * i, 3 * this.frames * (i + 1)));
+      if (commanded) for (const path of each) this.bendToGoal(path, scaled, question.raised);
+      return each;
+    };
+    // as in Python, one path unless it leaves the room or has to be near what the animal intends
+    const [first, rest] = question.intent ? [tried, []] : [tried.slice(0, 1), tried.slice(1)];
+    const paths = await towards(first);
+    if (rest.length && this.outside(frame, paths[0])) paths.push(...(await towards(rest)));
     const best = this.bestInside(frame, paths, question.intent ?? []);
-    const path = this.constrained(
-      frame,
-      codes.start,
-      this.positions(paths.subarray(3 * this.frames * best, 3 * this.frames * (best + 1))),
-      options,
-    );
+    const path = this.constrained(frame, codes.start, this.positions(paths[best]), options);
     const lived = await this.withBody(frame, codes, path, options);
     const arrives =
       leg.last && !options.detour?.unfinished(apply(frame, codes.start), lived.path.at(-1), question.aim);
@@ -415,16 +412,17 @@ export class Sampler {
 
   // Of the paths that leave the allowed space least, the one nearest to the intended places, world, or the first.
   bestInside(frame, paths, intent) {
-    const length = 3 * this.frames;
-    const scores = Array.from({ length: paths.length / length }, (_, i) => {
-      const places = this.positions(paths.subarray(i * length, (i + 1) * length)).map((place) =>
-        apply(frame, place),
-      );
-      const outside = places.filter((place) => !this.senses.space.allows(place)).length;
+    const scores = paths.map((path, i) => {
+      const places = this.positions(path).map((place) => apply(frame, place));
       const off = intent.reduce((sum, place, frames) => sum + distance(places[frames], place), 0);
-      return { i, outside, off };
+      return { i, outside: this.outside(frame, path), off };
     });
     return scores.sort((a, b) => a.outside - b.outside || a.off - b.off || a.i - b.i)[0].i;
+  }
+
+  // How many places of a scaled path are outside of the allowed space.
+  outside(frame, path) {
+    return this.positions(path).filter((place) => !this.senses.space.allows(apply(frame, place))).length;
   }
 
   // Over many plans small errors of height add up: keep the root between the heights that recordings know.

@@ -3,13 +3,13 @@
 
 import { ROW, blend } from './rigid.js';
 
-const FADE_TICKS = 4;
 const HOLD_TICKS = 10; // an animal that has to wait stands so long, unless a plan comes before
 
 export class Timeline {
-  // Start from frames of the past; the last of them is this tick. clear: moves a place to where the root may be.
-  constructor(past, tick = 0, clear = (point) => point) {
-    this.clear = clear;
+  // Start from frames of the past; the last of them is this tick. fade: over how many ticks a plan is blended
+  // in. clear: moves a place to where the root may be.
+  constructor(past, fade, tick = 0, clear = (point) => point) {
+    Object.assign(this, { fade, clear });
     this.history = past.map((frame) => Float32Array.from(frame));
     this.lastTick = tick;
     this.base = this.history.at(-1);
@@ -23,14 +23,14 @@ export class Timeline {
 
   // Follow frames[0] at tick start + 1, and so on; what was followed until `now` fades out.
   follow(start, frames, now) {
-    const faded = this.plans.findLastIndex((plan) => share(plan, now) >= 1);
+    const faded = this.plans.findLastIndex((plan) => this.share(plan, now) >= 1);
     this.plans = [...this.plans.slice(Math.max(0, faded)), { start, frames, since: now }];
   }
 
   // Stand still from now on, until another plan is followed.
   hold(now) {
     const pose = this.at(now);
-    this.plans = [{ start: now, frames: Array(HOLD_TICKS).fill(pose), since: now - FADE_TICKS }];
+    this.plans = [{ start: now, frames: Array(HOLD_TICKS).fill(pose), since: -Infinity }];
   }
 
   ticksLeft(now) {
@@ -42,7 +42,7 @@ export class Timeline {
   // between them need not be: it is moved there at every tick, as in Python, and in between along with them.
   at(now) {
     const pose = this.blended(now);
-    if (this.plans.length < 2 || share(this.plans.at(-1), now) >= 1) return pose;
+    if (this.plans.length < 2 || this.share(this.plans.at(-1), now) >= 1) return pose;
     const [before, after] = [this.pushed(Math.floor(now)), this.pushed(Math.ceil(now))];
     for (let axis = 0; axis < 3; axis++)
       pose[axis] += before[axis] + (now - Math.floor(now)) * (after[axis] - before[axis]);
@@ -51,8 +51,13 @@ export class Timeline {
 
   blended(now) {
     let pose = this.base;
-    for (const plan of this.plans) pose = blend(pose, sample(plan, now), share(plan, now));
+    for (const plan of this.plans) pose = blend(pose, sample(plan, now), this.share(plan, now));
     return pose;
+  }
+
+  // How far a plan has faded in, 0 to 1, as in Python: after `fade` more ticks only it is seen.
+  share(plan, now) {
+    return Math.min(1, Math.max(0, (now - plan.since) / (this.fade + 1)));
   }
 
   // How far the root of a blend is moved at a tick.
@@ -70,12 +75,6 @@ export class Timeline {
       if (this.history.length > 64) this.history.shift();
     }
   }
-}
-
-// How far a plan has faded in, 0 to 1, smoothly.
-function share(plan, now) {
-  const linear = Math.min(1, Math.max(0, (now - plan.since) / FADE_TICKS));
-  return linear * linear * (3 - 2 * linear);
 }
 
 function sample(plan, now) {
