@@ -112,7 +112,7 @@ def rows(build: Path, queries: int, per_session: int, settings: tuple[Setting, .
     """Train and localize; yield the lines of a Markdown table as they are measured."""
     template = build / "scene_template"
     clip = Clip.open(build / "frames" / recordings(build, "walkthrough")[0])
-    walk = SceneCameras.open(template).world_from_camera
+    walk = SceneCameras.open(template).world_from_registered
     floor_m = json.loads((template / "world.json").read_text())["floor"]
     scene = SceneConfig(views=max(setting.views for setting in settings), held_out=40)
     scene_views, seconds = timed(

@@ -3,7 +3,7 @@
 import itertools
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 
 def evenly(count: int, most: int, *, rounded: bool = False) -> Int[np.ndarray, "chosen"]:
@@ -13,6 +13,11 @@ def evenly(count: int, most: int, *, rounded: bool = False) -> Int[np.ndarray, "
     """
     places = np.linspace(0, max(count - 1, 0), min(most, count))
     return np.unique((np.round(places) if rounded else places).astype(int))
+
+
+def some(items: Shaped[np.ndarray, "item *rest"], most: int) -> Shaped[np.ndarray, "chosen *rest"]:
+    """Return at most ``most`` of the items, evenly spaced, first and last included."""
+    return items[evenly(len(items), most)]
 
 
 def nearest(

@@ -1,6 +1,7 @@
 """Point-to-plane correspondences between depth scans and a surface, for `pipeline.mapping.pose_optimization`.
 
-`scan` subsamples a depth image to points with their noise; `SurfaceMap` finds their nearest vertices.
+`scan` subsamples a depth image to points with their noise; `SurfaceMap` finds their nearest vertices;
+`measure_fit` tells how much of the depth lies on the surface.
 """
 
 from dataclasses import dataclass
@@ -25,6 +26,10 @@ SPAN_PX, MAX_NORMAL_STEP_M, MAX_NORMAL_STEP_SHARE = 4, 0.05, 0.06
 """Span of the differences of `image_normals`, and the same over it."""
 QUERY_RADIUS_RATIO = 1.5
 """Search radius over reach: the nearest vertex may be farther than the plane through it."""
+MIN_FIT_POINTS = 20
+"""Least points for measuring a frame's fit."""
+NEAR_M, FIT_M = 0.5, 0.05
+"""Depth farther from the surface than the first is ignored as foreign; within the second it fits, meters."""
 
 
 @dataclass(frozen=True)
@@ -135,3 +140,20 @@ class SurfaceMap:
         """Return signed point-to-plane distances to the nearest vertex, meters; negative behind it."""
         _, nearest = self._tree.query(points_world)
         return np.einsum("pi,pi->p", points_world - self.points_world[nearest], self.normals_world[nearest])
+
+
+def measure_fit(
+    surface: SurfaceMap, scans: list[Scan], world_from_camera: Float[np.ndarray, "frame 4 4"]
+) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame"]]:
+    """Return each scan's median distance from the surface, meters, and its share within 5 cm of it.
+
+    Both count points within 50 cm, and are NaN with too few points; the share is 0 if too few are that near.
+    """
+    gap, fit = np.full(len(scans), np.nan), np.full(len(scans), np.nan)
+    for frame, scan in enumerate(scans):
+        if len(scan.points_camera) >= MIN_FIT_POINTS:
+            distance = np.abs(surface.distance(rigid.apply(world_from_camera[frame], scan.points_camera)))
+            near, fit[frame] = distance[distance < NEAR_M], 0.0
+            if len(near) >= MIN_FIT_POINTS:
+                gap[frame], fit[frame] = np.median(near), (near < FIT_M).mean()
+    return gap, fit

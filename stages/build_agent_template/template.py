@@ -66,7 +66,7 @@ def build(
     weights = skinning_weights(surface, rest, scale)
     cameras = agent_from_world @ turnaround.world_from_camera
     seen = np.flatnonzero(masks.visible)
-    views = seen[subsampling.evenly(len(seen), config.views)]
+    views = subsampling.some(seen, config.views)
     weight, pixel = appearance.visibility(mesh, cameras[views], clip.intrinsics[views], clip.color_size)
     on_mask = [appearance.on_mask(at, masks[view]) for at, view in zip(pixel, views, strict=True)]
     weight = weight * np.stack(on_mask)

@@ -14,7 +14,7 @@ from pipeline.geometry import cameras, rigid, subsampling
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 from stages.build_scene_template import anchor, fuse
 from stages.build_scene_template.config import Config
-from stages.build_scene_template.template import REGISTERED_WITHIN_M, SceneTemplate, floor_height
+from stages.build_scene_template.template import SceneTemplate, floor_height
 
 EDGE_M, SUBDIVISIONS = 0.05, 12
 """Edge length (meters) to which edges are subdivided, in at most so many iterations, for vertex colors."""
@@ -41,13 +41,14 @@ def build(
     upright = rigid.apply(upright_from_world, points).astype(np.float32)
     fine = Mesh(upright, faces, np.full((len(vertices), 3), 128, np.uint8))
     scale, agree = compare_depth(clip, fine, upright_from_world @ odometry, SEEN_WITHIN_M)
-    poses, gap = fuse.align_frames(clip, fine, upright_from_world @ odometry, config.fusion)
+    poses, gap, fit = fuse.align_frames(clip, fine, upright_from_world @ odometry, config.fusion)
     median_gap_m = float(np.nanmedian(gap)) if np.isfinite(gap).any() else np.inf
     if not abs(scale - 1) < MAX_SCALE_ERROR or agree < MIN_AGREE or median_gap_m > MAX_GAP_M:
         measured = f"depth / mesh {scale:.3f}, {agree:.0%} of depth agrees"
         log(f"the recording's own mesh is rejected and one is fused instead: {measured}")
         return None
-    seen, color = seen_and_colored(clip, fine, poses)
+    registered, (seen, color) = fuse.registered(fit), seen_and_colored(clip, fine, poses)
+    shown = subsampling.some(np.flatnonzero(registered), config.fusion.feature_frames)
     observed = seen[fine.faces].any(1)
     used, new_index = np.unique(fine.faces[observed], return_inverse=True)
     visible_mesh = Mesh(fine.vertices[used], new_index.reshape(-1, 3).astype(np.int32), color[used])
@@ -55,9 +56,9 @@ def build(
     log(f"the recording's own mesh: {unseen}; {100 * median_gap_m:.1f} cm from depth")
     return SceneTemplate(
         mesh=visible_mesh,
-        features=fuse.vertex_features(clip, features, visible_mesh, poses, config.fusion.feature_frames),
+        features=fuse.vertex_features(clip, features, visible_mesh, poses, shown),
         world_from_camera=poses,
-        registered=np.nan_to_num(gap, nan=np.inf) < REGISTERED_WITHIN_M,
+        registered=registered,
         gap_m=gap,
         start=anchor.InitialTrajectory(poses, "odometry", "", np.arange(len(clip)), None, {}),
         keyframe=np.ones(len(clip), bool),

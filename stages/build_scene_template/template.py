@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from pipeline.core.errors import InputError
 from pipeline.core.progress import log
 from pipeline.data.clips import Clip, usable_depth
-from pipeline.geometry import rigid
+from pipeline.geometry import rigid, subsampling
 from pipeline.geometry.meshes import Mesh
 from pipeline.mapping.colmap import SparseModel
 from pipeline.mapping.icp import depth_views
@@ -21,8 +21,6 @@ from stages.build_scene_template.config import Config
 
 MIN_POINTS = 100
 """Least number of depth points with a normal, and of faces of the fused mesh."""
-REGISTERED_WITHIN_M = 0.1
-"""Largest median depth residual of a registered frame, meters."""
 UP_COSINE, FLOOR_SHARE = 0.9, 0.05
 """Least upward normal component of level surface, and quantile of its heights that is the floor's."""
 
@@ -77,16 +75,20 @@ def build(
     mesh = fuse.fuse(clip, frames, upright_from_world @ poses, config.fusion)
     if len(mesh.faces) < MIN_POINTS:
         raise _no_surface_error(clip)
-    poses, gap = fuse.align_frames(clip, mesh, upright_from_world @ poses, config.fusion, frames)
-    mesh = fuse.fuse(clip, np.arange(len(clip)), poses, config.fusion)
+    poses, gap, fit = fuse.align_frames(clip, mesh, upright_from_world @ poses, config.fusion, frames)
+    registered = fuse.registered(fit)
+    known = np.flatnonzero(registered)
+    if not len(known):
+        raise _no_surface_error(clip)
+    mesh = fuse.fuse(clip, known, poses, config.fusion)
     mesh = fuse.clean(mesh, workspace, config.fusion.island_faces)
     if mesh is None:
         raise _no_surface_error(clip)
     log(f"{len(mesh.faces)} faces; median gap of depth from the surface {np.nanmedian(gap) * 100:.1f} cm")
-    registered = np.nan_to_num(gap, nan=np.inf) < REGISTERED_WITHIN_M
+    shown = subsampling.some(known, config.fusion.feature_frames)
     built = SceneTemplate(
         mesh=mesh,
-        features=fuse.vertex_features(clip, features, mesh, poses, config.fusion.feature_frames),
+        features=fuse.vertex_features(clip, features, mesh, poses, shown),
         world_from_camera=poses,
         registered=registered,
         gap_m=gap,

@@ -83,8 +83,7 @@ def build(walk: Clip, walk_cameras: SceneCameras, caster: RayCaster) -> Landmark
 
 def keyframe_numbers(walk_cameras: SceneCameras) -> Int[np.ndarray, "keyframe"]:
     """Choose the keyframes of the walk-through."""
-    registered = np.flatnonzero(walk_cameras.registered)
-    return registered[subsampling.evenly(len(registered), KEYFRAMES)]
+    return subsampling.some(np.flatnonzero(walk_cameras.registered), KEYFRAMES)
 
 
 def on_surface(

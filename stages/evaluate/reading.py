@@ -12,7 +12,7 @@ from pipeline.data import motion
 from pipeline.data.clips import FRAMES, Clip, read_source_index
 from pipeline.data.motion import Motion
 from pipeline.data.templates import AgentCameras, SceneCameras
-from pipeline.geometry import rigid, subsampling
+from pipeline.geometry import rigid
 from pipeline.metrics.pose_errors import constant_between
 from stages.evaluate.truth import RecordingTruth
 
@@ -120,11 +120,6 @@ def filmed_together(folders: Reconstructed, phone: Video) -> Int[np.ndarray, "fr
     )
     when = when + phone.offset_s
     return np.flatnonzero((when >= session_s[0]) & (when <= session_s[-1]))
-
-
-def subsampled(frames: Int[np.ndarray, "frame"], count: int) -> Int[np.ndarray, "chosen"]:
-    """Return up to ``count`` of the frames, evenly spread."""
-    return frames[subsampling.evenly(len(frames), count)]
 
 
 def read_motion(folder: Path, id: str) -> Motion | None:

@@ -75,7 +75,7 @@ def shots(
     clip, found = Clip.open(folders.frames[video.id]), []
     together = reading.filmed_together(folders, video)
     known = together[np.isfinite(world_from_camera[together]).all((1, 2))]
-    for frame in reading.subsampled(known, count).tolist():
+    for frame in subsampling.some(known, count).tolist():
         depth = usable_depth(clip, frame, farthest_m=RANGE_M)
         color = cv2.resize(clip.color(frame), depth.shape[::-1], interpolation=cv2.INTER_AREA)
         time_s = float(clip.timestamp_s[frame] + video.offset_s)

@@ -143,7 +143,7 @@ def shots_of(
     depth, intrinsics = read_depth(folders.truth_folder, phone.name, phone.source_index)
     cameras = frames.cameras(phone.truth)
     shots = []
-    for frame in reading.subsampled(reading.filmed_together(folders, phone.video), count).tolist():
+    for frame in subsampling.some(reading.filmed_together(folders, phone.video), count).tolist():
         size = depth[frame].shape[::-1]
         color = cv2.resize(phone.clip.color(frame), size, interpolation=cv2.INTER_AREA)
         mask = phone.truth.masks[frame].astype(np.uint8)
@@ -265,7 +265,7 @@ def _agent_chamfer(
     faces = ply.read_ply(folders.truth_folder / "agent.ply").faces
     for each in sessions:
         motion = motions[each.video.id]
-        chosen = reading.subsampled(np.flatnonzero(each.truth.agent_visible), config.surface_frames)
+        chosen = subsampling.some(np.flatnonzero(each.truth.agent_visible), config.surface_frames)
         total += len(chosen)
         for frame in chosen.tolist():
             known = motion is not None and motion.agent_known[frame]

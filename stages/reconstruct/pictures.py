@@ -70,7 +70,7 @@ def chosen_frames(motion: Motion, number: int) -> list[int]:
         & np.isfinite(motion.world_from_camera).all((1, 2))
         & motion.agent_visible
     )
-    return known[subsampling.evenly(len(known), number)].tolist()
+    return subsampling.some(known, number).tolist()
 
 
 def compare(

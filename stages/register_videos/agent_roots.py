@@ -147,7 +147,7 @@ def _with_body(
 ) -> AgentModel:
     """Add the colored body; learn its typical residuals from rough fits to some of the visible frames."""
     body, pictures, poses = picture_fit.colored_body(mesh), [], []
-    for frame in visible[subsampling.evenly(len(visible), CALIBRATION_FRAMES)].tolist():
+    for frame in subsampling.some(visible, CALIBRATION_FRAMES).tolist():
         seen = observe(frame)
         if seen is not None and seen.picture is not None:
             fits = agent_fit.fit_coarse(seen, model, agent_fit.initial_poses(seen, model, config.headings))

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.core.progress import track
 from pipeline.data.clips import Clip, Masks
-from pipeline.geometry import rigid, subsampling
+from pipeline.geometry import subsampling
 from pipeline.geometry.meshes import RayCaster
 from pipeline.mapping import depth_scans, pose_optimization
 from pipeline.mapping.pose_optimization import Correspondences, RelativePoseFactors, optimize_poses
@@ -38,10 +38,6 @@ FEATURE_PASSES = 2
 """Passes of feature alignment; each moves by less than a cell."""
 MASK_MARGIN_PX = 7
 """Side of the square that dilates the agent's mask, depth pixels: depth bleeds across outlines."""
-MIN_STATIC_POINTS = 20
-"""Least static depth points for measuring a frame's fit."""
-NEAR_M, FIT_M = 0.5, 0.05
-"""Depth farther from the surface than the first is ignored as foreign; within the second it fits, meters."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +114,7 @@ def align(
     covariance = pose_optimization.marginal_covariance(
         poses, associate(poses, LAST_REACH_M), odometry, LAST_REACH_M
     )
-    return AlignedCameras(poses, covariance, *measure_fit(surface, scans, poses))
+    return AlignedCameras(poses, covariance, *depth_scans.measure_fit(surface, scans, poses))
 
 
 def keep_cameras(
@@ -143,25 +139,6 @@ def keep_cameras(
             world_from_camera, Correspondences.join(*valid), odometry, LAST_REACH_M
         )
     return AlignedCameras(world_from_camera, covariance, unknown, unknown)
-
-
-def measure_fit(
-    surface: depth_scans.SurfaceMap,
-    scans: list[depth_scans.Scan],
-    world_from_camera: Float[np.ndarray, "frame 4 4"],
-) -> tuple[Float[np.ndarray, "frame"], Float[np.ndarray, "frame"]]:
-    """Return `AlignedCameras.gap_m` and `AlignedCameras.fit` of each frame.
-
-    Both are NaN with too few points; the fit is 0 if too few of them are within 50 cm.
-    """
-    gap, fit = np.full(len(scans), np.nan), np.full(len(scans), np.nan)
-    for frame, scan in enumerate(scans):
-        if len(scan.points_camera) >= MIN_STATIC_POINTS:
-            distance = np.abs(surface.distance(rigid.apply(world_from_camera[frame], scan.points_camera)))
-            near, fit[frame] = distance[distance < NEAR_M], 0.0
-            if len(near) >= MIN_STATIC_POINTS:
-                gap[frame], fit[frame] = np.median(near), (near < FIT_M).mean()
-    return gap, fit
 
 
 def _median(values):

@@ -116,8 +116,7 @@ def compare_sizes(
     Legs and tail move, so even the right animal does not fill its mask. But no other size does it better,
     unless the recording shows another animal than the turnaround, or lengths of the two differ.
     """
-    placed = np.flatnonzero(np.isfinite(world_from_agent[:, 0, 0]))
-    frames = placed[subsampling.evenly(len(placed), SIZE_FRAMES)].tolist()
+    frames = subsampling.some(np.flatnonzero(np.isfinite(world_from_agent[:, 0, 0])), SIZE_FRAMES).tolist()
 
     def ious(factor: float) -> Float[np.ndarray, "compared"]:
         vertices = factor * agent.vertices

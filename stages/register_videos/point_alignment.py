@@ -47,8 +47,7 @@ class WalkthroughTerm:
         self, clip: Clip, masks: Masks, world_from_camera: Float[np.ndarray, "frame 4 4"], walk: Walkthrough
     ):
         """Match all frames with pictures of the walk-through, guided by the current cameras."""
-        known = np.flatnonzero(np.isfinite(walk.world_from_camera[:, 0, 0]))
-        known = known[subsampling.evenly(len(known), PICTURES)]
+        known = subsampling.some(np.flatnonzero(np.isfinite(walk.world_from_camera[:, 0, 0])), PICTURES)
         self._walked = walk.world_from_camera[known]
         poses = np.concatenate([world_from_camera, self._walked])
         pinholes = np.concatenate([clip.intrinsics, walk.clip.intrinsics[known]])

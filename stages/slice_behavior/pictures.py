@@ -3,7 +3,7 @@
 from collections.abc import Collection
 
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import UInt8
 
 from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData
@@ -33,7 +33,7 @@ def checks(data: BehaviorData) -> list[Check]:
     """Judge the data."""
     train, test = data.indices(TRAIN), data.indices(TEST)
     shared = set(data.video[train]) & set(data.video[test])
-    context, future = data.windows(some(train), bones=False)
+    context, future = data.windows(subsampling.some(train, MAX_WINDOWS), bones=False)
     moved = np.linalg.norm(future.goal_world - context.world_from_agent[:, -1, :3, 3], axis=-1) > MOVED_M
     valid = np.concatenate([trajectory.valid for trajectory in data.trajectories.values()])
     moving = f"training windows in which the animal moves more than {MOVED_M:g} m"
@@ -44,11 +44,6 @@ def checks(data: BehaviorData) -> list[Check]:
         Check("valid times", float(valid.mean()), "share", 0.7, 0.2, "higher"),
         Check(moving, float(moved.mean()) if len(moved) else None, "share", 0.2, None, "higher"),
     ]
-
-
-def some(windows: Int[np.ndarray, "window"]) -> Int[np.ndarray, "chosen"]:
-    """Return evenly chosen windows, all where they are few."""
-    return windows[subsampling.evenly(len(windows), MAX_WINDOWS)]
 
 
 def visitation(
@@ -75,7 +70,7 @@ def visitation(
 
 def histograms(data: BehaviorData) -> UInt8[np.ndarray, "height width 3"]:
     """Draw speed, distance and displacement."""
-    context, future = data.windows(some(data.indices(TRAIN)), bones=False)
+    context, future = data.windows(subsampling.some(data.indices(TRAIN), MAX_WINDOWS), bones=False)
     position = future.path_world
     speed = np.linalg.norm(np.diff(position, axis=1), axis=-1)[:, ::7] * data.rate_hz
     away = (context.observer_world - context.world_from_agent[..., :3, 3])[:, -1]

@@ -70,7 +70,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") ->
 def _scene_views(inputs: Inputs, config: Config, rng: np.random.Generator) -> training.TrainingViews:
     template = _required(inputs.scene_template, "scene_template")
     clip = Clip.open(next(iter(_required(inputs.frames, "frames").values())))
-    walk = SceneCameras.open(template).world_from_camera
+    walk = SceneCameras.open(template).world_from_registered
     floor_m = read_floor(template)
     return training.scene_views(ply.read_ply(template / "mesh.ply"), walk, floor_m, clip, config.scene, rng)
 

@@ -68,18 +68,18 @@ def scene_views(
     config: SceneConfig,
     rng: np.random.Generator,
 ) -> TrainingViews:
-    """Render random views of the scene and add frames of the walk-through.
+    """Render random views of the scene and add frames of the walk-through, whose camera is not NaN.
 
     Raises InputError MAP-006 if hardly any view is filled by the map.
     """
-    caster = RayCaster(mesh)
+    caster, known = RayCaster(mesh), np.flatnonzero(np.isfinite(walk).all((1, 2)))
     scale = config.focal_px / float(np.median(clip.intrinsics[:, 0, 0]))
     size = (round(clip.color_size[0] * scale), round(clip.color_size[1] * scale))
     intrinsics = cameras.scale_intrinsics(np.median(clip.intrinsics, axis=0), clip.color_size, size)
 
     def draw(rng: np.random.Generator) -> RenderedView:
         for _ in range(MAX_DRAWS):
-            camera = views.scene_camera(walk, floor_m, config.pitch_deg, rng)
+            camera = views.scene_camera(walk[known], floor_m, config.pitch_deg, rng)
             view = views.render(caster, camera, intrinsics, size, rng)
             if views.plausible(view, caster):
                 return view
@@ -97,7 +97,7 @@ def scene_views(
     pictures = [draw(rng) for _ in track(range(config.views), "rendering views")]
     pictures += [
         _resized_frame(clip, int(frame), walk[frame], intrinsics, size)
-        for frame in subsampling.evenly(len(clip), config.frames)
+        for frame in subsampling.some(known, config.frames)
     ]
     sampling = replace(SCENE_SAMPLING, focal_px=config.focal_px)
     return TrainingViews("scene", sampling, SOLVERS["scene"], pictures, draw, draw_query, config.held_out)

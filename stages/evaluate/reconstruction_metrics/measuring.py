@@ -121,8 +121,7 @@ def _single_frames(
 ) -> Metrics:
     """Place single frames by our localizer and by its baseline."""
     cameras = SceneCameras.open(folders.scene_template)
-    known = np.flatnonzero(cameras.registered)
-    mapped = known[subsampling.evenly(len(known), MAP_FRAMES)].tolist()
+    mapped = subsampling.some(np.flatnonzero(cameras.registered), MAP_FRAMES).tolist()
     ours = localizers.load(folders.scene_localizer, device)
     sift = localizing.sift_map(walkthrough.clip, cameras.world_from_camera, mapped)
     errors: dict[str, list[PoseErrors]] = {"localizer/": [], "localizer/sift_only_": []}

@@ -2,6 +2,8 @@
 fusion, cleaning.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pycolmap
 import pytest
@@ -79,9 +81,48 @@ def test_points_per_frame_are_limited_by_memory(clip, monkeypatch):
     monkeypatch.setattr(fuse.depth_scans.SurfaceMap, "correspondences", counted)
     start = clip.truth @ rigid.exp(np.random.default_rng(0).normal(0, 0.01, (len(clip), 6)))
     monkeypatch.setattr(fuse, "ALIGN_POINTS", 48 * 60)
-    _, gap = fuse.align_frames(clip, clip.caster.mesh, start, FusionConfig())
+    _, gap, _ = fuse.align_frames(clip, clip.caster.mesh, start, FusionConfig())
     assert max(taken) <= 48 * 60
     assert np.nanmedian(gap) < 0.006, "meters; the depth noise is 4 mm, the cameras began 1.6 cm off"
+
+
+def test_misplaced_frames_are_not_registered(clip):
+    """Depth near some surface is not enough: a misplaced frame always has floor within reach."""
+    start, lost = clip.truth.copy(), np.arange(len(clip)) >= 36
+    start[lost] = rigid.make(rigid.rotation_from_yaw(np.deg2rad(60)), np.array([0.4, 0, 0.3])) @ start[lost]
+    poses, gap, fit = fuse.align_frames(
+        replace(clip, odometry_from_camera=None), clip.caster.mesh, start, FusionConfig()
+    )
+    far = np.linalg.norm(poses[:, :3, 3] - clip.truth[:, :3, 3], axis=1) > 0.1
+    assert (far == lost).all(), "meters; alignment does not find them back"
+    assert (fuse.registered(fit) == ~lost).all()
+    assert gap[lost].max() < 0.01, (
+        "meters; the median cannot tell: half of the room still lies on floor or wall"
+    )
+
+
+def test_frames_that_hardly_measured_anything_are_not_registered():
+    assert fuse.registered(np.array([0.9, np.nan, 1.0, 0.0, 0.7, 0.95])).tolist() == [1, 0, 1, 0, 0, 1]
+    assert not fuse.registered(np.array([0.0, np.nan, 0.0])).any()
+
+
+@pytest.mark.slow
+def test_misplaced_frames_leave_no_trace_in_the_map(clip, tmp_path, monkeypatch):
+    """Surface and features come from registered frames alone."""
+    align = fuse.align_frames
+
+    def lost(clip, mesh, poses, config, frames):
+        poses, gap, fit = align(clip, mesh, poses, config, frames)
+        poses[40:, :3, 3] += 5.0
+        fit[40:] = 0.3
+        return poses, gap, fit
+
+    monkeypatch.setattr(fuse, "align_frames", lost)
+    fusion = FusionConfig(voxel_m=0.06, truncation_m=0.18, island_faces=30, feature_frames=3, align_rounds=2)
+    config = Config(sfm=SFM, refinement=RefinementConfig(rounds=2), fusion=fusion)
+    made, _ = template.build(clip, np.ones((len(clip), 20, 15, 2)), config, tmp_path)
+    assert (np.flatnonzero(~made.registered) == np.arange(40, 48)).all()
+    assert np.ptp(made.mesh.vertices, axis=0).max() < 3.5, "meters: the room, and no second one beside it"
 
 
 def test_wrong_structure_is_rejected_by_depth(clip):
@@ -141,7 +182,7 @@ def test_systematic_depth_errors_do_not_bend_keyframes(clip, matched):
         for points, given in {"with": tracked, "without": NO_POINTS}.items()
     }
     assert np.median(errors["with"]) < 0.8 * np.median(errors["without"])
-    poses, _ = fuse.align_frames(bent, clip.caster.mesh, clip.truth, FusionConfig(), frames)
+    poses, *_ = fuse.align_frames(bent, clip.caster.mesh, clip.truth, FusionConfig(), frames)
     assert np.array_equal(poses[frames], clip.truth[frames]), "keyframes that depth contradicts stay"
 
 

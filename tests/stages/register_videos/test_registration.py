@@ -170,14 +170,14 @@ def test_frames_without_static_depth_are_ignored(maps):
         replace(votes, hypotheses=[replace(one, probability=0.9) for one in votes.hypotheses]),
         np.ones(len(votes.frame), bool),
     )
-    gap, fit = alignment.measure_fit(surface, [blind] * 8 + seen[8:], truth)
+    gap, fit = depth_scans.measure_fit(surface, [blind] * 8 + seen[8:], truth)
     assert (np.isnan(fit) == np.isnan(gap)).all()
     assert np.isnan(fit).sum() == 8
     assert registration.rejection_reason(fit, 0.9, votes, inliers, config) is None, "the four others fit"
-    _, fit = alignment.measure_fit(surface, [blind] * 11 + seen[11:], truth)
+    _, fit = depth_scans.measure_fit(surface, [blind] * 11 + seen[11:], truth)
     assert "only 1 of 12 frames measured" in registration.rejection_reason(fit, 0.9, votes, inliers, config)
     away = rigid.make(np.eye(3), np.array([0.0, 3.0, 0.0])) @ truth
-    gap, fit = alignment.measure_fit(surface, seen, away)
+    gap, fit = depth_scans.measure_fit(surface, seen, away)
     assert (fit[np.isnan(gap)] == 0).all(), "depth that meets nothing is no fit"
     assert "5 cm of the room" in registration.rejection_reason(fit, 0.9, votes, inliers, config)
 

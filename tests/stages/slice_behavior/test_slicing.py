@@ -8,7 +8,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.videos import Video
 from pipeline.data import npz
 from pipeline.geometry import rigid
-from stages.slice_behavior import pictures, reading
+from stages.slice_behavior import reading
 from stages.slice_behavior.config import Config
 from stages.slice_behavior.gridding import ReconstructedMotion, trajectory_from_motion
 from stages.slice_behavior.stage import Inputs, run
@@ -149,14 +149,6 @@ def test_sparse_rows_are_refused_with_a_remedy(tmp_path):
         run(inputs, Config(), out, videos=videos)
     run(inputs, Config(max_gap_s=1.5), out, videos=videos)
     assert (out / "windows.npz").is_file() and (out / "volume.npz").is_file()
-
-
-def test_checks_subsample_many_windows():
-    few, many = np.arange(3, 60, 2), np.arange(7, 100_007)
-    np.testing.assert_array_equal(pictures.some(few), few)
-    chosen = pictures.some(many)
-    assert len(chosen) == pictures.MAX_WINDOWS and (chosen[0], chosen[-1]) == (7, 100_006)
-    assert set(np.diff(chosen)) == {12, 13}
 
 
 def test_allowed_positions_are_free_or_visited():

@@ -66,6 +66,17 @@ def test_map_that_fills_no_view_is_refused(tmp_path, monkeypatch):
         training.scene_views(crumb, truth, 0.0, clip, SceneConfig(), np.random.default_rng(0))
 
 
+def test_frames_without_a_registered_camera_are_no_views(tmp_path):
+    mesh, truth = textured_room(edge_m=0.2), walk(12)
+    clip, walked = MemoryClip(RayCaster(mesh), truth, truth, folder=tmp_path), truth.copy()
+    walked[4:9] = np.nan
+    data = training.scene_views(
+        mesh, walked, 0.0, clip, SceneConfig(views=3, frames=20), np.random.default_rng(0)
+    )
+    assert len(data.pictures) == 3 + 7
+    assert all(np.isfinite(view.map_from_camera).all() for view in data.pictures)
+
+
 def test_views_show_postures_with_the_root_bone_at_rest():
     points, weights, bones = (part.numpy() for part in chain())
     side = np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]]) * 0.02
