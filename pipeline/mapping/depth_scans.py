@@ -1,7 +1,7 @@
 """Point-to-plane correspondences between depth scans and a surface, for `pipeline.mapping.pose_optimization`.
 
 `scan` subsamples a depth image to points with their noise; `SurfaceMap` finds their nearest vertices;
-`measure_fit` tells how much of the depth lies on the surface.
+`measure_fit` measures how much of the depth lies on the surface.
 """
 
 from dataclasses import dataclass

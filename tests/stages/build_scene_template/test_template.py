@@ -97,7 +97,7 @@ def test_misplaced_frames_are_not_registered(clip):
     assert (far == lost).all(), "meters; alignment does not find them back"
     assert (fuse.registered(fit) == ~lost).all()
     assert gap[lost].max() < 0.01, (
-        "meters; the median cannot tell: half of the room still lies on floor or wall"
+        "meters; the median does not show it: half of the points still lie on floor or wall"
     )
 
 
