@@ -26,6 +26,8 @@ from stages.reconstruct.problem import Problem
 
 SHARE = 0.3
 """share of the usual steps of the scene and joint phases: the fields have nearly converged"""
+SAME_BONES = 0.01
+"""largest difference of bones at rest, meters and axes, of one template that was built again"""
 REBUILT = ("grid.levels.", "codes.", "fused.")
 """prefixes of the scene field's parameters whose shapes depend on the recordings; not loaded as they are"""
 
@@ -50,12 +52,12 @@ def begin(problem: Problem, videos: Sequence[RegisteredVideo], folder: Path) -> 
     """Initialize the problem's fields, body and cameras from the reconstruction at ``folder``.
 
     Returns the motion of the recordings it contains. Raises InputError RCN-003 if its fields have other
-    sizes, ART-007 if another version wrote it.
+    sizes or its animal another template, ART-007 if another version wrote it.
     """
     with other_versions_refused("reconstruction", str(folder)):
         loaded = fields.load(folder, str(problem.device))
     if differences := _differences(problem, loaded):
-        what = f"its fields have other sizes than this recipe's: {differences[0]}"
+        what = f"its fields differ from this recipe's: {differences[0]}"
         raise InputError("RCN-003", what, str(folder), "take it away to start from nothing")
     former = {video.id: found for video in videos if (found := _former_motion(folder, video)) is not None}
     _load_fields(problem, loaded, scene_ids(videos))
@@ -90,11 +92,14 @@ def _former_motion(folder: Path, video: RegisteredVideo) -> Motion | None:
 
 
 def _differences(problem: Problem, loaded: Reconstruction) -> list[str]:
-    """Return what differs in kind or size between the former fields and the problem's."""
+    """Return what differs in kind, size or template between the former fields and the problem's."""
     grids = [isinstance(field.grid, DenseGrid) for field in (loaded.scene, problem.scene)]
     voxels_m = [field.shape.voxel_m for field in (loaded.scene, problem.scene)]
     found = [] if all(grids) else ["a scene without a grid is tied to its box"]
     found += [f"scene voxels of {voxels_m[0]} m, not {voxels_m[1]} m"] if voxels_m[0] != voxels_m[1] else []
+    rest, own = (body.agent_from_bone_rest.cpu() for body in (loaded.body, problem.body))
+    if rest.shape == own.shape and (moved_m := float((rest - own).abs().max())) > SAME_BONES:
+        found.append(f"another agent template, whose bones differ by {moved_m:.2f}")
     for name in ("agent", "body", "scene"):
         before, now = (
             {key: tuple(value.shape) for key, value in getattr(whole, name).state_dict().items()}

@@ -12,9 +12,19 @@ from pipeline.core.errors import InputError
 from pipeline.data import motion
 from pipeline.fields import fields
 from pipeline.fields.fields import Reconstruction
+from pipeline.geometry import rigid
 from stages.reconstruct import assemble, former, optimize, results
 from stages.reconstruct.config import PhaseSteps
-from tests.stages.reconstruct.test_optimize import SHAPES, UPRIGHT, WIDE, film, plan, problem
+from tests.stages.reconstruct.test_optimize import (
+    RADIUS_M,
+    SHAPES,
+    UPRIGHT,
+    WIDE,
+    film,
+    plan,
+    problem,
+    template,
+)
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +108,16 @@ def test_fields_of_other_sizes_are_refused(made, tmp_path):
         former.begin(found, videos, folder)
     with pytest.raises(InputError, match="ART-007"):
         former.begin(found, videos, tmp_path)
+
+
+def test_fields_of_another_template_are_refused(made):
+    """Turned by 180 degrees (`turn_deg`), a template has the same sizes; its motion would be backwards."""
+    folder, *_ = made
+    videos, ball = films(added()), template(RADIUS_M)
+    turned = rigid.make(rigid.rotation_from_yaw(np.pi), np.zeros(3)) @ ball.agent_from_bone_rest
+    found = assemble.build(videos, replace(ball, agent_from_bone_rest=turned), SHAPES, 0, "cpu")
+    with pytest.raises(InputError, match=r"RCN-003.*another agent template"):
+        former.begin(found, videos, folder)
 
 
 def test_other_failures_are_not_taken_for_other_sizes(made, monkeypatch):
