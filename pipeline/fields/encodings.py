@@ -46,11 +46,8 @@ class DenseGrid(nn.Module):
         found = []
         for extent, level in zip(self.extents, self.levels, strict=True):
             place = ((points - self.low) / extent * 2 - 1).view(1, 1, 1, -1, 3)
-            found.append(
-                functional.grid_sample(level, place, padding_mode="border", align_corners=True).view(
-                    level.shape[1], -1
-                )
-            )
+            read = functional.grid_sample(level, place, padding_mode="border", align_corners=True)
+            found.append(read.view(level.shape[1], -1))
         return torch.cat(found).t()
 
 

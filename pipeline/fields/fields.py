@@ -114,9 +114,7 @@ class Field(nn.Module):
                 nn.init.zeros_(last.weight)
                 nn.init.zeros_(last.bias)
             elif limit:
-                nn.init.constant_(
-                    last.bias, torch.atanh(torch.tensor(min(free_m / limit, MAX_START_SATURATION))).item()
-                )
+                nn.init.constant_(last.bias, math.atanh(min(free_m / limit, MAX_START_SATURATION)))
             else:
                 nn.init.constant_(last.bias, free_m)
         self.appearance, last = _head(inputs, shape.width, 3 + FEATURE_CHANNELS)

@@ -81,11 +81,9 @@ class FusedGeometry(nn.Module):
         cell = place.detach().floor().long()
         block = self._block(cell, video)
         hit = torch.nonzero(block != EMPTY_BLOCK)[:, 0]
-        return (
-            result.index_put((hit,), self._trilinear(block[hit], cell[hit] % CELLS, (place - cell)[hit]))
-            if len(hit)
-            else result
-        )
+        if not len(hit):
+            return result
+        return result.index_put((hit,), self._trilinear(block[hit], cell[hit] % CELLS, (place - cell)[hit]))
 
     def _trilinear(
         self, block: Int[Tensor, "point"], within: Int[Tensor, "point 3"], offset: Float[Tensor, "point 3"]
@@ -97,9 +95,7 @@ class FusedGeometry(nn.Module):
         share = torch.where(self.corners.bool(), offset[:, None], 1 - offset[:, None]).prod(-1)
         mixed = (share[..., None] * values).sum(1)
         known = mixed[:, 4:]
-        color = torch.where(
-            known > 0, mixed[:, 1:4] / known.clamp_min(1e-6), torch.full_like(mixed[:, 1:4], 0.5)
-        )
+        color = torch.where(known > 0, mixed[:, 1:4] / known.clamp_min(1e-6), 0.5)
         return torch.cat([mixed[:, :1], color, known], dim=-1)
 
     def _block(self, cell: Int[Tensor, "point 3"], video: Int[Tensor, "point"]) -> Int[Tensor, "point"]:

@@ -176,13 +176,11 @@ def render_depth(
 
     pose = tensor(world_from_camera)
     directions = tensor(cameras.ray_directions(intrinsics, height, width).reshape(-1, 3))
-    uniform = NEAREST_M + (farthest_m - NEAREST_M) * (torch.arange(samples // 2, device=device) + 0.5) / (
-        samples // 2
-    )
+    spacing = (farthest_m - NEAREST_M) / (samples // 2)
+    uniform = NEAREST_M + spacing * (torch.arange(samples // 2, device=device) + 0.5)
     agent_pose = None
     if world_from_agent is not None and agent_from_bone is not None:
         agent_pose = rigid_torch.inverse(tensor(world_from_agent)) @ pose, tensor(agent_from_bone)
-    spacing = (farthest_m - NEAREST_M) / (samples // 2)
     depths, agents = [], []
     for direction in directions.split(RAYS_AT_ONCE):
         rays = _PosedRays(reconstruction, pose, direction, code, agent_pose)
@@ -279,11 +277,9 @@ class Renderer:
         on_scene = np.isfinite(depth) & ~is_agent
         color[on_scene] = self._scene_color(origin + directions[on_scene] * depth[on_scene, None])
         if is_agent.any():
-            rest = agent_hits.interpolate(mesh, self.agent_mesh.vertices)[is_agent]
+            rest = torch.from_numpy(agent_hits.interpolate(mesh, self.agent_mesh.vertices)[is_agent])
             field = self.reconstruction.agent
-            color[is_agent] = (
-                field.color_and_feature(field.encode(torch.from_numpy(rest).to(self.device)))[0].cpu().numpy()
-            )
+            color[is_agent] = field.color_and_feature(field.encode(rest.to(self.device)))[0].cpu().numpy()
         shape = (height, width)
         depth = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
         return DrawnView(

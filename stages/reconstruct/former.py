@@ -26,6 +26,9 @@ from stages.reconstruct.problem import Problem
 
 SHARE = 0.3
 """share of the usual steps of the scene and joint phases: the fields have nearly converged"""
+SAME_WORLD_M = 0.3
+"""largest median distance between a recording's cameras now and then, in one world: another walk-through has
+another, and each turnaround's is its animal's"""
 SAME_BONES = 0.01
 """largest difference of bones at rest, meters and axes, of one template that was built again"""
 REBUILT = ("grid.levels.", "codes.", "fused.")
@@ -52,14 +55,17 @@ def begin(problem: Problem, videos: Sequence[RegisteredVideo], folder: Path) -> 
     """Initialize the problem's fields, body and cameras from the reconstruction at ``folder``.
 
     Returns the motion of the recordings it contains. Raises InputError RCN-003 if its fields have other
-    sizes or its animal another template, ART-007 if another version wrote it.
+    sizes, its animal another template or its world another origin, ART-007 if another version wrote it.
     """
     with other_versions_refused("reconstruction", str(folder)):
         loaded = fields.load(folder, str(problem.device))
-    if differences := _differences(problem, loaded):
+    former = {video.id: found for video in videos if (found := _former_motion(folder, video)) is not None}
+    moved_m = {video.id: _moved_m(former[video.id], video) for video in videos if video.id in former}
+    differences = _differences(problem, loaded)
+    differences += [f"{id}'s cameras moved by {m:.1f} m" for id, m in moved_m.items() if m > SAME_WORLD_M]
+    if differences:
         what = f"its fields differ from this recipe's: {differences[0]}"
         raise InputError("RCN-003", what, str(folder), "take it away to start from nothing")
-    former = {video.id: found for video in videos if (found := _former_motion(folder, video)) is not None}
     _load_fields(problem, loaded, scene_ids(videos))
     frames, roots, bones = [], [], []
     for index, video in enumerate(scene_first(videos)):
@@ -89,6 +95,12 @@ def _former_motion(folder: Path, video: RegisteredVideo) -> Motion | None:
             if np.array_equal(found.timestamp_s, video.timestamp_s):
                 return found
     return None
+
+
+def _moved_m(former: Motion, video: RegisteredVideo) -> float:
+    """Return the median distance between a recording's cameras then and now; 0 if none is known in both."""
+    moved = np.linalg.norm((former.world_from_camera - video.world_from_camera)[:, :3, 3], axis=1)
+    return float(np.nanmedian(moved)) if np.isfinite(moved).any() else 0.0
 
 
 def _differences(problem: Problem, loaded: Reconstruction) -> list[str]:
@@ -139,11 +151,10 @@ def _resample_grid(scene: Field, former: Field) -> None:
         z, y, x = (torch.linspace(0, 1, count) for count in level.shape[2:])
         nodes = torch.stack(torch.meshgrid(z, y, x, indexing="ij")[::-1], dim=-1).to(level)
         place = (grid.low + nodes * extent - before.low.to(level)) / source_extent.to(level) * 2 - 1
-        level.copy_(
-            nn.functional.grid_sample(
-                source.to(level), place[None], padding_mode="border", align_corners=True
-            )
+        read = nn.functional.grid_sample(
+            source.to(level), place[None], padding_mode="border", align_corners=True
         )
+        level.copy_(read)
 
 
 @torch.no_grad()

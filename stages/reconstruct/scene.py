@@ -51,9 +51,8 @@ def swap_codes(
     if not videos:
         return video
     other = torch.randint(videos, video.shape, generator=generator).to(video.device)
-    return torch.where(
-        (torch.rand(video.shape, generator=generator) < probability).to(video.device), other, video
-    )
+    swapped = torch.rand(video.shape, generator=generator) < probability
+    return torch.where(swapped.to(video.device), other, video)
 
 
 def world_samples(

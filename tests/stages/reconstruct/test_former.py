@@ -120,6 +120,16 @@ def test_fields_of_another_template_are_refused(made):
         former.begin(found, videos, folder)
 
 
+def test_motion_in_another_world_is_refused(made):
+    """As after a second walk-through."""
+    folder, *_ = made
+    videos, elsewhere = films(added()), rigid.make(rigid.rotation_from_yaw(1.0), np.array([1.0, 0, 2]))
+    poses = {name: elsewhere @ getattr(videos[0], name) for name in ("world_from_camera", "world_from_agent")}
+    found, videos = problem(videos=[replace(videos[0], **poses), *videos[1:]])
+    with pytest.raises(InputError, match=r"RCN-003.*v002's cameras moved by \d"):
+        former.begin(found, videos, folder)
+
+
 def test_other_failures_are_not_taken_for_other_sizes(made, monkeypatch):
     def fail(*_):
         raise RuntimeError("out of memory")
