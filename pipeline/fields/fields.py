@@ -27,15 +27,13 @@ from pipeline.fields.fused_depth import FusedGeometry
 
 FEATURE_CHANNELS = 16
 FUSED_CHANNELS = fused.CHANNELS
-BETA_RANGE_M = (0.003, 0.006)
-"""range of the density's scale beta: below it the gradient vanishes between samples, above it thin limbs blur
-and silhouettes get a halo"""
-INITIAL_BETA_M, WIDE_RANGE_M = 0.1, (0.004, 0.2)
+BETA_M = 0.006
+"""the density's scale beta where distances are supervised, fixed: losses make it larger, and then thin limbs
+blur and silhouettes get a halo"""
+INITIAL_BETA_M, BETA_RANGE_M = 0.1, (0.004, 0.2)
 """initial beta and its range where rendering alone finds surfaces: samples are 0.1 m apart at first"""
 MAX_START_SATURATION = 0.9
 """share of the truncation that an untrained distance stays below: at 1 its tanh has no gradient"""
-INITIAL_LOG_BETA = -5.1
-"""initial log(beta) of fields supervised by distances: the upper end of the range"""
 MIN_FEATURE = 1e-4
 """shorter features are not normalized: their gradient would explode"""
 CODE_STD = 0.1
@@ -121,9 +119,7 @@ class Field(nn.Module):
         if fused:
             nn.init.zeros_(last.weight.data[:3])
             nn.init.zeros_(last.bias.data[:3])
-        self.log_beta = nn.Parameter(
-            torch.tensor(math.log(INITIAL_BETA_M) if shape.starts_as_box else INITIAL_LOG_BETA)
-        )
+        self.log_beta = nn.Parameter(torch.tensor(math.log(INITIAL_BETA_M)))
         if self.codes:
             nn.init.normal_(self.codes.weight, std=CODE_STD)
 
@@ -203,8 +199,9 @@ class Field(nn.Module):
 
     @property
     def beta_m(self) -> Float[Tensor, ""]:
-        """The scale of the Laplace distribution in `density`, meters."""
-        return self.log_beta.exp().clamp(*(WIDE_RANGE_M if self.shape.starts_as_box else BETA_RANGE_M))
+        """The scale of the Laplace distribution in `density`, meters; learned by rendering alone."""
+        learned = self.shape.starts_as_box
+        return self.log_beta.exp().clamp(*BETA_RANGE_M) if learned else self.log_beta.new_tensor(BETA_M)
 
     def density(
         self, signed_distance: Float[Tensor, "*point"], min_beta_m: float = 0.0

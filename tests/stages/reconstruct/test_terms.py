@@ -3,10 +3,11 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 import torch
 
 from pipeline.data.motion import MotionTable, gaps_s
-from pipeline.fields.fields import density
+from pipeline.fields.fields import Field, FieldShape, density
 from pipeline.fields.marching_cubes import zero_level
 from pipeline.fields.render import Layer, composite
 from pipeline.geometry import rigid
@@ -68,6 +69,16 @@ def test_surfaces_are_found_where_no_depth_was_measured():
     found = scene.surface_depths(rays, 5.0, density_of, torch.Generator().manual_seed(0))
     torch.testing.assert_close(found[[1, 3]], torch.tensor([1.2, 5.0]))
     torch.testing.assert_close(found[[0, 2]], wall_m[[0, 2]], atol=scene.REACH_M, rtol=0)
+
+
+@pytest.mark.parametrize("by_rendering", [False, True])
+def test_only_rendering_alone_learns_the_sharpness_of_surfaces(by_rendering):
+    shape = FieldShape((0, 0, 0), (1, 1, 1), (0.25,), starts_as_box=by_rendering)
+    field = Field(shape, free_m=0.1)
+    density = field.density(torch.linspace(-0.02, 0.02, 9, requires_grad=True)).sum()
+    density.backward()
+    assert bool(field.log_beta.grad is not None and field.log_beta.grad != 0) is by_rendering
+    assert float(field.beta_m) == pytest.approx(0.1 if by_rendering else 0.006), "meters"
 
 
 def test_eikonal_is_zero_on_a_distance_field_and_not_on_a_scaled_one():
