@@ -20,7 +20,7 @@ DEPTH_EDGE_M, OUTLINE_STEP = 0.08, 1.0
 HEADING_M = 0.2
 """length of the line that shows where the animal faces"""
 STEP_FRAMES, MIN_STEP_M = 5, 0.2
-"""an animal walks if it moves farther than `WALK_M`, meters, within `WALK_FRAMES`"""
+"""an animal walks if it moves farther than the second, meters, within the first, frames"""
 CAPTIONS = {
     "edges": "Template edges (magenta) and the placed animal (orange) over frames.",
     "bird": "From above: the phone's path (blue), the animal's (orange, yellow towards its head).",

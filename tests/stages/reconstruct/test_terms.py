@@ -78,7 +78,7 @@ def test_only_rendering_alone_learns_the_sharpness_of_surfaces(by_rendering):
     density = field.density(torch.linspace(-0.02, 0.02, 9, requires_grad=True)).sum()
     density.backward()
     assert bool(field.log_beta.grad is not None and field.log_beta.grad != 0) is by_rendering
-    assert float(field.beta_m) == pytest.approx(0.1 if by_rendering else 0.006), "meters"
+    assert field.beta_m.item() == pytest.approx(0.1 if by_rendering else 0.006), "meters"
 
 
 def test_eikonal_is_zero_on_a_distance_field_and_not_on_a_scaled_one():
