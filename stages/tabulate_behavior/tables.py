@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.metrics.intervals import BOOTSTRAP_DRAWS, Interval, episodes
+from pipeline.metrics.intervals import BOOTSTRAP_DRAWS, Interval, episodes, interval_of_draws
 from stages.tabulate_behavior.reading import MethodScores
 
 UNPREFIXED = "end_to_end"
@@ -70,11 +70,12 @@ def interval(
         return Interval(float(values.mean()), np.nan, np.nan)
     total = np.stack([np.bincount(episode, row, count) for row in values])
     size = np.bincount(episode, minlength=count)
-    means = np.empty(BOOTSTRAP_DRAWS)
-    for draw in range(BOOTSTRAP_DRAWS):
-        chosen, drawn = rng.integers(0, count, count), rng.integers(0, len(values), len(values))
-        means[draw] = total[drawn][:, chosen].sum() / (size[chosen].sum() * len(values))
-    return Interval(float(values.mean()), *(float(bound) for bound in np.percentile(means, (2.5, 97.5))))
+    resamples = (rng.integers(0, number, (BOOTSTRAP_DRAWS, number)) for number in (count, len(values)))
+    means = [
+        total[drawn][:, chosen].sum() / (size[chosen].sum() * len(values))
+        for chosen, drawn in zip(*resamples, strict=True)
+    ]
+    return interval_of_draws(float(values.mean()), means, count)
 
 
 def plateaus(curves: Mapping[str, Mapping[str, Float[np.ndarray, "seed step"]]]) -> dict[str, float]:

@@ -297,6 +297,17 @@ def test_intervals_widen_for_correlated_windows():
     assert wide.low - 0.5 < skewed.low <= skewed.mean <= skewed.high < wide.high + 0.5
 
 
+@pytest.mark.parametrize("count", [3, 6, 15])
+def test_intervals_of_few_episodes_cover_the_truth(count):
+    rng, covered = np.random.default_rng(0), []
+    for _ in range(400):
+        windows = np.repeat(rng.normal(size=count), 4)
+        found = bootstrapped(windows, np.repeat(np.arange(count), 4), rng)
+        covered.append(found.low <= 0 <= found.high)
+    # two standard deviations of 400 draws below 95 %; quantiles of the resamples cover 75, 86 and 91 %
+    assert np.mean(covered) > 0.925
+
+
 def test_one_episode_alone_has_no_interval():
     found = Metrics()
     found.put_mean("goal", bootstrapped(np.arange(5.0), np.zeros(5, int), np.random.default_rng(0)))

@@ -25,6 +25,13 @@ def test_intervals_include_the_variance_between_seeds():
     assert apart.high - apart.low > 10 * (alike.high - alike.low)
 
 
+def test_intervals_of_few_episodes_cover_the_truth(monkeypatch):
+    monkeypatch.setattr(tables, "BOOTSTRAP_DRAWS", 500)
+    rng, window = np.random.default_rng(0), np.stack([np.zeros(6, int), 64 * np.arange(6)], axis=1)
+    found = [tables.interval(rng.normal(size=(1, 6)), window, 64, seed) for seed in range(400)]
+    assert np.mean([each.low <= 0 <= each.high for each in found]) > 0.92
+
+
 def test_differences_are_paired_per_window():
     rng = np.random.default_rng(1)
     hard = np.repeat(rng.gamma(1, 1, 10), 64)[None] * np.ones((2, 1))
