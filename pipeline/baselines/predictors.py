@@ -17,7 +17,7 @@ from pipeline.behavior.config import Ego, PlanSamplingConfig
 from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
 from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.planning import Observation, Sampler, TorchNetworks, observe
-from pipeline.behavior.scenes import Scenes
+from pipeline.behavior.scenes import SceneConstraint, Scenes
 from pipeline.behavior.trajectories import Context, Future
 from pipeline.geometry import rigid
 
@@ -61,9 +61,10 @@ class LocationPrior:
         return cls(cell, count / count.sum(), cell_m)
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
-        """Draw cells by probability, and points uniformly inside."""
-        chosen = rng.choice(len(self.cell), (len(context), count), p=self.probability)
-        goal = (self.cell[chosen] + rng.random((*chosen.shape, 3))) * self.cell_m
+        """Draw cells by probability, and points uniformly inside; a window's do not depend on others."""
+        drawn = rng.random((len(context), count, 4))
+        chosen = np.searchsorted(self.probability.cumsum()[:-1], drawn[..., 0], side="right")
+        goal = (self.cell[chosen] + drawn[..., 1:]) * self.cell_m
         return Samples(rigid.apply(world_from_ego(context.world_from_agent[:, -1], "yaw"), goal))
 
 
@@ -116,6 +117,26 @@ BASELINES = {
 
 
 @dataclass(frozen=True)
+class Corrected:
+    """Another predictor, with goals and paths out of solids and on supporting surfaces, as `Ats` has them."""
+
+    predictor: Predictor
+    scenes: Scenes
+    rate_hz: float
+
+    def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
+        """Draw ``count`` futures for each window and correct them."""
+        drawn, now = self.predictor.sample(context, count, rng), context.world_from_agent[:, -1, :3, 3]
+        already_world = np.broadcast_to(np.eye(4), (len(context), 4, 4))
+        limit, start = SceneConstraint(self.scenes, already_world, context.video), now.repeat(count, axis=0)
+        goal, path = limit.goals_on_support(drawn.goal.reshape(-1, 3), start), drawn.path
+        if path is not None:
+            free = limit.out_of_solid(path.reshape(len(start), -1, 3))
+            path = limit.on_support(free, start, self.rate_hz).reshape(path.shape)
+        return replace(drawn, goal=goal.reshape(drawn.goal.shape), path=path)
+
+
+@dataclass(frozen=True)
 class Ats:
     """The behavior model: goal, path and body by diffusion from the perception code."""
 
@@ -148,6 +169,16 @@ class Ats:
             rows = goal, root[..., :3, 3], root[..., :3, :3], bones.astype(np.float32)
             parts.append([part.reshape(len(chunk), count, *part.shape[1:]) for part in rows])
         return Samples(*map(np.concatenate, zip(*parts, strict=True)))
+
+    @property
+    def future(self) -> int:
+        """Number of predicted frames."""
+        return self.sampler.scaling.path_std.shape[1]
+
+    @property
+    def corrected(self) -> bool:
+        """Whether goals and paths are moved to where the animal may be."""
+        return self.sampler.corrections and self.sampling.avoid_solid and self.sampling.scene
 
     def goals(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw goals only, at a hundredth of the cost of plans."""

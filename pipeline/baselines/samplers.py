@@ -14,7 +14,7 @@ from jaxtyping import Float
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import Architecture, Scaling
 from pipeline.behavior.path_encoding import PATH_CHANNELS_OF
-from pipeline.behavior.planning import Array, PlanCondition, SampledPlan, Sampler, TorchNetworks
+from pipeline.behavior.planning import Array, PlanCondition, SampledPlan, Sampler, TorchNetworks, filled
 
 MEAN_STEP, LOG_STD_STEP = 0.0, 1.0
 """Steps at which the networks, given a zero sample, predict mean and log standard deviation."""
@@ -78,7 +78,9 @@ class GaussianSampler(Sampler):
         control = self.scaling.scaled_path(path)
         zeros = np.zeros((len(path), len(self.scaling.body_mean), path.shape[1]), np.float32)
         outputs = [
-            self.networks.body(zeros, _step(zeros, t), codes.full, control, _keep_mask(zeros, 1.0))
+            self.networks.body(
+                zeros, filled(len(zeros), t), codes.full, control, filled((len(zeros), 1), 1.0)
+            )
             for t in (MEAN_STEP, LOG_STD_STEP)
         ]
         scaled = np.swapaxes(self._sample_gaussian(outputs, rng), 1, 2)
@@ -86,15 +88,17 @@ class GaussianSampler(Sampler):
 
     def _goal(self, codes: PlanCondition) -> list[Array]:
         zeros = np.zeros((len(codes.full), 3), np.float32)
-        return [self.networks.goal(zeros, _step(zeros, t), codes.full) for t in (MEAN_STEP, LOG_STD_STEP)]
+        return [
+            self.networks.goal(zeros, filled(len(zeros), t), codes.full) for t in (MEAN_STEP, LOG_STD_STEP)
+        ]
 
     def _path(self, codes: PlanCondition, goal: Float[np.ndarray, "plan 3"]) -> list[Array]:
         control = self.scaling.scaled_goal(goal)
         channels, frames = PATH_CHANNELS_OF[self.scaling.encoding], self.scaling.path_std.shape[1]
         zeros = np.zeros((len(goal), channels, frames), np.float32)
-        keep = _keep_mask(zeros, float(codes.sampling.goal))
+        keep = filled((len(zeros), 1), float(codes.sampling.goal))
         return [
-            self.networks.path(zeros, _step(zeros, t), codes.full, control, keep)
+            self.networks.path(zeros, filled(len(zeros), t), codes.full, control, keep)
             for t in (MEAN_STEP, LOG_STD_STEP)
         ]
 
@@ -139,7 +143,9 @@ class OneStageSampler(Sampler):
         control = np.zeros((len(codes.full), 3, frames), np.float32)
 
         def denoise(code: Array):
-            return lambda x, t: self.networks.body(x, _step(x, t), code, control, _keep_mask(x, 0.0))
+            return lambda x, t: self.networks.body(
+                x, filled(len(x), t), code, control, filled((len(x), 1), 0.0)
+            )
 
         def correct(x: Array) -> Array:
             path = self.paths_out_of_solid(codes, x[:, :lead])
@@ -152,11 +158,3 @@ class OneStageSampler(Sampler):
         stds = solver.path_noise_std, solver.body_noise_std
         noise_std = np.repeat(stds, (lead, body))[:, None]
         return self._denoised(denoisers, shape, solver, steps, rng, correct, noise_std)
-
-
-def _step(x: Array, t: float) -> Array:
-    return np.full(len(x), t, np.float32)
-
-
-def _keep_mask(x: Array, keep: float) -> Array:
-    return np.full((len(x), 1), keep, np.float32)

@@ -245,7 +245,7 @@ class Sampler:
         """Draw goals in the ego frame, meters."""
 
         def denoise(code: Array) -> Denoise:
-            return lambda x, t: self.networks.goal(x, _filled(len(x), t), code)
+            return lambda x, t: self.networks.goal(x, filled(len(x), t), code)
 
         denoisers = [denoise(code[:: codes.count]) for code in (codes.full, *codes.references)]
         steps = codes.sampling.goal_steps or self.schedule.sampled_steps
@@ -275,7 +275,7 @@ class Sampler:
 
         def denoise(code: Array, keep: float = 0.0) -> Denoise:
             return lambda x, t: self.networks.path(
-                x, _filled(len(x), t), code, control, _filled((len(x), 1), keep)
+                x, filled(len(x), t), code, control, filled((len(x), 1), keep)
             )
 
         denoisers = [denoise(codes.full, float(codes.sampling.goal)), *map(denoise, codes.references)]
@@ -293,7 +293,7 @@ class Sampler:
 
         def denoise(code: Array, keep: float = float(self.guided == "observer")) -> Denoise:
             return lambda x, t: self.networks.body(
-                x, _filled(len(x), t), code, control, _filled((len(x), 1), keep)
+                x, filled(len(x), t), code, control, filled((len(x), 1), keep)
             )
 
         shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
@@ -363,5 +363,6 @@ def guidance_of(sampling: PlanSamplingConfig) -> tuple[float, ...]:
     return (sampling.guidance, *(1 + sum(scales[k:]) - len(scales[k:]) for k in range(len(scales))))
 
 
-def _filled(shape: int | tuple[int, int], value: float) -> Array:
+def filled(shape: int | tuple[int, int], value: float) -> Array:
+    """Return a step of every row, or masks of shape (rows, 1), with this value."""
     return np.full(shape, value, np.float32)

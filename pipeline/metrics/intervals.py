@@ -66,20 +66,23 @@ def episodes(
 
 
 def bootstrapped(
-    values: Float[np.ndarray, "window"],
+    values: Float[np.ndarray, "*seed window"],
     episode: Int[np.ndarray, "window"],
     rng: np.random.Generator,
     *,
     median: bool = False,
 ) -> Interval:
-    """Resample episodes with replacement; return the mean or median with its `interval_of_draws`.
+    """Return the mean or median with a 95 % interval from resampled episodes and, of the mean, seeds.
 
-    Values that are not finite are left out; NaN where there are no others.
+    Quantiles of resamples are too narrow for few episodes: of 15 normal ones they cover 91 %, of 5 84 %.
+    Their distances from the mean are multiplied by sqrt(n / (n - 1)) and by the ratio of the quantiles of
+    Student's and the normal distribution, as the mean of n normal values needs; they then cover 94 %.
+    Windows with values that are not finite are left out; NaN where there are no others.
     """
-    known = np.isfinite(values)
+    known = np.isfinite(np.atleast_2d(values)).all(0)
     if not known.any():
         return Interval(np.nan, np.nan, np.nan)
-    values, episode = values[known], np.unique(episode[known], return_inverse=True)[1]
+    values, episode = values[..., known], np.unique(episode[known], return_inverse=True)[1]
     middle = float(np.median(values) if median else values.mean())
     count = episode.max() + 1
     if count < 2:
@@ -89,20 +92,10 @@ def bootstrapped(
         parts = [values[episode == number] for number in range(count)]
         drawn = [np.median(np.concatenate([parts[number] for number in row])) for row in chosen]
     else:
-        total, size = np.bincount(episode, values, count), np.bincount(episode, minlength=count)
-        drawn = total[chosen].sum(1) / size[chosen].sum(1)
-    return interval_of_draws(middle, drawn, count)
-
-
-def interval_of_draws(
-    middle: float, drawn: Sequence[float] | Float[np.ndarray, "draw"], count: int
-) -> Interval:
-    """Return the 95 % interval of a mean or median from its values in resamples of ``count`` episodes.
-
-    Quantiles of the resamples are too narrow for few episodes: of 15 normal ones they cover 91 %, of 5 84 %.
-    Their distances from ``middle`` are multiplied by sqrt(n / (n - 1)) and by the ratio of the quantiles of
-    Student's and the normal distribution, as for the mean of n normal values; they then cover 94 %.
-    """
-    wider = float(t.ppf(BOUNDS[1], count - 1) / norm.ppf(BOUNDS[1]))
-    factor = math.sqrt(count / (count - 1)) * wider
-    return Interval(middle, *(middle + factor * float(b - middle) for b in np.quantile(drawn, BOUNDS)))
+        total = np.stack([np.bincount(episode, row, count) for row in np.atleast_2d(values)])
+        seeds = rng.integers(0, len(total), (BOOTSTRAP_DRAWS, len(total)))
+        mean = total[seeds].mean(1)
+        size = np.bincount(episode, minlength=count)
+        drawn = np.take_along_axis(mean, chosen, axis=1).sum(1) / size[chosen].sum(1)
+    wider = math.sqrt(count / (count - 1)) * float(t.ppf(BOUNDS[1], count - 1) / norm.ppf(BOUNDS[1]))
+    return Interval(middle, *(middle + wider * float(b - middle) for b in np.quantile(drawn, BOUNDS)))

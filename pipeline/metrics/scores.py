@@ -6,10 +6,10 @@ Each returns one number per window; the paper averages them over trials and all 
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from pipeline.baselines.predictors import Samples
-from pipeline.behavior.trajectories import Future
+from pipeline.baselines.predictors import WINDOWS_AT_ONCE, Ats, Predictor, Samples
+from pipeline.behavior.trajectories import BehaviorData, Future
 from pipeline.geometry import rigid
 
 GOAL_SCORES = ("goal_minde_m", "goal_energy_score_m")
@@ -67,3 +67,37 @@ SCORES: dict[str, Callable[[Samples, Future], Float[np.ndarray, "window"]]] = {
     "joints_minade_rad": joints_minade,
 }
 """All scores by name of the metric."""
+
+
+def scored(
+    method: Predictor,
+    data: BehaviorData,
+    goal_windows: Int[np.ndarray, "goal_window"],
+    plan_windows: Int[np.ndarray, "plan_window"],
+    *,
+    samples: int,
+    trials: int,
+    seed: int,
+) -> dict[str, Float[np.ndarray, "window"]]:
+    """Score goals, mean over trials of ``samples``, and one trial of plans if the method draws any, each on
+    windows of its own.
+    """
+    found: dict[str, list[np.ndarray]] = {name: [] for name in SCORES}
+    rng = np.random.default_rng(seed)
+    draw = method.goals if isinstance(method, Ats) else method.sample
+    for window in _chunks(goal_windows):
+        context, future = data.windows(window)
+        goals = draw(context, samples * trials, rng).goal.copy()  # may be a view of paths, which this frees
+        drawn = np.split(goals, trials, axis=1)
+        for name in GOAL_SCORES:
+            found[name].append(np.mean([SCORES[name](Samples(trial), future) for trial in drawn], axis=0))
+    for window in _chunks(plan_windows):
+        context, future = data.windows(window)
+        plans = method.sample(context, samples, rng)
+        for name in PLAN_SCORES if plans.path is not None else ():
+            found[name].append(SCORES[name](plans, future))
+    return {name: np.concatenate(parts) for name, parts in found.items() if parts}
+
+
+def _chunks(windows: Int[np.ndarray, "window"]) -> list[Int[np.ndarray, "some"]]:
+    return [windows[begin : begin + WINDOWS_AT_ONCE] for begin in range(0, len(windows), WINDOWS_AT_ONCE)]

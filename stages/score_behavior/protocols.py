@@ -29,8 +29,8 @@ def scores(
 
     Protocols are ``end_to_end``, ``networks`` and ``truth_fed``, see above. ``goal_window``, ``plan_window``:
     recording and first frame of the windows that goals, and plans, are scored on; ``window_frames``: numbers
-    of past and future frames. ``solid``: share of each window's sampled positions inside solid or unmapped
-    space, which projection makes zero up to its resolution.
+    of past and future frames. ``samples``: of a window, the best of which counts. ``solid``: share of each
+    window's sampled positions inside solid or unmapped space, which projection makes about zero.
     """
     rng, test = np.random.default_rng(scoring.seed), data.indices(TEST)
     many, few = test[:: scoring.stride], test[:: scoring.plan_stride]
@@ -56,6 +56,7 @@ def scores(
         "plan_window": _listed(data, few),
         "videos": np.array(data.videos, np.str_),
         "window_frames": np.array([data.past, data.future], np.int32),
+        "samples": np.array(scoring.samples, np.int32),
     }
     true = ats.scenes.inside_solid(future.path_world, context.video).mean(1)
     return (

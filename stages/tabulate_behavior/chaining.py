@@ -9,12 +9,11 @@ from scipy.stats import ks_2samp
 
 from pipeline.baselines.predictors import Ats
 from pipeline.behavior.config import ReplanningConfig
+from pipeline.behavior.path_encoding import REST_SPEED_M_S
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import AnimalBatch
 from pipeline.behavior.trajectories import TEST, BehaviorData
 
-REST_M_S = 0.05
-"""speed below which an animal rests: it breathes, and reconstructions err by more"""
 UPRIGHT_QUANTILE = 0.999
 """quantile of recorded tilts above which an animal counts as tilted"""
 
@@ -51,13 +50,13 @@ def figures(
         "behavior/ats/chain_solid_share_worst": float(np.max(solid)),
         "behavior/ats/chain_speed_ks": _mean_ks(speeds, [whole] * count),
         "behavior/ats/chain_speed_ks_pooled": _mean_ks([every], [whole]),
-        "behavior/ats/chain_moving_speed_ks": _mean_ks(speeds, [whole] * count, REST_M_S),
-        "behavior/ats/chain_moving_speed_ks_pooled": _mean_ks([every], [whole], REST_M_S),
+        "behavior/ats/chain_moving_speed_ks": _mean_ks(speeds, [whole] * count, REST_SPEED_M_S),
+        "behavior/ats/chain_moving_speed_ks_pooled": _mean_ks([every], [whole], REST_SPEED_M_S),
         "behavior/ats/chain_tilted_share": float(np.mean(tilt > tilted)),
-        "behavior/ats/chain_rest_share": float(np.mean(every < REST_M_S)),
+        "behavior/ats/chain_rest_share": float(np.mean(every < REST_SPEED_M_S)),
         "behavior/true/chain_speed_ks": _mean_ks(parts, others),
-        "behavior/true/chain_moving_speed_ks": _mean_ks(parts, others, REST_M_S),
-        "behavior/true/chain_rest_share": float(np.mean(whole < REST_M_S)),
+        "behavior/true/chain_moving_speed_ks": _mean_ks(parts, others, REST_SPEED_M_S),
+        "behavior/true/chain_rest_share": float(np.mean(whole < REST_SPEED_M_S)),
     }
 
 
@@ -70,14 +69,8 @@ def rollouts(
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "life frame 4 4"]:
     """Roll out the model from some windows in their homes; recorded observers walk in a loop."""
-    animals = AnimalBatch(
-        ats.sampler,
-        scenes,
-        data.agent_from_bone_rest,
-        ats.ego,
-        sampling=ats.sampling,
-        chaining=ReplanningConfig(),
-    )
+    rest, chaining = data.agent_from_bone_rest, ReplanningConfig()
+    animals = AnimalBatch(ats.sampler, scenes, rest, ats.ego, sampling=ats.sampling, chaining=chaining)
     context, _ = data.windows(window)
     walks = [
         data.trajectories[data.videos[video]].world_from_camera[:, :3, 3] for video in data.video[window]

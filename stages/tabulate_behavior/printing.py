@@ -30,11 +30,11 @@ FLIGHT = (
 )
 
 
-def tables(figures: Mapping[str, float | None], methods: tuple[str, ...]) -> str:
+def tables(figures: Mapping[str, float | None], methods: tuple[str, ...], samples: int = 16) -> str:
     """Return Tables 4 and 5 of the paper, and how often the animal flees, as text: mean [95 % interval]."""
     projected = "plans projected out of solid space, snapped to goals, redrawn"
     parts = [
-        table(f"Table 4: end to end, best of 16 samples; {projected}", END_TO_END, figures, methods),
+        table(f"Table 4: end to end, best of {samples} samples; {projected}", END_TO_END, figures, methods),
         table("Table 4 by the networks alone, as in the paper", NETWORKS, figures, methods),
         table("Table 5: given the true goal, and the true path; networks alone", TRUTH_FED, figures, methods),
     ]

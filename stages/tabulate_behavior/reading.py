@@ -24,6 +24,8 @@ class MethodScores:
     past: int = PAST
     future: int = FUTURE
     """known and predicted frames of a window"""
+    samples: int = 16
+    """samples per window (K), the best of which counts"""
 
     def windows_of(self, name: str) -> Int[np.ndarray, "window 2"]:
         """Return the windows that a score belongs to; every approach is an episode of its own."""
@@ -41,7 +43,7 @@ def stacked(folders: Sequence[Path]) -> MethodScores:
         read[0]["goal_window"],
         read[0]["plan_window"],
         {name: np.stack([each[name] for each in read]) for name in names},
-        *(int(frames) for frames in read[0]["window_frames"]),
+        *(int(number) for number in (*read[0]["window_frames"], read[0]["samples"])),
     )
 
 

@@ -38,15 +38,16 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
         scores[method] = reading.stacked([inputs.behavior_scores[trial] for trial in trials])
         curves[method] = reading.curves([inputs.behavior_trials[trial] for trial in trials])
     data = BehaviorData.load(inputs.behavior_data).with_horizon(scores[OURS].future)
-    scores |= untrained.scores(data, scores[OURS], trials=config.trials, seed=config.seed)
+    scenes = Scenes.load(inputs.behavior_data, data.videos)
+    ats = Ats.load(inputs.behavior_trials[f"{OURS}-0"], scenes, PlanSamplingConfig(), device=device)
+    places = scenes if ats.corrected else None
+    scores |= untrained.scores(data, places, scores[OURS], trials=config.trials, seed=config.seed)
     figures = tables.figures(scores, OURS, seed=config.seed) | tables.plateaus(curves)
     if config.rollouts:
-        scenes = Scenes.load(inputs.behavior_data, data.videos)
-        ats = Ats.load(inputs.behavior_trials[f"{OURS}-0"], scenes, PlanSamplingConfig(), device=device)
         figures |= chaining.figures(
             ats, data, scenes, count=config.rollouts, seconds=config.rollout_s, seed=config.seed
         )
-    text = printing.tables(figures, tuple(scores))
+    text = printing.tables(figures, tuple(scores), scores[OURS].samples)
     progress.log(f"\n{text}")
     (out / "tables.json").write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
     (out / "tables.txt").write_text(text + "\n")

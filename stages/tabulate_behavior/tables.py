@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.metrics.intervals import BOOTSTRAP_DRAWS, Interval, episodes, interval_of_draws
+from pipeline.metrics.intervals import Interval, bootstrapped, episodes
 from stages.tabulate_behavior.reading import MethodScores
 
 UNPREFIXED = "end_to_end"
@@ -44,38 +44,19 @@ def figures(found: Mapping[str, MethodScores], ours: str, *, seed: int) -> dict[
 
 
 def _add_contrasts(table: dict[str, float | None], method: str, scores: MethodScores, seed: int) -> None:
-    """Add the contrasts within one method: `CONTRASTS`, and paths given the true goal against end to end."""
+    """Add the contrasts within one method."""
     for name, first, second in CONTRASTS:
         if first in scores.values and second in scores.values:
             difference, frames = scores.values[first] - scores.values[second], scores.past + scores.future
             found = interval(difference, scores.windows_of(first), frames, seed)
             table |= found.as_figures(f"behavior/{method}/{name}")
-    given_goal = scores.values.get("truth_fed/path_minade_m")
-    end_to_end = scores.values.get(f"{UNPREFIXED}/path_minade_m")
-    if given_goal is not None and end_to_end is not None:
-        table[f"behavior/{method}/path_minade_truth_fed_share"] = float(given_goal.mean() / end_to_end.mean())
 
 
 def interval(
     values: Float[np.ndarray, "seed window"], window: Int[np.ndarray, "window 2"], frames: int, seed: int
 ) -> Interval:
-    """Return the mean and its 95 % bootstrap interval over seeds and episodes of ``frames`` frames.
-
-    The bounds of a single episode are NaN.
-    """
-    rng = np.random.default_rng(seed)
-    episode = episodes(window[:, 1], window[:, 0], frames)
-    count = episode.max() + 1
-    if count == 1:
-        return Interval(float(values.mean()), np.nan, np.nan)
-    total = np.stack([np.bincount(episode, row, count) for row in values])
-    size = np.bincount(episode, minlength=count)
-    resamples = (rng.integers(0, number, (BOOTSTRAP_DRAWS, number)) for number in (count, len(values)))
-    means = [
-        total[drawn][:, chosen].sum() / (size[chosen].sum() * len(values))
-        for chosen, drawn in zip(*resamples, strict=True)
-    ]
-    return interval_of_draws(float(values.mean()), means, count)
+    """Return the mean and its interval over seeds and episodes of ``frames`` frames; NaN of one episode."""
+    return bootstrapped(values, episodes(window[:, 1], window[:, 0], frames), np.random.default_rng(seed))
 
 
 def plateaus(curves: Mapping[str, Mapping[str, Float[np.ndarray, "seed step"]]]) -> dict[str, float]:

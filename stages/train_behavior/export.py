@@ -150,11 +150,7 @@ def golden_plan(sampler: Sampler, architecture: Architecture) -> dict:
             "others": _plain(observation.others),
             "keep": [1, 1, 1],
         },
-        "sampling": {
-            "method": sampling.method,
-            "goal_steps": sampling.goal_steps,
-            "sequence_steps": sampling.sequence_steps,
-        },
+        "sampling": {name: getattr(sampling, name) for name in ("method", "goal_steps", "sequence_steps")},
         "noise": {name: _plain(value) for name, value in drawn.items()},
         "plans": {
             name: {k: _plain(value) for k, value in vars(plan).items()} for name, plan in plans.items()

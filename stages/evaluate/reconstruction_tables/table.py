@@ -124,13 +124,12 @@ def _compare(
     found: Metrics, variant: str, lacking: Float[np.ndarray, "view part"], rng: np.random.Generator
 ) -> None:
     """Put the mean difference of pictures to the reference; neighboring pictures are resampled together."""
-    for column, part in enumerate(PARTS):
-        seen = np.flatnonzero(np.isfinite(lacking[:, column]))
-        if not len(seen):
-            continue
-        episode = episodes(seen, np.zeros(len(seen), int), EPISODE_FRAMES)
-        interval = bootstrapped(lacking[seen, column], episode, rng)
-        found.put_mean(f"{variant}/depth_acc_{part}_less_than_reference", interval)
+    number = np.arange(len(lacking))
+    episode = episodes(number, np.zeros_like(number), EPISODE_FRAMES)
+    for part, values in zip(PARTS, lacking.T, strict=True):
+        if np.isfinite(values).any():
+            interval = bootstrapped(values, episode, rng)
+            found.put_mean(f"{variant}/depth_acc_{part}_less_than_reference", interval)
 
 
 def text(values: Mapping[str, float | None], variants: Sequence[str]) -> str:

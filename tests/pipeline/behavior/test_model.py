@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.baselines.predictors import Ats, ConstantVelocity, LocationPrior, StandStill
+from pipeline.baselines.predictors import Ats, ConstantVelocity, Corrected, LocationPrior, StandStill
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import BehaviorNets, Scaling, bones_from_channels, channels_from_bones
@@ -190,3 +190,20 @@ def test_data_survive_saving(data, tmp_path):
     for before, after in zip(data.windows(np.arange(9)), loaded.windows(np.arange(9)), strict=True):
         for name, value in vars(before).items():
             np.testing.assert_array_equal(getattr(after, name), value)
+
+
+def test_corrected_baselines_are_in_free_space_and_keep_what_was_free(data):
+    train, (test, _) = data.windows(data.indices(TRAIN)), data.windows(data.indices(TEST)[::7])
+    scenes = Scenes.of(room())
+    for kind in (LocationPrior, ConstantVelocity):
+        plain = kind.fit(*train)
+        drawn, moved = (
+            each.sample(test, 20, np.random.default_rng(0)) for each in (plain, Corrected(plain, scenes, 10))
+        )
+        for before, after in ((drawn.goal, moved.goal), (drawn.path, moved.path)):
+            if before is None or after is None:
+                continue
+            solid = scenes.inside_solid(before, test.video)
+            assert solid.mean() > 0.01
+            assert not scenes.inside_solid(after, test.video).any()
+            np.testing.assert_allclose(after[~solid][:, ::2], before[~solid][:, ::2], atol=1e-9)

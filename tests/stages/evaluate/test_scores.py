@@ -248,7 +248,7 @@ def test_windows_of_the_whole_test_are_evaluated_and_counted(data):
 
 def test_chunked_evaluation_gives_the_same_scores(data, monkeypatch):
     few = behavior.behavior_metrics(data, Oracle(data), PROTOCOL).values
-    monkeypatch.setattr(behavior, "WINDOWS_AT_ONCE", 1000)
+    monkeypatch.setattr(scores, "WINDOWS_AT_ONCE", 1000)
     assert behavior.behavior_metrics(data, Oracle(data), PROTOCOL).values == few
     monkeypatch.undo()
     tracemalloc.start()

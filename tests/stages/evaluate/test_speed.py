@@ -17,7 +17,12 @@ from pipeline.metrics.metrics import Metrics
 from stages.evaluate import speed, stage
 from stages.evaluate.config import Config
 
-DATA = SimpleNamespace(start=np.zeros(1), windows=lambda index: (None, None), videos=())
+DATA = SimpleNamespace(
+    start=np.zeros(1),
+    windows=lambda index: (None, None),
+    videos=(),
+    with_horizon=lambda future: SimpleNamespace(future=future),
+)
 
 
 @dataclass(frozen=True)
@@ -25,6 +30,8 @@ class Watched:
     """Records the number of threads of each call."""
 
     device: str = "cpu"
+    future: int = 40
+    corrected: bool = False
     sampling: PlanSamplingConfig = PlanSamplingConfig()
     threads: list[int] = field(default_factory=list)
 
@@ -41,17 +48,22 @@ def test_plans_are_timed_with_one_thread():
     assert set(ours.threads) == {1} and values["simulator/plan_few_s"] >= 0
 
 
-def test_plans_are_timed_on_the_cpu(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+@pytest.mark.parametrize("corrected", [True, False])
+def test_devices_horizon_and_corrections_are_those_of_the_model(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, corrected: bool
+):
     asked = {}
 
     def nothing(*given: object, **named: object) -> Metrics:
         return Metrics()
 
     def loaded(*given: object, device: str) -> Watched:
-        return Watched(device)
+        return Watched(device, corrected=corrected)
 
     def remembers(room: str):
-        def metrics(data: object, ours: Watched, *given: object, **named: object) -> Metrics:
+        def metrics(data: SimpleNamespace, ours: Watched, *given: object, **named: object) -> Metrics:
+            assert data.future == ours.future
+            assert room != "behavior" or (given[-1] is not None) == corrected, "baselines as ours"
             asked[room] = ours.device
             return Metrics()
 

@@ -42,6 +42,8 @@ def test_breathing_counts_as_rest():
     speed = np.linalg.norm(np.diff(tested.world_from_agent[:, :3, 3], axis=0), axis=-1) * RATE_HZ
     assert found["behavior/ats/chain_rest_share"] == 1 and found["behavior/ats/chain_solid_share"] == 0
     assert found["behavior/ats/chain_tilted_share"] == 0, "upright all the time"
-    assert found["behavior/true/chain_rest_share"] == pytest.approx((speed < chaining.REST_M_S).mean())
-    assert found["behavior/ats/chain_moving_speed_ks"] == pytest.approx((speed > chaining.REST_M_S).mean())
+    assert found["behavior/true/chain_rest_share"] == pytest.approx((speed < chaining.REST_SPEED_M_S).mean())
+    assert found["behavior/ats/chain_moving_speed_ks"] == pytest.approx(
+        (speed > chaining.REST_SPEED_M_S).mean()
+    )
     assert found["behavior/ats/chain_moving_speed_ks"] <= found["behavior/ats/chain_speed_ks"]
