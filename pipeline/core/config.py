@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 LARGEST_INTEGER = (1 << 63) - 1
 """64 bits, as TOML guarantees; larger ones may not fit a float either."""
+NEVER_ZERO = ("_hz", "_px", "_size", "batch", "epochs", "stride", "trials")
+"""Endings of keys of rates, sizes and numbers that nothing can be made with none of."""
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlong, _SHORT.maxstring, _SHORT.maxother = 4, 40, 100, 200
 _SHORT.maxtuple = _SHORT.maxlist = _SHORT.maxdict = 20
@@ -81,10 +83,10 @@ def refuse_unknown(
 
 
 def refuse_impossible(value: Any, default: Any, *, where: str) -> None:
-    """Raise REC-002 for non-finite numbers, unexpected negative ones, and a rate or size of 0."""
+    """Raise REC-002 for non-finite numbers, unexpected negative ones, and a `NEVER_ZERO` of 0."""
     if not isinstance(value, int | float) or not isinstance(default, int | float):
         return
-    zero_size = where.endswith(("_hz", "_px")) and value == 0
+    zero_size = where.endswith(NEVER_ZERO) and value == 0
     non_negative = default > 0 or (default == 0 and isinstance(default, int))
     if not math.isfinite(value) or (non_negative and value < 0) or (default > 0 and zero_size):
         remedy = f"give a number as the default is, {default!r}"

@@ -10,7 +10,7 @@ from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
 from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.trajectories import FUTURE, RATE_HZ, TRAIN, BehaviorData
+from pipeline.behavior.trajectories import RATE_HZ, TEST, BehaviorData
 from pipeline.core import progress
 from pipeline.geometry import subsampling
 from pipeline.longterm.journeys import LongTermWorld, refine_at_rate
@@ -26,18 +26,20 @@ UNITS = ("m", "m_s", "m", "m")
 def figures(
     source: MotionSource, model: Path, behavior_data: Path, config: Config, device: str
 ) -> dict[str, float | None]:
-    """Sample one plan per window, optimize it, and compare penetration, foot skate and errors.
+    """Sample one plan per test window, optimize it, and compare penetration, foot skate and errors.
 
     Returns `<name>_before_<unit>`, `<name>_<unit>` and their difference `<name>_more_<unit>`, with intervals
-    over episodes.
+    over episodes; nothing without a test window.
     """
     data = source.data
     assert data is not None, "only recorded motion has samples of the behavior model"
-    windows = np.flatnonzero(data.split != TRAIN)
-    windows = windows if len(windows) else np.flatnonzero(data.split == TRAIN)
+    windows = data.indices(TEST)
+    if not len(windows):
+        progress.log("no test window: samples of the behavior model are not measured")
+        return {}
     windows = windows[subsampling.evenly(len(windows), config.samples)]
     both = rows(source.world, data, windows, model, behavior_data, config, device)
-    episode = episodes(data.start[windows], data.video[windows], FUTURE)
+    episode = episodes(data.start[windows], data.video[windows], data.past + data.future)
     found: dict[str, float | None] = {"longterm_samples/windows": float(len(windows))}
     for column, (name, unit) in enumerate(zip(NAMES, UNITS, strict=True)):
         before, after = both[..., column].T

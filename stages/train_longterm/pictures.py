@@ -30,7 +30,7 @@ ARROW_M, ARROW_FRAMES = 0.15, 15
 """Length of the heading lines, and frames between them."""
 CAPTIONS = {
     "losses": "Loss of each network over its training, smoothed.",
-    "routes": f"Held-out routes in panels of {2 * SHOWN_M:g} m: true blue, generated orange, scene gray.",
+    "routes": f"Routes (held out if any) in panels of {2 * SHOWN_M:g} m: true blue, made orange, scene gray.",
 }
 
 
@@ -38,7 +38,7 @@ def evaluate_held_out(
     learned: TrainedLongTerm, dataset: DatasetSplit, seed: int
 ) -> tuple[list[Check], list[Picture]]:
     """Return checks and pictures of a model on held-out motion, or on training motion if none is held out."""
-    where = dataset.held_out or dataset.train
+    where, kind = (dataset.held_out, "held-out") if dataset.held_out else (dataset.train, "training")
     rng = np.random.default_rng(seed)
     cuts = select_clips(where, rng, stride=CLIP_STRIDE, most=TRIED)
     clips = encode_selection(where, cuts, learned.model.poses, learned.model.sizes.points, rng)
@@ -50,8 +50,8 @@ def evaluate_held_out(
     gap, depth = _stills(learned, where, rng)
     explained = float(learned.model.poses.explained)
     checks = [
-        Check("L1 of held-out routes", 100 * error, "cm", 10.0),
-        Check("L1 of held-out routes against straight lines", error / max(straight, 1e-9), "", 0.9),
+        Check(f"L1 of {kind} routes", 100 * error, "cm", 10.0),
+        Check(f"L1 of {kind} routes against straight lines", error / max(straight, 1e-9), "", 0.9),
         Check("bodies at sub-goals: gap to the scene, median", 100 * gap, "cm", 2.0),
         Check("bodies at sub-goals: deepest vertex in the scene, median", 100 * depth, "cm", 4.0),
         Check("contact vertices found", len(learned.model.contacts.vertices), "", 10, 1, "higher"),

@@ -8,7 +8,7 @@ from pipeline.behavior.trajectories import BehaviorData
 from pipeline.core.errors import InputError
 from pipeline.data import npz, ply
 from pipeline.longterm.examples import DatasetSplit, MotionDataset, reconstructed_split
-from pipeline.longterm.short_motions import resample_motion
+from pipeline.longterm.short_motions import STEPS, resample_motion
 from pipeline.longterm.smplx_bodies import motion_from_parameters, smplx_body
 from pipeline.longterm.surroundings import MotionScene
 from stages.train_longterm import prox
@@ -50,10 +50,12 @@ def people(model: Path, folder: Path) -> DatasetSplit:
         for each in loaded
     ]
     motions = tuple(map(resample_motion, (each["timestamp_s"] for each in loaded), fitted))
+    last = max(len(motions) - 1, 1)
+    if max(map(len, motions[:last])) <= STEPS:
+        raise InputError("LTM-001", NO_MOTION, str(folder), "give recordings of more than two seconds")
     roots = np.concatenate([motion.world_from_agent[:, :3, 3] for motion in motions])
     scene = MotionScene.for_motion(ply.read_ply(folder / "scene.ply"), roots, reach_m=STUDY_REACH_M)
     dataset = MotionDataset(person.body, motions, (0,) * len(motions), (scene,))
-    last = max(len(motions) - 1, 1)
     return DatasetSplit.of(dataset, ["train"] * last + ["test"] * (len(motions) - last))
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.core import distributed, progress
+from pipeline.core.errors import InputError
 from pipeline.data import qa
 from pipeline.longterm import simulated_lives
 from pipeline.longterm.examples import DatasetSplit
@@ -25,7 +26,8 @@ class Inputs:
 def run(inputs: Inputs, config: Config, out: Path, *, resume: Path | None = None) -> TrainedLongTerm:
     """Train all networks; the first process writes `longterm.safetensors`, `longterm.json`, `ablations/`.
 
-    Raises InputError LTM-001 to LTM-004 for missing motion, weights or SMPL-X.
+    Raises InputError REC-002 for SMPL-X without motions, or the reverse, and LTM-001 to LTM-005 for missing
+    or damaged motion, weights or SMPL-X.
     """
     distributed.join("cpu")
     split = _read(inputs, config)
@@ -48,8 +50,11 @@ def run(inputs: Inputs, config: Config, out: Path, *, resume: Path | None = None
 
 
 def _read(inputs: Inputs, config: Config) -> DatasetSplit:
-    if config.smplx_model is not None:
-        return sources.people(Path(config.smplx_model), Path(config.smplx_motions or ""))
+    if (config.smplx_model is None) != (config.smplx_motions is None):
+        what, remedy = "one of smplx_model and smplx_motions is missing", "give both to learn people, or none"
+        raise InputError("REC-002", what, "[longterm]", remedy)
+    if config.smplx_model is not None and config.smplx_motions is not None:
+        return sources.people(Path(config.smplx_model), Path(config.smplx_motions))
     if inputs.longterm_world is not None:
         return simulated_lives.load(inputs.longterm_world)
     assert inputs.reconstruction is not None and inputs.behavior_data is not None, "nothing to learn from"

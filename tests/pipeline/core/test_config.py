@@ -17,6 +17,8 @@ DEEPLY_NESTED = functools.reduce(lambda inner, _: {"a": inner}, range(5000), {})
 @dataclass(frozen=True)
 class Inner:
     width_m: float = 1.0
+    batch: int = 16
+    epochs: float = 20.0
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,8 @@ def test_table_is_converted_to_a_dataclass():
         ({"steps": -1}, "REC-002"),
         ({"seed": -1}, "REC-002"),
         ({"side_px": 0}, "REC-002"),
+        ({"inner": {"batch": 0}}, "REC-002"),
+        ({"inner": {"epochs": 0.0}}, "REC-002"),
         ({"kind": "c"}, "REC-002"),
         ({"sizes": 3}, "REC-002"),
         ({"name": 3}, "REC-002"),

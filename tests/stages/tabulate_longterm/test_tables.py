@@ -9,9 +9,10 @@ from pipeline.longterm.clip_channels import Clips
 from pipeline.longterm.config import MotionOptimizationConfig
 from pipeline.longterm.examples import DatasetSplit, encode_selection, select_clips
 from pipeline.longterm.short_motions import BodyMotion
-from stages.tabulate_longterm import bars, comparison, lengths, methods, scores, tables
+from stages.tabulate_longterm import bars, comparison, lengths, methods, samples, scores, tables
 from stages.tabulate_longterm.config import Config
 from stages.tabulate_longterm.reading import MotionSource
+from tests.pipeline.behavior.wandering import wandering
 from tests.pipeline.longterm import strider
 from tests.pipeline.longterm.strider import SIZES
 
@@ -138,6 +139,22 @@ def test_long_takes_are_measured(source):
     assert found["longterm_minutes/seconds"] >= 12.0
     assert found["longterm_minutes/subgoals"] == 3
     assert found["longterm_minutes/outside_room_m"] < 0.05
+
+
+def test_samples_of_training_windows_are_never_measured(source, monkeypatch, tmp_path):
+    data, chosen = wandering(), []
+
+    def rows(world, data, windows, *_):
+        chosen.extend(windows)
+        return np.ones((len(windows), 2, 4))
+
+    monkeypatch.setattr(samples, "rows", rows)
+    for split, count in ((data.split, SMALL.samples), (0 * data.split, 0)):
+        chosen.clear()
+        recorded = replace(source, data=replace(data, split=split))
+        found = samples.figures(recorded, tmp_path, tmp_path, SMALL, "cpu")
+        assert found.get("longterm_samples/windows", 0) == min(count, (split == 1).sum()) == len(chosen)
+        assert (split[chosen] == 1).all()
 
 
 def test_clips_with_an_obstacle_between_their_ends_are_marked(source):

@@ -157,3 +157,6 @@ def test_pictures_show_held_out_motion(dataset, learned):
     )
     assert {picture.name for picture in shown} == {"losses", "routes"}
     assert all(np.isfinite(check.value) for check in checks)
+    assert any("held-out routes" in check.name for check in checks)
+    checks, _ = pictures.evaluate_held_out(learned, DatasetSplit(dataset, None), 0)
+    assert not any("held-out" in check.name for check in checks), "training motion is not called held out"
