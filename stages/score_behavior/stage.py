@@ -38,7 +38,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
     architecture = behavior.load(inputs.behavior_trials)[0]
     data = BehaviorData.load(inputs.behavior_data).with_horizon(architecture.future)
     if not len(data.indices(TEST)):
-        remedy = "record a session for the test, 6.4 s or longer"
+        remedy = f"record a session for the test, {(data.past + data.future) / data.rate_hz:g} s or longer"
         raise InputError("BEH-004", "there is no test window", str(inputs.behavior_data), remedy)
     scenes = Scenes.load(inputs.behavior_data, data.videos)
     ats = Ats.load(inputs.behavior_trials, scenes, PlanSamplingConfig(), device=device)

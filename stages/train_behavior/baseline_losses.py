@@ -17,6 +17,7 @@ from stages.train_behavior.objective import (
     MOTION_WEIGHT,
     Denoise,
     TrainingPhase,
+    goal_targets,
     joint_mask,
     level_losses,
     partly_foreseen,
@@ -36,13 +37,16 @@ def gaussian_losses(
 ) -> dict[str, Float[Tensor, ""]]:
     """Return the negative log-likelihood per channel of goal, path and body, each given the level above.
 
+    Goals are learned as ours are: by each member of the ensemble, and at earlier times, too.
     Paths are positions, as in the paper: a mean of strides, which are 0 at rest, is no mean of paths.
     """
     del schedule
     batch = replace(batch, path=torch.cat([batch.places, batch.path[:, 3:]], dim=1))
 
     def goal(code: Tensor) -> Tensor:
-        return negative_log_likelihood(lambda x, t: nets.goal(x, t, code), batch.goal)
+        clean, horizon = goal_targets(batch, objective, generator)
+        each = negative_log_likelihood(lambda x, t: nets.goal.per_member(x, t, code, horizon), clean)
+        return each.mean(0)
 
     each = negative_log_likelihood
     return level_losses(nets, batch, objective, generator, phase, goal, each, each)

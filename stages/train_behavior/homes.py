@@ -18,11 +18,11 @@ from pipeline.environments.other_home import ReconstructedHome, perceived
 
 
 def windows_of_all(homes: Habitat) -> Int[np.ndarray, "window"]:
-    """Return the training windows of all homes, repeated so that all homes have as many."""
+    """Return the training windows of all homes, evenly repeated so that all homes have as many."""
     index = homes.data.indices(TRAIN)
     each = [index[homes.home_of_window[index] == number] for number in range(homes.home_of_video.max() + 1)]
     most = max(len(mine) for mine in each)
-    return np.concatenate([np.resize(mine, most) for mine in each if len(mine)])
+    return np.concatenate([mine[np.arange(most) * len(mine) // most] for mine in each if len(mine)])
 
 
 def with_other_homes(

@@ -167,19 +167,25 @@ def goal_error(
     objective: ObjectiveConfig,
     generator: torch.Generator,
 ) -> Float[Tensor, "draw 3"]:
-    """Return the error of goals, mean over members; some draws have targets at earlier times."""
-    draws, frames = objective.goal_draws, batch.track.shape[-1]
-    count = len(code) * draws
+    """Return the error of goals, mean over members."""
+    clean, horizon = goal_targets(batch, objective, generator)
+    error = squared_error(
+        lambda x, t: nets.goal.per_member(x, t, code, horizon),
+        clean, schedule, objective.weighting, generator,
+    )  # fmt: skip
+    return error.mean(0)
+
+
+def goal_targets(
+    batch: TrainingBatch, objective: ObjectiveConfig, generator: torch.Generator
+) -> tuple[Float[Tensor, "draw 3"], Float[Tensor, "draw"]]:
+    """Return several goals of each window and their times as shares of the horizon; some are earlier."""
+    draws, frames, device = objective.goal_draws, batch.track.shape[-1], batch.track.device
+    count = len(batch.track) * draws
     earlier = torch.rand(count, generator=generator) < objective.earlier_share
     drawn = torch.randint(round(EARLIEST_GOAL * frames), frames, (count,), generator=generator)
-    frame = torch.where(earlier, drawn, frames - 1).to(code.device)
-    row = torch.arange(count, device=code.device) // draws
-    horizon = (frame + 1) / frames
-    clean, weighting = batch.track[row, :, frame], objective.weighting
-    error = squared_error(
-        lambda x, t: nets.goal.per_member(x, t, code, horizon), clean, schedule, weighting, generator
-    )
-    return error.mean(0)
+    frame = torch.where(earlier, drawn, frames - 1).to(device)
+    return batch.track[torch.arange(count, device=device) // draws, :, frame], (frame + 1) / frames
 
 
 def keep_mask(size: int, count: int, generator: torch.Generator) -> Float[Tensor, "batch count"]:

@@ -21,6 +21,7 @@ from pipeline.core.errors import InputError
 from pipeline.environments.homes import Habitat
 from pipeline.geometry import rigid_torch
 from stages.train_behavior import objective, outcome, pictures, training
+from stages.train_behavior.baseline_losses import gaussian_losses
 from stages.train_behavior.batches import (
     MAX_REPEATS,
     approached,
@@ -46,6 +47,7 @@ from stages.train_behavior.export import (
     write_networks,
 )
 from stages.train_behavior.objective import (
+    FORESEEN_SHARE,
     goal_error,
     joint_mask,
     losses,
@@ -613,6 +615,30 @@ def test_earlier_goals_have_the_given_probability(windows, share, lowest, highes
     assert error.shape == (4 * len(batch.goal), 3)
     assert error.abs().max() < 1e-3  # the true goal for the requested time
     assert lowest - 1e-6 <= nets.horizons.min() <= highest
+
+
+def test_gaussian_goals_are_learned_by_each_member_and_at_earlier_times(windows, untrained, monkeypatch):
+    batch, _ = drawn(windows, PLAIN)
+    asked, answers, of_each = [], [], untrained.goal.per_member
+
+    def per_member(x, t, code, horizon):
+        asked.append(horizon)
+        answers.append(of_each(x, t, code, horizon))
+        return answers[-1]
+
+    monkeypatch.setattr(untrained.goal, "per_member", per_member)
+    settings = ObjectiveConfig(goal_draws=4, code_dropout=0.0)
+    generator = torch.Generator().manual_seed(0)
+    found = gaussian_losses(untrained, batch, Schedule(), settings, generator, phase="goals")["goal"]
+    assert all(len(horizon) == 4 * len(batch.goal) for horizon in asked)
+    assert min(horizon.min() for horizon in asked) < 0.5 < 1 == max(horizon.max() for horizon in asked)
+    errors = []
+    for horizon, mean, log_std in zip(asked[::2], answers[::2], answers[1::2], strict=True):
+        row = torch.arange(len(horizon)) // 4
+        clean = batch.track[row, :, (horizon * batch.track.shape[-1]).round().long() - 1]
+        errors.append(-torch.distributions.Normal(mean, log_std.clamp(-5, 2).exp()).log_prob(clean).mean())
+    goal, informed = errors
+    torch.testing.assert_close(found, (goal + FORESEEN_SHARE * informed) / (1 + FORESEEN_SHARE))
 
 
 @pytest.mark.parametrize(

@@ -69,6 +69,18 @@ def test_homes_are_sampled_with_equal_probability(learned):
     assert set(drawn) == set(range(len(few)))
 
 
+def test_windows_of_a_smaller_home_are_repeated_evenly(learned):
+    data = learned.data
+    train = data.indices(TRAIN)
+    own = train[learned.home_of_window[train] == 0]
+    few = np.concatenate([own[: round(0.6 * len(own))], train[learned.home_of_window[train] == 1]])
+    some = replace(data, **{name: getattr(data, name)[few] for name in ("video", "start", "split")})
+    count = np.bincount(windows_of_all(replace(learned, data=some)))[: round(0.6 * len(own))]
+    halves = [half.mean() for half in np.array_split(count, 2)]
+    assert set(count) == {1, 2}
+    assert halves[0] == pytest.approx(halves[1], abs=0.1), "early windows are not drawn more often"
+
+
 def test_bodies_are_learned_from_the_own_home_only(learned):
     windows = windows_from_data(learned, ARCHITECTURE)
     drawn = AugmentationConfig(mirror=0.0)
