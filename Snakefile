@@ -43,7 +43,6 @@ for node in dag.FLOW:
         name: node.artifact
         input: partial(engine.inputs, node)
         output: engine.output(node)
-        benchmark: engine.benchmark(node)
         threads: node.threads
         resources:
             mem_mb=partial(engine.memory_mb, node),

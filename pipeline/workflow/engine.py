@@ -74,11 +74,6 @@ def output(node: dag.Node) -> str:
     return f"build/{{home}}/{node.artifact}/{'{part}/' if node.several else ''}{artifact.STAMP}"
 
 
-def benchmark(node: dag.Node) -> str:
-    """Return the file for Snakemake's own measurements of a node's jobs, as a pattern."""
-    return f"build/{{home}}/benchmarks/{node.artifact}{'.{part}' if node.several else ''}.tsv"
-
-
 def job_pattern(node: dag.Node) -> str:
     """Return the id of a node's jobs, as a pattern."""
     return f"{node.artifact}.{{part}}" if node.several else node.artifact

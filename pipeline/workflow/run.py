@@ -11,6 +11,7 @@ meet. --attempt: of an engine that tries again; above 1, a job that ended with 2
 not run. What a job printed stands in build/<home>/logs/<job>.<number>.log. Standard library only.
 """
 
+import contextlib
 import json
 import os
 import platform
@@ -76,7 +77,7 @@ def _run(home: str, job_id: str, engine: Engine) -> int | None:
     redo = jobs.redo_mark(job["home"], job_id)
     waiting = f"[{job_id}] is being made by another build; waiting for it"
     with artifact.locked(Path("build", job["home"], "plan", "locks", job_id), waiting):
-        artifact.clean(out, _record(job), _failure(job))
+        artifact.clean(out, _file_of(job, "records"), _file_of(job, "failures"))
         key = _key(job)
         made = artifact.read_manifest(out)
         if made is None or made.key != key or redo.exists():
@@ -88,9 +89,9 @@ def _run(home: str, job_id: str, engine: Engine) -> int | None:
                 shutil.rmtree(resume, ignore_errors=True)
             code = _do(job, key, resume, engine)
             if code:
-                _write_json(_failure(job), {"key": key, "code": code})
+                _write_json(_file_of(job, "failures"), {"key": key, "code": code})
                 return code
-        _failure(job).unlink(missing_ok=True)
+        _file_of(job, "failures").unlink(missing_ok=True)
         redo.unlink(missing_ok=True)
         stamps.put(stamp, job["keys"])
         try:  # after the stamp: a planner reads stamps after keys
@@ -104,17 +105,13 @@ def _run(home: str, job_id: str, engine: Engine) -> int | None:
     return 0
 
 
-def _record(job: dict[str, Any]) -> Path:
-    return Path("build", job["home"], "records", f"{job['id']}.json")
-
-
-def _failure(job: dict[str, Any]) -> Path:
-    return Path("build", job["home"], "failures", f"{job['id']}.json")
+def _file_of(job: dict[str, Any], kind: str) -> Path:
+    return Path("build", job["home"], kind, f"{job['id']}.json")
 
 
 def _failed_before(job: dict[str, Any], key: str) -> int:
     """Return the exit code of the job's last failure if it is deterministic and the key the same, else 0."""
-    last = artifact.read_json(_failure(job))
+    last = artifact.read_json(_file_of(job, "failures"))
     return last["code"] if last and last["key"] == key and last["code"] in FINAL_CODES else 0
 
 
@@ -172,7 +169,7 @@ def _publish(job: dict[str, Any], key: str, command: list[str], log: TextIO) -> 
         "commit": _commit(),
         "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
-    _write_json(_record(job), record)
+    _write_json(_file_of(job, "records"), record)
     _say(job["id"], f"done in {seconds:.1f} s, peak {usage.ru_maxrss / 1024:.0f} MB{_quality(out)}", log)
     return 0
 
@@ -277,9 +274,14 @@ def _forward(job_id: str, lines: Any, log: TextIO) -> None:
 
 
 def _say(job_id: str, text: str, log: TextIO | None = None) -> None:
-    print(f"[{job_id}] {text}", file=sys.stderr, flush=True)
-    if log is not None and not log.closed:
-        print(text, file=log, flush=True)
+    """Print a line; where nobody reads it, or the disk is full, the stage must not wait."""
+    try:
+        print(f"[{job_id}] {text}", file=sys.stderr, flush=True)
+    except OSError:
+        sys.stderr = open(os.devnull, "w")
+    with contextlib.suppress(OSError):
+        if log is not None and not log.closed:
+            print(text, file=log, flush=True)
 
 
 def _quality(out: Path) -> str:

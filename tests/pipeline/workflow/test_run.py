@@ -279,6 +279,25 @@ def test_terminated_job_ends_its_stage(small_checkout):
     assert (running.returncode, completed.count("run the same again to go on")) == (128 + signal.SIGTERM, 1)
 
 
+def test_stage_ends_although_nobody_reads_its_output(small_checkout):
+    """As `make toy 2>&1 | less` after `q`: the stage prints more than a pipe holds, and its log has it all."""
+    program = small_checkout.folder / "stages/synthesize_capture/__main__.py"
+    loud = "run(inputs, config, out):\n    print('one line more\\n' * 50_000)"
+    program.write_text(program.read_text().replace("run(inputs, config, out):", loud))
+    assert small_checkout.plan().returncode == 0
+    command = [sys.executable, "-SE", "-m", "pipeline.workflow.run", "toy", "synthetic_capture"]
+    running = subprocess.Popen(command, cwd=small_checkout.folder, stderr=subprocess.PIPE)
+    assert running.stderr is not None and b"begins" in running.stderr.readline()
+    running.stderr.close()
+    try:
+        assert running.wait(timeout=30) == 0
+    finally:
+        running.kill()
+    log = (small_checkout.folder / "build/toy/logs/synthetic_capture.2.log").read_text()
+    assert log.count("one line more") == 50_000 and "done in" in log
+    assert (small_checkout.folder / "build/toy/synthetic_capture/.ok").exists()
+
+
 def test_snakemake_accepts_results_of_make(small_checkout):
     completed = small_checkout.snakemake("--cores", "2", "--config", "agent=toy")
     assert completed.returncode == 0, completed.stderr
