@@ -38,7 +38,7 @@ PLUMBING = (
     "workflow.dag",
 )
 """Modules of `pipeline` that cannot affect what a stage computes."""
-CACHE_VERSION = 4
+CACHE_VERSION = 5
 """Raise it to invalidate cached entries when parsing changes."""
 
 
@@ -64,7 +64,7 @@ class Cache:
 
 
 def digest(stage: str, cache: Cache) -> str:
-    """Hash the program `stage`, the local modules below it, and its folder's other files (pages)."""
+    """Hash the program `stage`, the local modules below it, and its package's other files (pages)."""
     if stage in cache.digests:
         return cache.digests[stage]
     waiting, seen = [f"stages.{stage}.__main__"], {}
@@ -76,7 +76,8 @@ def digest(stage: str, cache: Cache) -> str:
         source = Source(**cache.get(path, _read))
         seen[module] = source.digest
         waiting += source.imports
-    cache.digests[stage] = artifact.digest_of([seen, _assets(Path("stages", *stage.split(".")), cache)])
+    assets = _assets(Path("stages", stage.partition(".")[0]), cache)
+    cache.digests[stage] = artifact.digest_of([seen, assets])
     return cache.digests[stage]
 
 
@@ -155,19 +156,24 @@ def _read(path: Path) -> dict[str, Any]:
     except SyntaxError:  # fails when a stage imports it, without breaking the plan of the others
         return asdict(Source(artifact.digest_of_file(path), ()))
     imports = {
-        name for node in ast.walk(tree) for name in _imported(node) if name.startswith(("pipeline", "stages"))
+        name
+        for node in ast.walk(tree)
+        for name in _used(node, path)
+        if name.startswith(("pipeline", "stages"))
     }
     for node in ast.walk(tree):
         _drop_docstrings(node)
     return asdict(Source(artifact.digest_of(ast.dump(tree)), tuple(sorted(imports))))
 
 
-def _imported(node: ast.AST) -> list[str]:
-    """Return the modules that a statement may import: `from a import b` imports `a`, and may mean `a.b`."""
+def _used(node: ast.AST, path: Path) -> list[str]:
+    """Return modules that code at `path` may import (`from a import b`: `a`, `a.b`) or run (`"b.py"`)."""
     if isinstance(node, ast.Import):
         names = [alias.name for alias in node.names]
     elif isinstance(node, ast.ImportFrom) and node.module:
         names = [f"{node.module}.{alias.name}" for alias in node.names]
+    elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.endswith(".py"):
+        return [".".join(path.with_name(Path(node.value).stem).relative_to(CODE).parts)]
     else:
         return []
     return [".".join(name.split(".")[: i + 1]) for name in names for i in range(name.count(".") + 1)]

@@ -311,6 +311,21 @@ def test_only_relevant_changes_change_a_key(small_checkout):
     assert changed_keys(small_checkout, before) == {"masks.json", "report.json", "flow.json"}
 
 
+def test_files_that_a_stage_reads_and_programs_that_it_starts_are_its_code(small_checkout):
+    small_checkout.record("walkthrough.r3d", "turnaround_cat.r3d", "turnaround_dog.r3d", "a.r3d")
+    front = small_checkout.folder / "stages/build_scene_template/__main__.py"
+    named = "def run(inputs, config, out):\n    program = Path(__file__).with_name('clean.py')\n"
+    front.write_text(front.read_text().replace("def run(inputs, config, out):\n", named))
+    small_checkout.write("stages/build_scene_template/clean.py", "print(1)")
+    assert small_checkout.plan().returncode == 0
+    before = key_files(small_checkout)
+    small_checkout.write("stages/build_scene_template/clean.py", "print(2)")
+    assert changed_keys(small_checkout, before) == {"scene_template.json"}
+    before = key_files(small_checkout)
+    small_checkout.write("stages/export_simulator/web/dist/page.html", "<p>")
+    assert changed_keys(small_checkout, before) == {"home_simulator.json"}
+
+
 def test_new_session_does_not_change_the_templates(small_checkout):
     small_checkout.record("walkthrough.r3d", "turnaround.r3d", "a.r3d", "b.r3d")
     small_checkout.plan()
