@@ -115,8 +115,7 @@ def remarks(
     folder: Path, names: Sequence[str], overrides: Mapping[str, Any], where: str
 ) -> dict[str, Remarks]:
     """Return what the user says about each recording; the recipe overrides sidecars."""
-    config.refuse_unknown(overrides, names, where=f"{where}: [videos]", kind="recording")
-    said = {}
+    overrides, said = by_file(overrides, names, where), {}
     for name in names:
         data = name.encode(errors="replace")
         if len(data) > LONGEST_NAME_BYTES or data.decode() != name:
@@ -131,6 +130,19 @@ def remarks(
             raise InputError("CAP-041", f"{name!r} has no finite offset_s", where, "give seconds")
         said[name] = remark
     return said
+
+
+def by_file(overrides: Mapping[str, Any], names: Sequence[str], where: str) -> dict[str, Any]:
+    """Return the recipe's `[videos]` by file name as the disk spells it. Raises REC-001 for other names."""
+    found = {spelled(name, names): table for name, table in overrides.items()}
+    config.refuse_unknown(found, names, where=f"{where}: [videos]", kind="recording")
+    return found
+
+
+def spelled(name: str, names: Iterable[str]) -> str:
+    """Return a name as it stands in ``names``: macOS stores an accent apart from its letter."""
+    composed = {unicodedata.normalize("NFC", each): each for each in names}
+    return composed.get(unicodedata.normalize("NFC", name), name)
 
 
 def assign(
@@ -148,7 +160,9 @@ def assign(
     roles: dict[str, Role] = {name: role_of(name, remark, where) for name, remark in said.items()}
     if missing := [needed for needed in _NEEDED[flow] if needed[0] not in roles.values()]:
         absent, wanted = (" and ".join(each) for each in zip(*missing, strict=True))
-        raise InputError("CAP-040", f"there is no {absent} among the recordings", where, f"add {wanted}")
+        seen = ", ".join(f"{name!r} is a {role}" for name, role in roles.items())
+        what = f"there is no {absent} among the recordings: {seen}"
+        raise InputError("CAP-040", what, where, f"add {wanted}")
     order = sorted(said, key=lambda name: (ROLES.index(roles[name]), name))
     splits = _splits([name for name in order if roles[name] == "session"], said, where)
     ids = _ids(order, known_ids)
@@ -262,6 +276,7 @@ def _partner(name: str, said: Mapping[str, Remarks], ids: Mapping[str, str], whe
     partner = said[name].synchronized_with
     if partner is None:
         return None
+    partner = spelled(partner, ids)
     if partner not in ids or partner == name:
         what, remedy = f"{name!r} shares no clock with {partner!r}", f"recordings: {', '.join(sorted(ids))}"
         raise InputError("CAP-041", what, where, remedy)

@@ -78,6 +78,10 @@ def _checked(recipe: dict[str, Any], path: Path) -> dict[str, Any]:
                 if not isinstance(remarks, dict):
                     what = f"{recording!r}: {config.shown(remarks)} is no table"
                     raise InputError("REC-002", what, at, f"write [{name}.{recording!r}]")
+                ending = next((key for key, value in remarks.items() if isinstance(value, dict)), "")
+                if ending and "." not in recording:
+                    remedy = f'write [{name}."{recording}.{ending}"]'
+                    raise InputError("REC-002", "a file name with a dot needs quotes", at, remedy)
                 config.from_table(captures.Remarks, remarks, where=f"{at}: {recording!r}")
         if name not in stages:
             continue

@@ -9,7 +9,6 @@ import itertools
 import sys
 from pathlib import Path
 
-from pipeline.core import config
 from pipeline.core.errors import CommandLine, InputError, exit_code, printable
 from pipeline.core.videos import Role
 from pipeline.workflow import captures, recipes
@@ -61,8 +60,7 @@ def _said(
         captures.refuse_unknown_files(folder)
         what = "there are no recordings; make builds from the built-in capture"
         raise InputError("CAP-042", what, str(folder), "copy recordings there (README: your own animal)")
-    overrides = given.get(recipes.VIDEOS_TABLE, {})
-    config.refuse_unknown(overrides, names, where=f"{recipe}: [videos]", kind="recording")
+    overrides = captures.by_file(given.get(recipes.VIDEOS_TABLE, {}), names, str(recipe))
     said, files, refused = {}, [], []
     for name in names:
         try:

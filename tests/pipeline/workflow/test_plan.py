@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import unicodedata
 
 import pytest
 
@@ -77,8 +78,20 @@ def test_incomplete_capture_is_refused(missing):
     names = [
         name for name in ("walkthrough.r3d", "turnaround.r3d", "session.r3d") if not name.startswith(missing)
     ]
-    with pytest.raises(InputError, match=f"CAP-040.*no {missing}"):
+    with pytest.raises(InputError, match=f"CAP-040.*no {missing}.*: '.*' is a "):
         assigned(names)
+
+
+def test_accents_may_be_stored_apart_from_their_letters(tmp_path):
+    """As macOS does: the recipe is typed with `ü` as one character."""
+    stored = unicodedata.normalize("NFD", "über.r3d")
+    names = ["walkthrough.r3d", "turnaround.r3d", "a.r3d", stored, "heldout.r3d"]
+    recipe = {"über.r3d": {"split": "test"}, "heldout.r3d": {"synchronized_with": "über.r3d"}}
+    assert stored not in recipe
+    said = captures.remarks(tmp_path, names, recipe, "cat.toml")
+    videos = {v.file: v for v in assign(said, {}, dict.fromkeys(names), "")}
+    assert videos[stored].split == "test" and videos["a.r3d"].split == "train"
+    assert videos["heldout.r3d"].synchronized_with == videos[stored].id
 
 
 @pytest.mark.parametrize(

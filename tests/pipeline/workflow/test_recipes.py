@@ -64,6 +64,7 @@ def test_empty_tables_and_tables_without_ours_are_refused(table):
         (f"[extract_frames]\nrate_hz = {'9' * 400}", "rate_hz: 99999"),
         ("[videos]\n'a.r3d' = 3", "'a.r3d': 3 is no table"),
         ("[videos]\n'a.r3d'." + ".".join("a" * 5000) + " = 3", "'a.r3d': unknown key 'a'"),
+        ("[videos.monday.r3d]\nsplit = 'test'", 'needs quotes\n.*write .videos."monday.r3d"'),
         (f"[videos.'a.r3d']\noffset_s = {'9' * 400}", "offset_s: 99999"),
     ],
 )
