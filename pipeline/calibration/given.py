@@ -51,6 +51,12 @@ def read(path: Path | None) -> GivenCalibration:
     return given
 
 
+def beside(recording: Path) -> GivenCalibration:
+    """Read the file beside a recording, if there is one. Raises what `read` raises."""
+    file = recording.with_name(f"{recording.name}.depth.toml")
+    return read(file if file.is_file() else None)
+
+
 def described(recording: Recording, given: GivenCalibration) -> Recording:
     """Return a recording with the depth camera that is given, if any. Raises CAP-004."""
     size, where = recording.depth_size, recording.where

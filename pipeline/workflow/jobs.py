@@ -267,15 +267,15 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
     arguments += ["--videos", str(listed), *(["--video", video.id] if video else [])]
     keys_folder = home.base.plan / "keys"
     keys = [str(home.plan / f"keys/{named}.json")]
-    keys += [str(keys_folder / f"video.{id}.json") for id in deciding]
+    for each in deciding:
+        keys.append(str(keys_folder / f"video.{each.id}.json"))
+        for name, file in captures.sidecars(plan.home.agent, each.file, node.sidecars).items():
+            keys.append(str(keys_folder / f"{name}.{each.id}.json"))
+            arguments += [f"--{name}", str(file)] if each is video else []
     own = home.variant is None and home.animal is None
     for file in captures.extra_inputs(plan.home.agent, node.extra_inputs, artifacts=own):
         keys.append(str(keys_folder / f"extra.{file.name}"))
         arguments += [f"--{file.stem}", str(file)]
-    if video:
-        for name, file in captures.sidecars(plan.home.agent, video.file, node.sidecars).items():
-            keys.append(str(keys_folder / f"{name}.{video.id}.json"))
-            arguments += [f"--{name}", str(file)]
     return Job(
         id=f"{node.artifact}.{part.id}" if part else node.artifact,
         artifact=node.artifact,
@@ -294,19 +294,21 @@ def _job(plan: Plan, node: Node, part: Video | Trial | None) -> Job:
     )
 
 
-def _read_by(plan: Plan, node: Node, part: Video | Trial | None) -> tuple[list[Input], list[str], list[str]]:
-    """Return a job's inputs, the options for them, and the ids of the recordings that affect its result."""
+def _read_by(
+    plan: Plan, node: Node, part: Video | Trial | None
+) -> tuple[list[Input], list[str], list[Video]]:
+    """Return a job's inputs, the options for them, and the recordings that affect its result."""
     folder, video = Path("captures", plan.home.agent), part if isinstance(part, Video) else None
     inputs: list[Input] = []
     arguments: list[str] = []
-    deciding = [video.id] if video else []
+    deciding = [video] if video else []
     for need in (each for each in dag.needs_of(node, plan.flow) if _is_read(plan, node, each, video)):
         if need.artifact in dag.BUILTIN.values() and not plan.builtin:
             if video:
                 scale_from = formats.scale_sources(folder, video, plan.videos)
                 arguments += [f"--{need.option}", f"{folder}/{video.file}"]
                 arguments += ["--captures", str(folder)] if scale_from else []
-                deciding += [other.id for other in scale_from]
+                deciding += scale_from
             continue
         inputs += _inputs(plan, need, node, part)
         option = f"--{need.option or need.artifact.replace('_', '-')}"

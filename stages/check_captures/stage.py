@@ -19,8 +19,6 @@ from stages.check_captures.overlap import DescribedFrame
 from stages.check_captures.problems import CaptureMeasurements, problems
 
 MAX_DEPTH_M = 6.0
-GIVEN = ".depth.toml"
-"""suffix of the file beside a recording that describes its depth"""
 SAMPLES, SEED = 40, 0
 """frames sampled per recording; seed of the robust fits"""
 
@@ -41,8 +39,7 @@ def run(files: Sequence[tuple[Path, Role]]) -> Iterator[CaptureVerdict]:
     rng = np.random.default_rng(SEED)
     for path, role in sorted(files, key=lambda file: (file[1] != "walkthrough", file[0].name)):
         try:
-            file = path.with_name(path.name + GIVEN)
-            stated = given.read(file if file.is_file() else None)
+            stated = given.beside(path)
             sample = sampling.sample(open_recording(path), SAMPLES, max_depth_m=MAX_DEPTH_M, given=stated)
             seen = _seen(sample, role, room, rng)
         except InputError as error:

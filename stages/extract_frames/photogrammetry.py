@@ -24,6 +24,7 @@ from pipeline.recordings.extraction import ExtractedFrame, ExtractionPlan, choos
 from pipeline.recordings.recording import Recording
 from stages.extract_frames import scaling, structure
 from stages.extract_frames.config import Config, PhotogrammetryConfig
+from stages.extract_frames.scaling import MeasuredRecording
 from stages.extract_frames.structure import Structure
 
 LISTED = 12
@@ -41,7 +42,7 @@ KEYFRAME_JPEG_QUALITY = 98
 
 
 def map_pictures(
-    recording: Recording, measured: Mapping[str, Recording], settings: Config, workspace: Path
+    recording: Recording, measured: Mapping[str, MeasuredRecording], settings: Config, workspace: Path
 ) -> tuple[ExtractionPlan, Iterator[ExtractedFrame], str]:
     """Map a video without depth: plan, frames and a sentence about them. Raises MAP-004.
 
@@ -159,7 +160,7 @@ def _unit_m(
     grays: list[np.ndarray],
     views: list[SweepView],
     depth: list[np.ndarray],
-    measured: Mapping[str, Recording],
+    measured: Mapping[str, MeasuredRecording],
 ) -> tuple[float, str]:
     """Return meters per unit of the model, and the id of the recording that gave them, or `relative`."""
     mapped = [
@@ -167,8 +168,8 @@ def _unit_m(
         for picture, view, each in zip(grays, views, depth, strict=True)
         if measured
     ]
-    for name, recording in measured.items():
-        unit_m = scaling.meters_per_unit(mapped, recording, SEED)
+    for name, other in measured.items():
+        unit_m = scaling.meters_per_unit(mapped, other, SEED)
         if unit_m is not None:
             return unit_m, name
     known = np.concatenate([each[each > 0] for each in depth])

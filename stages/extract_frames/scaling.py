@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 import pycolmap
 
+from pipeline.calibration import recordings as calibration
+from pipeline.calibration.given import GivenCalibration
 from pipeline.geometry.subsampling import evenly
 from pipeline.mapping import sift
 from pipeline.mapping.sift import SiftPoints
@@ -37,10 +39,14 @@ RATE_HZ, MAX_DEPTH_M, MAX_SIDE_PX = 10.0, 5.0, 640
 """extraction settings for recordings with depth"""
 
 
-def meters_per_unit(mapped: Sequence[SiftPoints], measured: Recording, seed: int) -> float | None:
+MeasuredRecording = tuple[Recording, GivenCalibration]
+"""a recording with depth, and what its user says about that"""
+
+
+def meters_per_unit(mapped: Sequence[SiftPoints], measured: MeasuredRecording, seed: int) -> float | None:
     """Return meters per unit of the map by one recording with depth, None if too few pairs agree."""
     scales = []
-    for frame in _described(measured):
+    for frame in _described(*measured):
         scales += [scale for known in mapped if (scale := _scale(known, frame, seed)) is not None]
     if not scales:
         return None
@@ -51,11 +57,12 @@ def meters_per_unit(mapped: Sequence[SiftPoints], measured: Recording, seed: int
     return float(np.median(np.array(scales)[agreeing]))
 
 
-def _described(recording: Recording) -> Iterator[SiftPoints]:
-    plan = extraction.understand(recording, rate_hz=RATE_HZ, max_depth_m=MAX_DEPTH_M, max_side_px=MAX_SIDE_PX)
+def _described(recording: Recording, given: GivenCalibration) -> Iterator[SiftPoints]:
+    options = {"rate_hz": RATE_HZ, "max_side_px": MAX_SIDE_PX, "max_depth_m": MAX_DEPTH_M}
+    found, plan = calibration.understand(recording, given, **options)
     rows = evenly(len(plan.chosen), FRAMES, rounded=True)
     sample = replace(plan, chosen=plan.chosen[rows])
-    frames = extraction.frames(recording, sample, max_depth_m=MAX_DEPTH_M)
+    frames = extraction.frames(found.recording, sample, max_depth_m=MAX_DEPTH_M)
     for row, frame in zip(rows, frames, strict=True):
         if frame is not None:
             gray, lens = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), plan.depth_intrinsics[row]

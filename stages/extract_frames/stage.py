@@ -43,7 +43,8 @@ def run(
         sources, agreement = {}, None
         if video is not None and inputs.captures is not None:  # their depth may supply metric scale
             found = scale_sources(inputs.captures, video, videos)
-            sources = {other.id: open_recording(inputs.captures / other.file) for other in found}
+            paths = {other.id: inputs.captures / other.file for other in found}
+            sources = {id: (open_recording(path), given.beside(path)) for id, path in paths.items()}
         with tempfile.TemporaryDirectory() as workspace:
             plan, frames, summary = photogrammetry.map_pictures(recording, sources, config, Path(workspace))
     else:

@@ -377,6 +377,11 @@ def test_walkthrough_without_depth_is_scaled_by_training_sessions(small_checkout
         "video.v002.json",
     ]
     assert not [id for id, job in jobs.items() if "--captures" in job["arguments"] and id != "frames.v000"]
+    small_checkout.write("captures/toy/a.r3d.depth.toml", "registered = true")
+    small_checkout.plan()
+    described = small_checkout.jobs()["frames.v000"]
+    assert described["keys"] == [*walk["keys"], "build/toy/plan/keys/depth.v002.json"]
+    assert described["arguments"] == walk["arguments"]
 
 
 def test_clicks_are_an_input_of_reconstruction_metrics_only(small_checkout):

@@ -2,17 +2,20 @@
 recordings.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from pipeline.calibration.given import NOTHING, GivenCalibration
 from pipeline.core.errors import InputError
 from pipeline.geometry import align, rigid
 from pipeline.geometry.meshes import RayCaster, render_view
-from pipeline.mapping import plane_sweep
+from pipeline.mapping import plane_sweep, sift
 from pipeline.recordings.recording import Recording
-from stages.extract_frames import photogrammetry, structure
+from stages.extract_frames import photogrammetry, scaling, structure
 from stages.extract_frames.config import Config, PhotogrammetryConfig
 from tests.stages import textured_room
 
@@ -62,7 +65,7 @@ def test_walkthrough_is_mapped_and_scaled_by_a_session_with_depth(room, tmp_path
     session = _recording(
         room, textured_room.walk(14)[2:12:3] @ rigid.make(np.eye(3), np.array([0.03, 0, 0])), with_depth=True
     )
-    plan, frames, _ = _mapped(_recording(room, truth), {"v002": session}, tmp_path)
+    plan, frames, _ = _mapped(_recording(room, truth), {"v002": (session, NOTHING)}, tmp_path)
     assert plan.scale == "v002"
     assert len(plan.chosen) >= 10
     assert abs(plan.intrinsics[0, 0, 0] / INTRINSICS[0, 0] - 1) < 0.04, "the focal length was not told"
@@ -79,6 +82,22 @@ def test_walkthrough_is_mapped_and_scaled_by_a_session_with_depth(room, tmp_path
         known.append(seen.mean())
     assert np.median(np.abs(np.concatenate(off))) < 0.04
     assert np.mean(known) > 0.5
+
+
+def test_scale_uses_the_depth_camera_that_is_given(room):
+    """Depth of another lens, described in `<recording>.depth.toml`, puts points beside where they are."""
+    path = textured_room.walk(30)[:20]
+    lens = INTRINSICS * np.array([[0.85, 1, 1], [1, 0.85, 1], [1, 1, 1]])
+    depth = [render_view(room[1], camera, lens, *SIZE)[0] for camera in path]
+    session = replace(_recording(room, path, with_depth=True), read_depth=lambda i: depth[i])
+    mapped = []
+    for camera in path[3::4]:
+        color, true = _seen(room, camera)
+        described = sift.describe(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), scaling.POINTS)
+        mapped.append(sift.lift(described, INTRINSICS, true, INTRINSICS))
+    given = GivenCalibration(depth_intrinsics=tuple(lens[[0, 1, 0, 1], [0, 1, 2, 2]]))
+    assert abs(scaling.meters_per_unit(mapped, (session, given), 0) - 1) < 0.01
+    assert abs(scaling.meters_per_unit(mapped, (session, NOTHING), 0) - 1) > 0.03
 
 
 def test_pure_rotation_is_refused(room, tmp_path):
