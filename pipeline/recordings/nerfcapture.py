@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.core.errors import InputError
-from pipeline.recordings import errors
+from pipeline.recordings import errors, text_files
 from pipeline.recordings.containers import Container, FolderContainer, ZipContainer, frame_number
 from pipeline.recordings.conventions import OPENGL
 from pipeline.recordings.recording import Y_UP, Recording, intrinsics_from_coefficients, pose_from_matrix
@@ -33,7 +33,7 @@ def open_recording(path: Path) -> Recording:
     frames = [frame for frame in listed if {frame["file_path"], frame["depth_path"]} <= container.names]
     if not frames:
         raise errors.no_frames(container.where, "no frame has color and depth")
-    timestamp_s, remarks = _times(frames, container.where)
+    frames, timestamp_s, remarks = _timed(frames, container.where)
     depth_size = container.meters(frames[0]["depth_path"]).shape
     coefficients = np.array([frame["coefficients"] for frame in frames])
     return Recording(
@@ -107,11 +107,11 @@ def _member(name: str, container: Container) -> str:
     return next((each for each in (name, f"{name}.png", f"{name}.jpg") if each in container.names), name)
 
 
-def _times(frames: list[dict[str, Any]], where: str) -> tuple[np.ndarray, tuple[str, ...]]:
+def _timed(frames: list[dict], where: str) -> tuple[list[dict], np.ndarray, tuple[str, ...]]:
+    """Return the frames whose times increase, these times from 0, and remarks."""
     if any(frame["time"] is None for frame in frames):
         remark = f"the frames carry no times: {ASSUMED_HZ:g} per second are assumed"
-        return np.arange(len(frames)) / ASSUMED_HZ, (remark,)
+        return frames, np.arange(len(frames)) / ASSUMED_HZ, (remark,)
     timestamp_s = np.array([frame["time"] for frame in frames])
-    if not (np.isfinite(timestamp_s).all() and (np.diff(timestamp_s) > 0).all()):
-        raise errors.broken_metadata(where, "the frames' times must increase with their numbers")
-    return timestamp_s - timestamp_s[0], ()
+    timed = np.flatnonzero(text_files.increasing(timestamp_s, where))
+    return [frames[row] for row in timed], timestamp_s[timed] - timestamp_s[timed[0]], ()

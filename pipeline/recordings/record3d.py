@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.core.errors import InputError
 from pipeline.data import images
-from pipeline.recordings import errors
+from pipeline.recordings import errors, text_files
 from pipeline.recordings.containers import Container, FolderContainer, ZipContainer, frame_number
 from pipeline.recordings.conventions import OPENGL
 from pipeline.recordings.recording import Y_UP, Recording, intrinsics_from_coefficients
@@ -26,8 +26,6 @@ FACE_ID, LIDAR = 0, 1
 """the app's numbers of the front and back cameras"""
 MAX_SIDE_PX = 16384
 """maximum longer side of a phone's picture"""
-MIN_TIMED = 0.5
-"""minimum share of frames with increasing timestamps for them to be used"""
 LZFSE_HEADER_BYTES = {b"bvxn": 12, b"bvx1": 772}
 """header size by magic number: LZVN blocks, and LZFSE v1 blocks (uncompressed tables)"""
 LZFSE_FIELD_BITS = 20
@@ -135,11 +133,11 @@ class _Metadata:
         if not self._table.get("frameTimestamps"):
             return (index - index[0]) / self._numbers("fps", (), positive=True)
         timestamp_s = self._rows("frameTimestamps", (), index)
-        good = timestamp_s > np.fmax.accumulate(np.r_[-np.inf, timestamp_s[:-1]])
-        if good.mean() < MIN_TIMED:
-            raise self._broken("'frameTimestamps' must increase")
+        good = text_files.increasing(timestamp_s, self._where)
         self._remark(~good, "are left out: their times are missing or do not increase")
-        return np.where(good, timestamp_s - timestamp_s[good][0], np.nan)
+        per_second, unit_remarks = text_files.units_per_second(timestamp_s[good])
+        self.remarks += unit_remarks
+        return np.where(good, (timestamp_s - timestamp_s[good][0]) / per_second, np.nan)
 
     def intrinsics(self, index: Int[np.ndarray, "frame"]) -> Float[np.ndarray, "frame 3 3"]:
         """Return K in color pixels, per frame if the app wrote it, else the first frame's."""

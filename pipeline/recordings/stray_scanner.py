@@ -19,8 +19,6 @@ from pipeline.recordings.recording import Y_UP, Recording, intrinsics_from_coeff
 INTRINSICS_SIZE = (1440, 1920)
 """(height, width) that the app's intrinsics refer to, whatever the video's size"""
 POSE = ("qx", "qy", "qz", "qw", "x", "y", "z")
-MIN_TIMED = 0.5
-"""minimum share of rows with increasing times"""
 MAX_FRAMES = 1 << 31
 """upper bound of frame numbers"""
 COEFFICIENTS = ("fx", "fy", "cx", "cy")
@@ -55,6 +53,7 @@ def open_recording(path: Path) -> Recording:
         raise errors.no_frames(container.where, "none has color, depth and odometry")
     index = rows.frame[valid]
     timestamp_s = movie.timestamp_s[index] if rows.timestamp_s is None else rows.timestamp_s[valid]
+    per_second, unit_remarks = text_files.units_per_second(timestamp_s)
     size = _depth(container, depth[int(index[0])], None).shape
     some = [_depth(container, depth[int(number)], None) for number in index[:: max(1, len(index) // 5)]]
     if all(np.ptp(picture, axis=1).max() == 0 and np.ptp(picture) > 0 for picture in some):
@@ -70,7 +69,7 @@ def open_recording(path: Path) -> Recording:
         where=container.where,
         kind="Stray Scanner",
         index=index,
-        timestamp_s=timestamp_s - timestamp_s[0],
+        timestamp_s=(timestamp_s - timestamp_s[0]) / per_second,
         intrinsics=_intrinsics(container, rows, valid, movie.size),
         pose=rows.pose[valid],
         color_size=movie.size,
@@ -79,7 +78,7 @@ def open_recording(path: Path) -> Recording:
         read_depth=lambda i: _depth(container, depth[i], size),
         read_confidence=confident if confidence else None,
         up=Y_UP,
-        remarks=movie.remarks,
+        remarks=movie.remarks + unit_remarks,
         listed=max(len(movie), len(rows.frame)),
     )
 
@@ -87,7 +86,7 @@ def open_recording(path: Path) -> Recording:
 def read_odometry(text: str, where: str) -> OdometryTable:
     """Read the table by its column names: 7 (oldest, no header), 9 or 15 columns, blanks where unknown.
 
-    Rows without a later time than all before, and a last one that was cut off, are left out.
+    Rows whose times do not increase, and a last one that was cut off, are left out.
     """
     lines = [[cell.strip() for cell in row.split(",")] for row in text.splitlines()]
     lines = [row for row in lines if any(row)]
@@ -104,13 +103,10 @@ def read_odometry(text: str, where: str) -> OdometryTable:
         column = {name: np.array([float(row[i] or "nan") for row in lines]) for i, name in known}
     except (ValueError, IndexError) as error:
         raise errors.broken_metadata(where, f"a row is cut or no numbers ({error})") from error
-    timestamp_s = column.get("timestamp", np.arange(len(lines)))
-    timestamp_s = np.where(np.isfinite(timestamp_s), timestamp_s, np.nan)
-    later = timestamp_s > np.fmax.accumulate(np.r_[-np.inf, timestamp_s[:-1]])
-    if later.sum() < MIN_TIMED * len(lines):
-        raise errors.broken_metadata(where, "the times must increase")
-    column = {name: values[later] for name, values in column.items()}
-    frame = column.get("frame", np.flatnonzero(later))
+    timestamp_s = column.get("timestamp", np.arange(len(lines), dtype=float))
+    timed = text_files.increasing(timestamp_s, where)
+    column = {name: values[timed] for name, values in column.items()}
+    frame = column.get("frame", np.flatnonzero(timed))
     if not (np.isfinite(frame) & (frame >= 0) & (frame < MAX_FRAMES)).all():
         raise errors.broken_metadata(where, "a frame has no number")
     pose, coefficients = np.stack([column[name] for name in POSE], axis=1), None
@@ -127,8 +123,6 @@ def _intrinsics(
     if rows.coefficients is not None:
         coefficients = rows.coefficients[valid]
     else:
-        if "camera_matrix.csv" not in container.names:
-            raise errors.broken_metadata(container.where, "camera_matrix.csv is missing")
         coefficients = text_files.read_coefficients(container, "camera_matrix.csv")
         coefficients = np.tile(coefficients, (int(valid.sum()), 1))
     height, width = (size[0] / INTRINSICS_SIZE[0], size[1] / INTRINSICS_SIZE[1])

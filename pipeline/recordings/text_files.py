@@ -1,7 +1,9 @@
-"""Small text files beside pictures: tables of numbers, and the cameras of formats without metadata."""
+"""Small text files beside pictures: tables of numbers, times, and the cameras of formats without metadata."""
+
+from bisect import bisect_left
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from pipeline.core.errors import InputError
 from pipeline.geometry import cameras
@@ -15,6 +17,11 @@ DEPTH_INTRINSICS, DEPTH_FROM_COLOR = "depth_intrinsics.txt", "depth_from_color.t
 """intrinsics of a separate depth camera, in depth pixels, and its extrinsics: a 4 x 4 matrix, meters"""
 MAX_BASELINE_M = 0.5
 """largest distance of two cameras of one handheld device"""
+MIN_TIMED = 0.5
+"""minimum share of frames with increasing times"""
+TIME_UNITS = {1.0: "seconds", 1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+LONGEST_STEP_S = 8.0
+"""units per second, and longest typical step: RGB-D cameras take at most 125 pictures per second"""
 
 
 def lines(container: Container, name: str) -> list[str]:
@@ -40,6 +47,35 @@ def table(
     if rows is not None and len(read) != rows:
         raise errors.broken_metadata(container.place(name), f"{len(read)} rows instead of {rows}")
     return read
+
+
+def increasing(times: Float[np.ndarray, "frame"], where: str) -> Bool[np.ndarray, "frame"]:
+    """Return the longest increasing sequence of times, so that one that jumps costs its frame alone.
+
+    Raises CAP-004 if it has less than half of them.
+    """
+    ends: list[float] = []  # lowest last time of the sequences of each length
+    length = np.zeros(len(times), int)
+    for row in np.flatnonzero(np.isfinite(times)).tolist():
+        shorter = bisect_left(ends, times[row])
+        if ends[shorter : shorter + 1] != [times[row]]:
+            ends[shorter : shorter + 1] = [times[row]]
+            length[row] = shorter + 1
+    if len(ends) < MIN_TIMED * len(times):
+        raise errors.broken_metadata(where, "the times must increase")
+    found, wanted, following = np.zeros(len(times), bool), len(ends), np.inf
+    for row in reversed(range(len(times))):
+        if 0 < length[row] == wanted and times[row] < following:
+            found[row], wanted, following = True, wanted - 1, times[row]
+    return found
+
+
+def units_per_second(times: Float[np.ndarray, "frame"]) -> tuple[float, tuple[str, ...]]:
+    """Return the unit of increasing times by their typical step, and a remark unless these are seconds."""
+    step = float(np.median(np.diff(times, prepend=times[0])))
+    per_second = next((each for each in TIME_UNITS if step <= LONGEST_STEP_S * each), max(TIME_UNITS))
+    remark = f"time stamps seem to be {TIME_UNITS[per_second]}, and are read as such"
+    return per_second, () if per_second == 1 else (remark,)
 
 
 def read_intrinsics(

@@ -24,9 +24,6 @@ PER_METER, OTHERS = 5000.0, (1000.0, 10_000.0)
 """depth units per meter of the data set, and of other cameras"""
 MAX_RESIDUAL_RATIO = 0.6
 """another unit is chosen if their residual is below this share of the other unit's"""
-TIME_UNITS = {1.0: "seconds", 1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
-LONGEST_STEP_S = 8.0
-"""units per second, and longest typical step: RGB-D cameras take at most 125 pictures per second"""
 NEAREST_S = 0.02
 """maximum time difference between a color picture, its depth and its pose, seconds"""
 DEFAULT = (525.0, 525.0, 319.5, 239.5)
@@ -42,8 +39,7 @@ def open_recording(path: Path) -> Recording:
     if not color:
         raise errors.no_frames(container.where, "rgb.txt lists nothing")
     ticks, depth_ticks = (np.array([time for time, _ in files]) for files in (color, depth_files))
-    step = float(np.median(np.diff(ticks, prepend=ticks[0])))
-    per_second = next((each for each in TIME_UNITS if step <= LONGEST_STEP_S * each), max(TIME_UNITS))
+    per_second, unit_remarks = text_files.units_per_second(ticks)
     times, depth_times = ticks / per_second, depth_ticks / per_second
     partner = partners(times, depth_times)
     nearest = subsampling.nearest(times, depth_times[partner]) == np.arange(len(times))
@@ -62,8 +58,6 @@ def open_recording(path: Path) -> Recording:
     intrinsics, remarks = text_files.read_intrinsics(container, len(pairs), default)
     camera, camera_remarks = text_files.depth_camera(container, intrinsics[0], (color_size, depth_size))
     pose = _poses(container, times[paired], per_second)
-    if per_second != 1:
-        remarks += (f"time stamps seem to be {TIME_UNITS[per_second]}, and are read as such",)
 
     def view(number: int, per_meter: float) -> DepthPicture:
         depth = container.meters(pairs[number][1], depth_size, per_meter)
@@ -82,7 +76,7 @@ def open_recording(path: Path) -> Recording:
         read_color=lambda i: container.read(pairs[i][0]),
         read_depth=lambda i: container.meters(pairs[i][1], depth_size, per_meter),
         depth_camera=camera,
-        remarks=remarks + scale_remarks + camera_remarks,
+        remarks=remarks + unit_remarks + scale_remarks + camera_remarks,
         listed=len(present),
     )
 

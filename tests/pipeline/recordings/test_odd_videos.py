@@ -1,5 +1,6 @@
 """Recordings in odd but real forms: cut off, wide colors, missing files, varying times."""
 
+import json
 import zipfile
 from fractions import Fraction
 from pathlib import Path
@@ -157,6 +158,49 @@ def test_rows_that_stray_scanner_cut_or_timed_twice_cost_no_more_than_themselves
     (path / "odometry.csv").write_text("\n".join([rows[0], *rows[:0:-1]]))
     with pytest.raises(InputError, match="CAP-004.*the times must increase"):
         open_recording(path)
+
+
+def _with_times(folder: Path, app: str, times_s: np.ndarray) -> Path:
+    """Write a walk with other times than its own."""
+    made = walk(len(times_s), rate_hz=15.0)
+    if app == "record3d":
+        made.metadata["frameTimestamps"] = times_s.tolist()
+        return made.write(folder / "a.r3d")
+    if app == "nerfcapture":
+        path = made_formats.nerfcapture(folder / "a", made)
+        table = json.loads((path / "transforms.json").read_text())
+        for frame, time_s in zip(reversed(table["frames"]), times_s.tolist(), strict=True):
+            frame["timestamp"] = time_s
+        (path / "transforms.json").write_text(json.dumps(table))
+        return path
+    path = made_formats.stray(folder / "a", made)
+    head, *rows = (row.split(", ") for row in (path / "odometry.csv").read_text().split("\n"))
+    lines = [[repr(time_s), *row[1:]] for time_s, row in zip(times_s.tolist(), rows, strict=True)]
+    (path / "odometry.csv").write_text("\n".join(", ".join(row) for row in [head, *lines]))
+    return path
+
+
+@pytest.mark.parametrize("app", ["record3d", "stray", "nerfcapture"])
+@pytest.mark.parametrize(("row", "off_s"), [(3, 1000.0), (15, 0.1), (15, -3.0), (15, np.nan)])
+def test_a_time_that_jumps_costs_its_frame_alone(tmp_path, app, row, off_s):
+    times_s = 500 + np.arange(20) / 15.0
+    jumped = times_s.copy()
+    jumped[row] += off_s
+    recording = open_recording(_with_times(tmp_path, app, jumped))
+    assert len(recording.index) == 19
+    assert (np.diff(recording.timestamp_s) > 0).all()
+    assert recording.timestamp_s[-1] == pytest.approx(times_s[-1] - times_s[0])
+    assert recording.incomplete == pytest.approx(1 / 20)
+
+
+@pytest.mark.parametrize("app", ["record3d", "stray"])
+@pytest.mark.parametrize(("unit", "per_second"), [("milliseconds", 1e3), ("nanoseconds", 1e9)])
+@pytest.mark.parametrize("rate_hz", [0.5, 60.0])
+def test_video_times_in_other_units_are_read(tmp_path, app, unit, per_second, rate_hz):
+    times_s = 500 + np.arange(20) / rate_hz
+    recording = open_recording(_with_times(tmp_path, app, per_second * times_s))
+    np.testing.assert_allclose(recording.timestamp_s, times_s - 500, atol=1e-5)
+    assert f"time stamps seem to be {unit}, and are read as such" in recording.remarks
 
 
 def test_depth_of_every_second_frame_is_complete(tmp_path):
