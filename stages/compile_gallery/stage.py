@@ -98,7 +98,7 @@ def card(folder: Path, root: Path) -> Card:
     pictures = [file for name in PICTURES for file in sorted(folder.glob(name))]
     pages = [(_SIMULATORS[simulator], folder / simulator / "index.html")]
     pages.append(("report", folder / "report/index.html"))
-    homes = sorted(folder.glob("homes/*/simulator/index.html"))
+    homes = sorted(folder.glob("homes/*/*simulator/index.html"))
     pages += [(f"in the home of {home.parents[1].name}", home) for home in homes]
     checks = json.loads((folder / simulator / "qa.json").read_bytes())["checks"]
     figures = [Figure(one["name"], one["value"], one["unit"]) for one in checks if one["name"] in _CHECKS]
@@ -109,9 +109,7 @@ def card(folder: Path, root: Path) -> Card:
         name=folder.name if folder.parent.name == "animals" else str(contract["name"]),
         folder=folder.relative_to(root).as_posix(),
         thumbnail=_thumbnail(pictures[0]) if pictures else None,
-        status=qa.worst([*states, bars.worst(bars.judge(metrics.values, metrics.reasons))])
-        if states
-        else "none",
+        status=qa.worst(states) if states else "none",
         figures=tuple(figures),
         links=tuple(Link(to, page.relative_to(root).as_posix()) for to, page in pages if page.is_file()),
         home=simulator == "home_simulator",

@@ -32,7 +32,7 @@ def write_build(folder: Path, name: str, goal_m: float | None, megabytes: float)
         ),
         pictures=(qa.Picture("visits", picture, ""),),
     )
-    for page in ("report", "homes/other/simulator"):
+    for page in ("report", "homes/other/simulator", "homes/third/home_simulator"):
         (folder / page).mkdir(parents=True)
         (folder / page / "index.html").write_text("page")
     (folder / "evaluation").mkdir()
@@ -52,7 +52,7 @@ def test_every_finished_simulator_has_a_card(tmp_path: Path) -> None:
     names = re.findall(r"<h2>(.*?)</h2>", page)
     assert names == ["cat", "cat without a scene", "luna &amp; &lt;co&gt;", "luna"]
     links = re.findall(r'href="([^"]*)"', page)
-    assert len(links) == 4 * 4 and all((tmp_path / link).is_file() for link in links)
+    assert len(links) == 4 * 5 and all((tmp_path / link).is_file() for link in links)
     assert "0.432 m" in page and "30 MB" in page and "12.3 MB" in page
     lights = re.findall(r'class="light (\w+)"', page)
     assert lights == ["ok", "fail", "warn", "fail"], "goals behind standing still, a page of 30 MB"
