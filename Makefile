@@ -91,10 +91,14 @@ capture-check: .venv/.ok
 gallery: .venv/.ok
 	@$(PYTHON) -m stages.compile_gallery build
 
+# A wrong NAME is refused before anything is built.
+CHECK_NAME = $(if $(NAME),@$(PLAN) plan $(ANIMAL) >/dev/null && $(PLAN) inputs $(HOME_OF:build/%=%) >/dev/null)
+
 # One export format; includes a take of `make simulate` as a further motion, optionally on the body of another build
 # (BODY=luna).
 EXPORTED = $(HOME_OF)/exports/$(or $(FORMAT),glb)$(BODY:%=_on_%)
 export: .venv/.ok
+	$(CHECK_NAME)
 	@$(PYTHON) -m stages.export --format $(or $(FORMAT),glb) --help >/dev/null
 	@$(if $(BODY),$(PLAN) plan $(BODY))
 	@$(MAKE) $(NESTING) $(ANIMAL).simulator $(BODY:%=%.simulator)
@@ -114,6 +118,7 @@ MOVED = reconstruction splats behavior behavior_data
 TOGETHER = $(if $(SUBGOALS)$(PLACES),INPUTS,TOGETHER_INPUTS)
 PAGES = stages.export_simulator
 simulate: .venv/.ok
+	$(CHECK_NAME)
 	@test -z "$$SUBGOALS" || test -f "$$SUBGOALS" || { { echo "error: SIM-004 $$SUBGOALS: there is no such file"; echo "  -> write it as docs/long_motion.md explains"; } >&2; exit 2; }
 	@$(if $(PLACES),$(PYTHON) -m stages.simulate --places '$(PLACES)' --help >/dev/null)
 	@$(if $(OTHER),$(PLAN) plan $(OTHER))
@@ -127,6 +132,7 @@ simulate: .venv/.ok
 	  --home build/$(OTHER) --take $(ELSEWHERE)/take --out $(ELSEWHERE)/$$kind && echo "[$(HOME_OF)] open: $(ELSEWHERE)/$$kind/index.html")
 
 serve: .venv/.ok
+	$(CHECK_NAME)
 	@$(MAKE) $(NESTING) $(ANIMAL).simulator
 	@$(call INPUTS,behavior behavior_data simulator) && $(PYTHON) -m stages.simulate $$inputs --serve --out $(HOME_OF)/take
 
@@ -170,8 +176,9 @@ reproduce: .venv/.ok
 verify: .venv/.ok
 	@$(PYTHON) -SE -m pipeline.workflow.verify $(HOME_OF:build/%=%)
 
+# All builds, or that of AGENT (or of its VARIANT) alone.
 clean:
-	rm -rf build .snakemake
+	rm -rf $(if $(AGENT),$(HOME_OF),build .snakemake)
 
 # A table compares variants that its own rule cannot build; name the command that does.
 .DEFAULT:

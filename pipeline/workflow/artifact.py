@@ -138,12 +138,12 @@ def digest_of_file(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def read_json(path: Path) -> Any:
-    """Return the content of a JSON file that can be made again; None if it is missing or damaged."""
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the table in a JSON file that can be made again; empty if it is missing or damaged."""
     try:
-        return json.loads(path.read_bytes())
-    except (FileNotFoundError, ValueError, RecursionError):
-        return None
+        return dict(json.loads(path.read_bytes()))
+    except (FileNotFoundError, ValueError, TypeError, RecursionError):
+        return {}
 
 
 def digest_of(value: Any) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 from pipeline.core import config
 from pipeline.core.errors import InputError
 from pipeline.core.videos import PERSON, ROLES, SPLITS, Role, Split, Video
-from pipeline.recordings.formats import UNDERSTOOD, format_of, has_depth
+from pipeline.recordings.formats import UNDERSTOOD, format_of
 from pipeline.workflow import dag
 from pipeline.workflow.artifact import MANIFEST
 from pipeline.workflow.dag import Flow
@@ -180,11 +180,6 @@ def assign(
         )
         for name in sorted(said, key=ids.__getitem__)
     )
-
-
-def is_mapped(folder: Path, video: Video) -> bool:
-    """Return whether a recording in `folder` gets cameras and depth from the map: it has no depth itself."""
-    return video.role in ("turnaround", "session") and not has_depth(folder / video.file)
 
 
 def role_of(name: str, remark: Remarks, where: str) -> Role:

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.core.errors import InputError, exit_code
+from pipeline.recordings.formats import has_depth
 from pipeline.workflow import artifact, captures, dag, jobs, recipes, sources, stamps
 from pipeline.workflow.jobs import Home, Job, Plan, jobs_file
 
@@ -54,7 +55,8 @@ def read(home: Home, cache: sources.Cache) -> Plan:
         hashes = dict.fromkeys(said)
     videos = captures.assign(said, _known_ids(home.base), hashes, str(folder) if names else where, flow)
     if names and flow == "recordings":
-        videos = tuple(replace(video, mapped=captures.is_mapped(folder, video)) for video in videos)
+        without_depth = {v for v in videos if v.role in dag.AGENT and not has_depth(folder / v.file)}
+        videos = tuple(replace(video, mapped=video in without_depth) for video in videos)
     mapped = any(video.mapped for video in videos)
     touched = jobs.touched_by(tables, changed, mapped) if home.variant else frozenset(dag.NODES)
     if home.tables:
@@ -80,10 +82,11 @@ def write(plan: Plan, cache: sources.Cache, code: sources.Cache) -> None:
         for name, trial in {(job.artifact, job.trial) for job in all_jobs if job.home == str(each.home)}:
             _write_key(each, code, name, trial)
     after, lines = jobs.direct_dependencies(all_jobs), []
+    file_of = {video.id: f": {video.file!r}" for video in plan.videos}
     for number, job in enumerate(all_jobs, start=1):
-        place = {"place": f"{number} of {len(all_jobs)}", "after": after[job.stamp]}
+        place = f"{number} of {len(all_jobs)}{file_of.get(job.video or '', '')}"
         plain = {**vars(job), "inputs": [vars(each) for each in job.inputs], "stamp": job.stamp}
-        lines.append((job.home, json.dumps(plain | place)))
+        lines.append((job.home, json.dumps(plain | {"place": place, "after": after[job.stamp]})))
     for each in (plan, *plan.animals):
         homes = {home for home, _ in lines} if each is plan else {str(plan.home), str(each.home)}
         own_lines = ",\n".join(line for home, line in lines if home in homes)
@@ -153,7 +156,8 @@ def inputs(home: Home, names: Sequence[str], *, together: bool = False) -> str:
     """
     animals = [str(each.animal) for each in _animal_homes(home.base)]
     if home.animal and home.animal not in animals:
-        raise InputError("REC-007", "no such animal", str(home), f"animals: {', '.join(animals) or 'one'}")
+        remedy = f"animals: {', '.join(animals)}" if animals else "a home of one animal: leave out NAME="
+        raise InputError("REC-007", "no such animal", str(home), remedy)
     known = {job["artifact"]: Path(job["out"]) for job in jobs.read_jobs(home)}
     unknown = [name for name in names if name not in known]
     if unknown:
@@ -191,7 +195,7 @@ def new_agent(name: str, taken: Sequence[str] = ()) -> None:
 def _known_ids(base: Home) -> dict[str, str]:
     """Return the ids assigned so far by file name; none if the file is missing or invalid."""
     known = artifact.read_json(base.plan / "ids.json")
-    ids = list(known.values()) if isinstance(known, dict) else [None]
+    ids = list(known.values())
     sound = all(isinstance(id, str) and re.fullmatch(r"v[0-9]{3,}", id) for id in ids)
     return known if sound and len(set(ids)) == len(ids) else {}
 
@@ -256,12 +260,6 @@ def _json(value: Any) -> str:
     return json.dumps(value, indent=1, sort_keys=True) + "\n"
 
 
-def _load_cache(path: Path) -> dict[str, Any]:
-    """Return the cache of earlier runs of the planner; empty if it is missing or invalid."""
-    known = artifact.read_json(path)
-    return known if isinstance(known, dict) else {}
-
-
 def _input_fingerprint(home: Home, code: sources.Cache) -> str:
     """Hash names, sizes and times of all files that a plan depends on."""
     recipe = Path("agents", f"{home.agent}.toml")
@@ -298,8 +296,8 @@ def _plan(home: Home, code: sources.Cache) -> None:
             if inputs_before == fingerprint and outputs_before == _output_fingerprint(home):
                 print(*messages, sep="\n", end="\n" if messages else "")
                 return
-    code.known = code.known or _load_cache(CODE_CACHE)
-    cache = sources.Cache(_load_cache(home.plan / "cache.json"))
+    code.known = code.known or artifact.read_json(CODE_CACHE)
+    cache = sources.Cache(artifact.read_json(home.plan / "cache.json"))
     planned = [read(each, cache) for each in dict.fromkeys((home.base, home))]
     with artifact.locked(home.base.folder / "plan.lock"):
         for plan in planned:
@@ -321,7 +319,10 @@ def _messages(plan: Plan, home: Home) -> list[str]:
     unused = [v.file for v in plan.videos if v.role == "heldout" and v.synchronized_with is None]
     named = (captures.named(folder / name, plan.flow) for name in unknown)
     clock = "measures nothing until the recipe's [videos] sets its synchronized_with"
+    first = {video.sha256: video.file for video in reversed(plan.videos)}
+    again = [(video.file, first[video.sha256]) for video in plan.videos if first[video.sha256] != video.file]
     return [
+        *(f"[{home}] {copy!r} is a copy of {file!r}: keep only one" for copy, file in again),
         *(f"[{home}] not a recording, left alone: {name}" for name in named),
         *(f"[{home}] {file!r} {clock}" for file in unused),
     ]

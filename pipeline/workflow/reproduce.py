@@ -136,7 +136,7 @@ def compare(crate: Crate, build: Path) -> Iterator[str]:
         for name in sorted(name for name in was.keys() | now.keys() if was.get(name) != now.get(name)):
             yield f"  {name}: {was.get(name)} in the crate, {now.get(name)} here"
     now = artifact.read_json(build / "evaluation/metrics.json")
-    if now is None:
+    if not now:
         return
     moved = {name: (old, now.get(name)) for name, old in crate.metrics.items() if old != now.get(name)}
     for name, (old, new) in sorted(moved.items(), key=lambda row: -_change(*row[1]))[:SHOWN_METRICS]:

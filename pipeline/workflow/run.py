@@ -112,7 +112,7 @@ def _file_of(job: dict[str, Any], kind: str) -> Path:
 def _failed_before(job: dict[str, Any], key: str) -> int:
     """Return the exit code of the job's last failure if it is deterministic and the key the same, else 0."""
     last = artifact.read_json(_file_of(job, "failures"))
-    return last["code"] if last and last["key"] == key and last["code"] in FINAL_CODES else 0
+    return last["code"] if last.get("key") == key and last["code"] in FINAL_CODES else 0
 
 
 def _key(job: dict[str, Any]) -> str:
@@ -287,7 +287,7 @@ def _say(job_id: str, text: str, log: TextIO | None = None) -> None:
 def _quality(out: Path) -> str:
     """Return the artifact's own quality verdict for the last line of the log."""
     report = artifact.read_json(out / "qa.json")
-    if report is None:
+    if not report:
         return ""
     warnings = []
     for check in (check for check in report["checks"] if check["status"] != "ok"):

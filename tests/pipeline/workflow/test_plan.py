@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import unicodedata
 
 import pytest
@@ -185,6 +186,39 @@ HOSTILE = ["$(shell touch hacked).r3d", "`touch hacked`.r3d", "a b'\"\n;c.r3d", 
 
 
 @pytest.mark.slow
+def test_jobs_and_copies_are_named_by_their_files(small_checkout):
+    small_checkout.record("walkthrough.r3d", "turnaround.r3d", "a.r3d", "b.r3d")
+    assert small_checkout.plan().stdout == ""
+    jobs = small_checkout.jobs()
+    assert jobs["masks.v003"]["place"].endswith(f" of {len(jobs)}: 'b.r3d'")
+    assert jobs["behavior"]["place"].endswith(f" of {len(jobs)}")
+    small_checkout.write("captures/toy/c.r3d", "a.r3d")
+    assert small_checkout.plan().stdout == "[toy] 'c.r3d' is a copy of 'a.r3d': keep only one\n"
+
+
+def test_an_unknown_animal_is_refused_before_anything_is_built(small_checkout):
+    small_checkout.record("walkthrough.r3d", "turnaround_cat.r3d", "turnaround_dog.r3d", "a.r3d")
+    for command in ("export", "simulate", "serve"):
+        refused = small_checkout.make(command, "AGENT=toy", "NAME=bird")
+        assert refused.returncode == 2 and "REC-007" in refused.stderr and "cat, dog" in refused.stderr
+        assert "begins (" not in refused.stderr
+    (small_checkout.folder / "captures/toy/turnaround_dog.r3d").unlink()
+    shutil.rmtree(small_checkout.folder / "build")
+    assert "leave out NAME=" in small_checkout.make("serve", "AGENT=toy", "NAME=cat").stderr
+
+
+def test_one_build_alone_is_removed(small_checkout):
+    for name in ("build/toy/x", "build/toy/variants/other/x", "build/cat/x"):
+        small_checkout.write(name, "")
+    assert small_checkout.make("clean", "AGENT=toy", "VARIANT=other").returncode == 0
+    assert (small_checkout.folder / "build/toy/x").exists()
+    assert not (small_checkout.folder / "build/toy/variants/other").exists()
+    assert small_checkout.make("clean", "AGENT=toy").returncode == 0
+    assert [path.name for path in (small_checkout.folder / "build").iterdir()] == ["cat"]
+    assert small_checkout.make("clean").returncode == 0
+    assert not (small_checkout.folder / "build").exists()
+
+
 def test_file_names_are_never_executed(small_checkout):
     small_checkout.record("walkthrough.r3d", "turnaround.r3d", *HOSTILE)
     made = small_checkout.make("-j2", "toy.frames")
