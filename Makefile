@@ -27,6 +27,11 @@ WANTED := $(foreach a,$(AGENTS),$(if $(filter $a $a.%,$(MAKECMDGOALS)),$a))
 ifeq ($(origin NAME),environment)
 NAME :=
 endif
+# A variable on the command line that nothing reads is a typing error.
+VARIABLES := AGENT NAME ABSENT REPLAYED HOME VARIANT FORMAT PLACES PROCESSES LOCK BODY GUIDANCE SUBGOALS DATA CRATE FUZZ
+given = $(subst :,,$(firstword $(subst =, ,$1)))
+$(foreach each,$(subst \$() $(),_,$(MAKEOVERRIDES)),$(if $(filter $(call given,$(each)),$(VARIABLES) PYTHON WORKERS NESTED TABLES),,$(error \
+  REC-004 there is no variable $(call given,$(each)): known are $(VARIABLES))))
 # Variables that become part of a command line or a path may contain plain names only.
 PLAIN := a b c d e f g h i j k l m n o p q r s t u v w x y z 0 1 2 3 4 5 6 7 8 9 _ -
 rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline.core.config import refuse_unknown
 from pipeline.core.errors import InputError
 from pipeline.workflow import artifact, dag, jobs
 
@@ -29,12 +30,14 @@ MEMORY_GROWTH = 1.5
 """Memory of each attempt, relative to the one before."""
 _known: dict[tuple[str, str], dict[str, Any]] = {}
 """Cache of planned jobs, by home and id."""
+OPTIONS = ("agent", "agents", "homes", "variant", "gpu", "processes", "launcher", "container")
 HOME = r"[a-z0-9][a-z0-9_-]*(?:/(?:variants|animals)/[a-z0-9][a-z0-9_-]*)?"
 """Pattern of the homes in a rule's output."""
 
 
 def homes(config: Mapping[str, Any]) -> list[str]:
     """Return the homes to build: `agents=[...]`, a table `homes=` (agent, variant), or one `agent=`."""
+    refuse_unknown(config, OPTIONS, where="snakemake --config")
     variant = config.get("variant")
     if config.get("homes"):
         path = Path(config["homes"])

@@ -40,6 +40,11 @@ def test_invalid_table_of_homes_is_refused(tmp_path, text):
         engine.homes({"agents": ["../x"]})
 
 
+def test_unknown_options_are_refused():
+    with pytest.raises(InputError, match="REC-001 snakemake --config: unknown key 'agnet'"):
+        engine.homes({"agnet": "luna"})
+
+
 def test_resources_grow_with_frames_and_attempts(small_checkout):
     small_checkout.plan()
     node, home = dag.NODES["reconstruction"], SimpleNamespace(home="toy")

@@ -207,6 +207,16 @@ def test_an_unknown_animal_is_refused_before_anything_is_built(small_checkout):
     assert "leave out NAME=" in small_checkout.make("serve", "AGENT=toy", "NAME=cat").stderr
 
 
+def test_misspelled_variables_are_refused(small_checkout):
+    refused = small_checkout.make("toy", "VARAINT=other")
+    assert (
+        refused.returncode == 2 and "REC-004 there is no variable VARAINT: known are AGENT" in refused.stderr
+    )
+    assert not (small_checkout.folder / "build").exists()
+    spaces = ["AGENT=toy", "SUBGOALS=my goals x=3.toml", "GUIDANCE=person=1.5 dog=2", "-n"]
+    assert "no variable" not in small_checkout.make("simulate", *spaces).stderr
+
+
 def test_one_build_alone_is_removed(small_checkout):
     for name in ("build/toy/x", "build/toy/variants/other/x", "build/cat/x"):
         small_checkout.write(name, "")
