@@ -51,7 +51,7 @@ def read(path: Path | None) -> GivenCalibration:
     return given
 
 
-def beside(recording: Path) -> GivenCalibration:
+def sidecar_of(recording: Path) -> GivenCalibration:
     """Read the file beside a recording, if there is one. Raises what `read` raises."""
     file = recording.with_name(f"{recording.name}.depth.toml")
     return read(file if file.is_file() else None)

@@ -39,7 +39,7 @@ def run(files: Sequence[tuple[Path, Role]]) -> Iterator[CaptureVerdict]:
     rng = np.random.default_rng(SEED)
     for path, role in sorted(files, key=lambda file: (file[1] != "walkthrough", file[0].name)):
         try:
-            stated = given.beside(path)
+            stated = given.sidecar_of(path)
             sample = sampling.sample(open_recording(path), SAMPLES, max_depth_m=MAX_DEPTH_M, given=stated)
             seen = _seen(sample, role, room, rng)
         except InputError as error:

@@ -44,7 +44,7 @@ def run(
         if video is not None and inputs.captures is not None:  # their depth may supply metric scale
             found = scale_sources(inputs.captures, video, videos)
             paths = {other.id: inputs.captures / other.file for other in found}
-            sources = {id: (open_recording(path), given.beside(path)) for id, path in paths.items()}
+            sources = {id: (open_recording(path), given.sidecar_of(path)) for id, path in paths.items()}
         with tempfile.TemporaryDirectory() as workspace:
             plan, frames, summary = photogrammetry.map_pictures(recording, sources, config, Path(workspace))
     else:
