@@ -19,8 +19,9 @@ DEPTH_EDGE_M, OUTLINE_STEP = 0.08, 1.0
 """thresholds of drawn edges: of depth, and of the animal's silhouette (any step is larger)"""
 HEADING_M = 0.2
 """length of the line that shows where the animal faces"""
-STEP_FRAMES, MIN_STEP_M = 5, 0.2
-"""an animal walks if it moves farther than the second, meters, within the first, frames"""
+STEP_FRAMES, MIN_STEP_M, AHEAD = 5, 0.2, 0.7
+"""an animal walks if it moves farther than `MIN_STEP_M` within `STEP_FRAMES`, and ahead if within 45 degrees
+(the cosine) of its heading: a template that is turned by 60 degrees does not"""
 CAPTIONS = {
     "edges": "Template edges (magenta) and the placed animal (orange) over frames.",
     "bird": "From above: the phone's path (blue), the animal's (orange, yellow towards its head).",
@@ -96,13 +97,13 @@ def _size_checks(size: AnimalSize | None) -> list[Check]:
 def head_first(world_from_agent: Float[np.ndarray, "frame 4 4"]) -> float | None:
     """Return the share of the walked distance on which the animal faced ahead; None if it does not walk.
 
-    Low if the template's head and tail are swapped (`[build_agent_template] turn_deg`).
+    Low if the template's head and tail are swapped, or it is turned (`[build_agent_template] turn_deg`).
     """
     step = world_from_agent[STEP_FRAMES:, :3, 3] - world_from_agent[:-STEP_FRAMES, :3, 3]
-    ahead = (step * world_from_agent[:-STEP_FRAMES, :3, 2])[:, [0, 2]].sum(-1)
-    length = np.linalg.norm(step[:, [0, 2]], axis=-1)
-    walks = length > MIN_STEP_M
-    return float(length[walks & (ahead > 0)].sum() / length[walks].sum()) if walks.any() else None
+    step, heading = step[:, [0, 2]], world_from_agent[:-STEP_FRAMES, [0, 2], 2]
+    length, level = np.linalg.norm(step, axis=-1), np.linalg.norm(heading, axis=-1)
+    walks, ahead = length > MIN_STEP_M, (step * heading).sum(-1) > AHEAD * length * level
+    return float(length[walks & ahead].sum() / length[walks].sum()) if walks.any() else None
 
 
 def pictures(result: Registered | Rejected, clip: Clip, maps: Maps) -> list[Picture]:
