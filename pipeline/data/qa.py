@@ -35,8 +35,9 @@ class Check:
 
     @property
     def status(self) -> Status:
-        """Compare the value with its thresholds; one that was not measured (None, NaN) warns."""
-        if self.value is None or not math.isfinite(self.value):
+        """Compare the value with its thresholds; if one of them was not measured (NaN, no value), warn."""
+        limits = [limit for limit in (self.warn, self.fail) if limit is not None]
+        if self.value is None or not all(map(math.isfinite, (self.value, *limits))):
             return "warn"
         sign = 1 if self.better == "lower" else -1
         if self.fail is not None and sign * self.value > sign * self.fail:
@@ -64,13 +65,13 @@ def write(
 ) -> None:
     """Write `qa.json` and its pictures into `folder`, an artifact in the making.
 
-    `good` and `bad` each complete the sentence "good (bad) looks like ...".
+    `good` and `bad` each complete the sentence "good (bad) looks like ...". Without checks its status is none.
     """
     for picture in pictures:
         (folder / "qa").mkdir(exist_ok=True)
         images.write_color(folder / "qa" / f"{picture.name}.webp", picture.image)
     report = {
-        "status": worst([check.status for check in checks]),
+        "status": worst([check.status for check in checks]) if checks else "none",
         "good": good,
         "bad": bad,
         "checks": [_plain(check) for check in checks],
@@ -92,5 +93,6 @@ def worst(statuses: Sequence[Status]) -> Status:
 
 
 def _plain(check: Check) -> dict[str, Any]:
-    value = None if check.value is None or not math.isfinite(check.value) else float(check.value)
-    return {**vars(check), "value": value, "status": check.status}
+    measured = {key: getattr(check, key) for key in ("value", "warn", "fail")}
+    known = {key: float(x) if x is not None and math.isfinite(x) else None for key, x in measured.items()}
+    return {**vars(check), **known, "status": check.status}
