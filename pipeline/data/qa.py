@@ -65,7 +65,7 @@ def write(
 ) -> None:
     """Write `qa.json` and its pictures into `folder`, an artifact in the making.
 
-    `good` and `bad` each complete the sentence "good (bad) looks like ...". Without checks its status is none.
+    `good` and `bad` each complete the sentence "good (bad) looks like ...". Status none: without checks.
     """
     for picture in pictures:
         (folder / "qa").mkdir(exist_ok=True)

@@ -59,7 +59,7 @@ class Need:
     alone: bool = False
     """Read only in homes of one animal."""
     mapped: bool = False
-    """Read only by jobs of recordings whose depth comes from the map."""
+    """Read only by jobs of recordings whose depth comes from the map, and by single jobs if there are any."""
     homes: Literal["any", "own", "other"] = "any"
     """If the table names `homes`, other builds of the animal: its own artifact, or theirs in `build/`."""
 
@@ -132,6 +132,7 @@ def merging(*artifacts: str, roles: tuple[Role, ...] | None = None) -> tuple[Nee
 TRUTH = Need("synthetic_capture", part="truth", option="truth", per_animal=True)
 RECORDING = Need("synthetic_capture", part="recordings", option="recording")
 WALK = Need("frames", roles=("walkthrough",), option="walk")
+RECOGNIZER = Need("recognizer", readers=("session",), alone=True, mapped=True)
 OF_HOMES = (
     *(Need(name, homes="own", flow="recordings") for name in HOME_ARTIFACTS[1:]),
     *(Need(name, option="homes", homes="other", flow="recordings") for name in HOME_ARTIFACTS),
@@ -156,13 +157,12 @@ FLOW: tuple[Node, ...] = (
          roles=("session",), sidecars=("prompt",), table="segment_agent", of_several=True,
          seconds_per_frame=0.3),
     Node("masks", "segment_agent",
-         ("frames", "flow", "home_masks", Need("recognizer", readers=("session",), alone=True, mapped=True)),
+         ("frames", "flow", "home_masks", RECOGNIZER),
          roles=AGENT, sidecars=("prompt",), begins_animal=True, seconds_per_frame=0.11),
     Node("recognizer", "train_recognizer", (WALK, *merging("frames", "masks", roles=("turnaround",))),
          resumable=True, on_demand=True),
     Node("estimated_frames", "estimate_depth",
-         ("pictures", Need("frames", roles=("walkthrough",)), "scene_template",
-          Need("recognizer", readers=("session",), alone=True, mapped=True)),
+         ("pictures", Need("frames", roles=("walkthrough",)), "scene_template", RECOGNIZER),
          roles=AGENT, mapped=True, stands_in_for="frames", seconds_per_frame=0.5),
     Node("agent_template", "build_agent_template",
          merging("frames", "masks", "features", roles=("turnaround",))),
@@ -229,7 +229,7 @@ FLOW: tuple[Node, ...] = (
          on_demand=True),
     Node("report", "report",
          (*merging("frames", "flow", "masks"), "feature_basis", *merging("features"),
-          *TEMPLATES, *LOCALIZERS, *merging("video_poses"), "registration",
+          *TEMPLATES, *LOCALIZERS, *merging("video_poses"), "registration", "identities", RECOGNIZER,
           *READ_BY_PAGES, "longterm", "simulator", "reconstruction_metrics", "evaluation")),
 )
 # fmt: on

@@ -323,7 +323,8 @@ def _is_read(plan: Plan, node: Node, need: Need, video: Video | None) -> bool:
     in_home = not need.alone if plan.others else not (source.of_several or need.others)
     in_recipe = need.homes == "any" or bool(plan.tables[node.artifact].get(HOMES))
     if video is None:
-        return in_home and in_recipe and not need.mapped
+        readers = [each for each in plan.videos if each.mapped and each.role in (need.readers or dag.AGENT)]
+        return in_home and in_recipe and bool(readers or not need.mapped)
     roles_of_several = source.roles if source.of_several else ()
     by_role = all(video.role in roles for roles in (need.readers, roles_of_several) if roles)
     return in_home and in_recipe and by_role and (video.mapped or not need.mapped)

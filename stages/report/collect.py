@@ -26,6 +26,8 @@ WORDS: Mapping[str, Any] = tomllib.loads(
 )
 """The texts of the report: chapters in flow order, methods, remedies for checks."""
 LIGHTS = ("none", "ok", "warn", "fail")
+PAGE_OF = {"estimated_frames": "frames", "home_masks": "identities"}
+"""where inputs without a page of their own are judged: theirs, or that of what they are made from"""
 _PICTURE_BYTES = 10_000_000
 _SMALLEST_PX = 160
 _JPEG_QUALITY, _BLURRED_JPEG_QUALITY = 85, 80
@@ -170,7 +172,8 @@ def read_chapter(
         ]
         label = labels.get(video or "", RecordingLabel())
         notes.append(Note(video, label, qa["status"], qa["good"], qa["bad"], qa["checks"], pictures))
-    depends_on = frozenset(name.partition("/")[0] for manifest in manifests for name in manifest["inputs"])
+    read = {name.partition("/")[0] for manifest in manifests for name in manifest["inputs"]}
+    depends_on = frozenset(PAGE_OF.get(name, name) for name in read)
     return ChapterReport(chapter, notes, dict(manifests[0]["config"]) if manifests else {}, depends_on)
 
 

@@ -40,6 +40,10 @@ class Inputs:
     simulator: Path
     reconstruction_metrics: Path
     evaluation: Path
+    identities: Path | None = None
+    """Only in a home of several animals."""
+    recognizer: Path | None = None
+    """Only where sessions are plain videos."""
 
     def folders(self, artifact: str) -> dict[str | None, Path]:
         """Return an artifact's folders by recording; the key None if there is only one."""
@@ -50,12 +54,13 @@ class Inputs:
 def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] = ()) -> None:
     """Collect notes, derive verdicts, render pages."""
     measured = Metrics.read(inputs.evaluation)
-    folders = {chapter.artifact: inputs.folders(chapter.artifact) for chapter in CHAPTERS}
+    shown = [chapter for chapter in CHAPTERS if getattr(inputs, chapter.artifact) is not None]
+    folders = {chapter.artifact: inputs.folders(chapter.artifact) for chapter in shown}
     judged = bars.judge(measured.values, measured.reasons)
     labels = {video.id: collect.label(video, config.share_safe) for video in videos}
     read = [
         collect.read_chapter(chapter, folders[chapter.artifact], labels, config.share_safe)
-        for chapter in CHAPTERS
+        for chapter in shown
     ]
     chapters = collect.with_verdicts(read, {"evaluation": bars.worst(judged)})
     texts = pages.render(

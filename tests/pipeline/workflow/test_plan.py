@@ -537,7 +537,7 @@ def test_session_without_depth_is_read_with_estimated_depth(small_checkout):
     assert of_all | {"recognizer", "pictures/v002"} == read["estimated_frames.v002"]
     assert "estimated_frames/v002" in read["masks.v002"] and "frames/v003" in read["masks.v003"]
     assert {job for job, names in read.items() if "recognizer" in names} == {
-        "estimated_frames.v002", "masks.v002",
+        "estimated_frames.v002", "masks.v002", "report",
     }  # fmt: skip
     assert not any(name.startswith("estimated") for name in read["feature_basis"]), "the map needs features"
     assert {"frames/v000", "estimated_frames/v001", "estimated_frames/v002"} <= read["reconstruction"]
@@ -550,6 +550,17 @@ def test_sessions_without_depth_of_several_animals_do_not_wait_for_masks(small_c
     read = {job["id"]: {each["name"] for each in job["inputs"]} for job in jobs if job["home"] == "toy"}
     sessions = [names for job, names in read.items() if job.startswith("estimated_frames.")]
     assert len(sessions) == 4 and not any(name.startswith("masks") for names in sessions for name in names)
+    for animal in "ab":
+        of_animal = small_checkout.folder / "build/toy/animals" / animal / "plan/dag.json"
+        (report,) = [job for job in json.loads(of_animal.read_text()) if job["artifact"] == "report"]
+        assert {"identities"} == {each["name"] for each in report["inputs"]} & {"identities", "recognizer"}
+
+
+def test_report_of_recordings_with_depth_reads_no_recognizer(small_checkout):
+    small_checkout.record("walkthrough.r3d", "turnaround.mp4", "a.r3d", "b.r3d")
+    small_checkout.plan()
+    read = {each["name"] for each in small_checkout.jobs()["report"]["inputs"]}
+    assert {"frames/v000", "estimated_frames/v001"} <= read and read.isdisjoint({"identities", "recognizer"})
 
 
 def test_make_starts_what_templates_need_first_and_long_recordings_before_short_ones(small_checkout):

@@ -2,6 +2,7 @@
 
 import ast
 import base64
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -136,6 +137,45 @@ def test_verdict_includes_the_inputs() -> None:
         "the root, not what lies between"
     )
     assert judged["evaluation"].causes == (), "its own bars"
+
+
+def test_masks_stand_on_networks_and_on_what_replaces_inputs(tmp_path: Path) -> None:
+    """The inputs are those of manifests: stand-ins have no page of their own."""
+    inputs = {
+        "frames": ["pictures/v002", "recognizer"],
+        "recognizer": ["frames/v001", "masks/v001"],
+        "masks": ["estimated_frames/v002", "recognizer", "home_masks/v002"],
+        "identities": ["frames/v001"],
+    }
+    read = {}
+    for chapter in (each for each in CHAPTERS if each.artifact in inputs):
+        with artifact.create(
+            tmp_path / chapter.artifact,
+            stage=dag.NODES[chapter.artifact].stage,
+            config={},
+            inputs=dict.fromkeys(inputs[chapter.artifact], "0" * 64),
+        ) as folder:
+            qa.write(folder, good="", bad="", checks=[qa.Check("recall", 1.0, warn=2.0, fail=3.0)])
+        read[chapter.artifact] = collect.read_chapter(chapter, {None: tmp_path / chapter.artifact}, {})
+    assert list(read) == ["frames", "identities", "recognizer", "masks"]
+    for wrong in ("frames", "identities", "recognizer"):
+        note = read[wrong].notes[0]
+        notes = [collect.Note(None, note.label, "fail", "", "", note.checks, [])]
+        wrong_one = [
+            dataclasses.replace(each, notes=notes) if name == wrong else each for name, each in read.items()
+        ]
+        masks = collect.with_verdicts(wrong_one, {})[-1]
+        assert masks.light == "fail" and [cause.artifact for cause in masks.causes] == [wrong]
+    assert collect.with_verdicts(list(read.values()), {})[-1].light == "ok"
+
+
+def test_pages_of_networks_only_where_there_are_some(tmp_path: Path) -> None:
+    paths = write_notes(tmp_path, {}, {})
+    given = dataclasses.replace(inputs_of(paths), identities=None, recognizer=None)
+    (tmp_path / "report").mkdir()
+    stage.run(given, Config(name="toy", times=False), tmp_path / "report", videos=VIDEOS)
+    pages = {path.stem for path in (tmp_path / "report").glob("*.html")}
+    assert pages == {"index", *(chapter.artifact for chapter in CHAPTERS)} - {"identities", "recognizer"}
 
 
 def test_foot_skate_gives_a_warning() -> None:
