@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from pipeline.calibration import depth_steps, estimation
 from pipeline.calibration.depth_steps import PARAMETERS, StepFrame, StepProfiles
@@ -22,7 +22,7 @@ from pipeline.mapping.edge_agreement import relative_slopes
 from pipeline.mapping.picture_agreement import beats
 from pipeline.recordings import extraction
 from pipeline.recordings.extraction import ExtractionPlan
-from pipeline.recordings.recording import DepthCamera, Recording, grid_size, reproject
+from pipeline.recordings.recording import DepthCamera, Recording, grid_size, reproject, reproject_confidence
 
 FRAMES, RATE_HZ = 90, 10.0
 """frames that are read, at most this many per second: two thirds for the estimate, the others confirm it"""
@@ -176,14 +176,22 @@ def _reprojected(recording: Recording, found: DepthEstimate) -> Recording:
     lenses = _depth_intrinsics(recording)
     row = {number: at for at, number in enumerate(recording.index.tolist())}
 
-    def depth(number: int) -> Float[np.ndarray, "height width"]:
+    stored = recording.read_confidence
+
+    def seen_by_color(number: int) -> tuple[np.ndarray, DepthCamera, np.ndarray, tuple[int, int]]:
         lens = _scaled(lenses[row[number]], found.focal)
         known = extraction.known_depth(recording.read_depth(number), np.inf)
-        return reproject(known, DepthCamera(lens, found.depth_from_color), intrinsics[row[number]], size)
+        return known, DepthCamera(lens, found.depth_from_color), intrinsics[row[number]], size
+
+    def confidence(number: int) -> UInt8[np.ndarray, "height width"] | None:
+        assert stored is not None, recording.where
+        seen, rest = stored(number), seen_by_color(number)
+        return None if seen is None else reproject_confidence(seen, *rest)
 
     return replace(
         recording,
-        read_depth=depth,
+        read_depth=lambda number: reproject(*seen_by_color(number)),
+        read_confidence=stored and confidence,
         depth_size=grid_size(recording.depth_size, size),
         depth_camera=None,
         remarks=(*recording.remarks, f"depth is reprojected: {describe(found, ('camera',))}"),

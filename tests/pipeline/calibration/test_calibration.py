@@ -130,6 +130,29 @@ def test_what_is_given_is_kept():
     assert not right.read_depth(FRAMES - 1).any(), "there is no depth of that time"
 
 
+def test_confidence_moves_along_with_corrected_depth():
+    recording = _recording()
+    stored = recording.read_depth(3)
+    near = stored < np.median(stored[stored > 0])
+    levels = replace(
+        recording,
+        read_confidence=lambda number: None if number == 2 else np.where(near, 2, 1).astype(np.uint8),
+    )
+    parallel = rigid.make(np.eye(3), np.array([0.2, 0, 0]))
+    moved = recordings._changed(levels, recordings.DepthEstimate(0.9, parallel, 0.0, np.zeros(8)), ["camera"])
+    assert (
+        moved.read_confidence(2) is None
+        and recordings._changed(
+            recording, recordings.DepthEstimate(0.9, parallel, 0.0, np.zeros(8)), ["camera"]
+        ).read_confidence
+        is None
+    )
+    depth, found = moved.read_depth(3), moved.read_confidence(3)
+    assert found.shape == depth.shape and ((found > 0) == (depth > 0)).all()
+    limit = np.median(stored[stored > 0])
+    np.testing.assert_array_equal(found[depth > 0], np.where(depth[depth > 0] < limit, 2, 1))
+
+
 def test_what_fits_includes_the_delay_that_is_given():
     stated = GivenCalibration(registered=True, delay_s=0.1)
     recording = recordings.with_given(_recording(delay_s=0.3), stated)
