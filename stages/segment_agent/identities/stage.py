@@ -36,7 +36,7 @@ class Inputs:
 def run(inputs: Inputs, config: Config, out: Path, *, videos: Sequence[Video] = ()) -> Identities:
     """Learn to distinguish the animals and write the network, and what it learned from, into `out`.
 
-    Raises InputError MSK-005 where two look the same.
+    Raises InputError MSK-005 where two look the same, MSK-008 where too few masks show one of them.
     """
     animal_of = {video.id: video.animal for video in videos if video.animal}
     names = tuple(sorted(animal_of[id] for id in inputs.frames))
@@ -46,6 +46,11 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: Sequence[Video] = 
         found = portraits(folder, inputs.flow[id], names.index(animal_of[id]), config, rng)
         tested += found[TEST_EVERY // 2 :: TEST_EVERY]
         learned += [each for index, each in enumerate(found) if index % TEST_EVERY != TEST_EVERY // 2]
+    for index, name in enumerate(names):
+        if index not in {each.animal for each in tested}:
+            remedy = f"film the turnaround of {name} again, closer and by more light"
+            what = f"hardly any mask of the turnaround shows {name}"
+            raise InputError("MSK-008", what, str(next(iter(inputs.frames.values())).parent), remedy)
     network = identity.learn_identities(learned, names, config, rng)
     shares = dict(zip(names, identity.recognition_rates(network, tested).tolist(), strict=True))
     log("recognized: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items()))

@@ -323,3 +323,15 @@ def test_prompt_with_unknown_animal_is_refused(network, together, tmp_path):
     prompt.write_text("frame = 0\nclick = [0.5, 0.5]\n")
     with pytest.raises(InputError, match="MSK-006"):
         stage.run(stage.Inputs(together[0], Path("none"), prompt, tmp_path), OPTIONS, tmp_path)
+
+
+@pytest.mark.parametrize("shown", [0, 2])
+def test_an_animal_that_hardly_any_mask_shows_is_refused(turnarounds, tmp_path, monkeypatch, shown):
+    portraits = identities.portraits
+
+    def few(frames, flow, animal, config, rng):
+        return portraits(frames, flow, animal, config, rng)[: shown if animal else None]
+
+    monkeypatch.setattr(identities, "portraits", few)
+    with pytest.raises(InputError, match="MSK-008"):
+        identities.run(identities.Inputs(turnarounds, turnarounds), SHORT, tmp_path, videos=VIDEOS)
