@@ -139,6 +139,24 @@ def test_stage_writes_a_network_and_how_good_it_is(tmp_path):
     assert overlap["value"] > 0.6 and mistaken["value"] < 2
 
 
+@pytest.mark.parametrize("count", [4, 5, 50, 60, 66, 67, 400])
+def test_short_turnarounds_leave_pictures_for_the_test(count):
+    chosen, others = stage._split(count, stage.PORTRAITS)
+    assert sorted(chosen + others) == list(range(count)) and len(others) >= count // 4
+    assert len(chosen) == min(stage.PORTRAITS, 3 * count // 4)
+
+
+def test_what_no_unseen_picture_measures_is_not_fine(tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "BATCH", 1)
+    portraits = portraits_and_rooms()[0]
+    seen = stage._split(len(portraits), stage.PORTRAITS)[0]
+    blank = np.zeros(SIZE, np.uint8)
+    portraits = [each if i in seen else Example(each.color, blank) for i, each in enumerate(portraits)]
+    stage.run(stage_inputs(tmp_path, portraits), Config(steps=2), tmp_path / "out")
+    overlap, _ = json.loads((tmp_path / "out/qa.json").read_text())["checks"]
+    assert overlap["value"] is None and overlap["status"] == "warn"
+
+
 def test_turnaround_without_masks_is_refused(tmp_path):
     empty = [Example(each.color, np.zeros(SIZE, np.uint8)) for each in portraits_and_rooms()[0]]
     with pytest.raises(InputError, match="MSK-008"):
