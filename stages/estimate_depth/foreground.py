@@ -72,7 +72,9 @@ def difference(
 def foreground(
     target: ColorView, walk: Sequence[ColorView], times: Sequence[ColorView]
 ) -> Bool[np.ndarray, "height width"]:
-    """Segment the foreground by hysteresis thresholding and morphology."""
+    """Segment the foreground by hysteresis thresholding and morphology; none without any source."""
+    if not (walk or times):
+        return np.zeros(target.view.gray.shape, bool)
     both = [[difference(target, source) for source in sources] for sources in (walk, times)]
     sure, weak = (_differing(both, limit) for limit in (HIGH_THRESHOLD, LOW_THRESHOLD))
     sure = cv2.morphologyEx(sure.astype(np.uint8), cv2.MORPH_OPEN, OPENING)

@@ -32,7 +32,7 @@ class View:
     """One small picture, its camera, and the surface's depth."""
 
     gray: UInt8[np.ndarray, "height width"]
-    """Contrast equalised."""
+    """Contrast equalized."""
     intrinsics: Float[np.ndarray, "3 3"]
     world_from_camera: Float[np.ndarray, "4 4"]
     depth: Float[np.ndarray, "height width"]
@@ -40,7 +40,7 @@ class View:
 
 
 def small_gray(color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "small_height small_width"]:
-    """Reduce a picture and equalise its contrast."""
+    """Reduce a picture and equalize its contrast."""
     gray = small(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY))
     return cv2.createCLAHE(CLAHE_CLIP, CLAHE_TILES).apply(gray)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.meshes import RayCaster
-from stages.estimate_depth import landmarks, tracking, views
+from stages.estimate_depth import foreground, landmarks, tracking, views
 from stages.estimate_depth.landmarks import Matches
 from stages.estimate_depth.lens import Lens, PnPResult
 from tests.stages.estimate_depth import filmed_room
@@ -60,3 +60,13 @@ def test_cameras_are_tracked_over_short_gaps_only(filmed, covered, monkeypatch):
         assert off_m.max() < 0.05
     else:
         assert not placed[beyond].any()
+
+
+def test_nothing_is_in_front_where_no_picture_shows_the_same(filmed):
+    room, path, pictures = filmed
+    gray = views.small_gray(pictures[0])
+    view = views.view_of(gray, filmed_room.INTRINSICS, path[0], room.caster)
+    shown = foreground.color_view(pictures[0], view)
+    assert not foreground.foreground(shown, [], []).any()
+    for sources in (([shown], []), ([], [shown, shown])):
+        assert not foreground.foreground(shown, *sources).any(), "it differs from none"

@@ -211,7 +211,9 @@ def test_reversed_heading_is_detected():
     ahead[10] = np.nan
     backwards = ahead @ rigid.exp(np.array([0, np.pi, 0, 0, 0, 0]))
     assert (pictures.head_first(ahead), pictures.head_first(backwards)) == (1.0, 0.0)
-    turned = {deg: ahead @ rigid.exp(np.array([0, np.radians(deg), 0, 0, 0, 0])) for deg in (-60, -30, 30, 60)}
+    turned = {
+        deg: ahead @ rigid.exp(np.array([0, np.radians(deg), 0, 0, 0, 0])) for deg in (-60, -30, 30, 60)
+    }
     assert [pictures.head_first(each) for each in turned.values()] == [0.0, 1.0, 1.0, 0.0]
     nosing = ahead @ rigid.exp(np.array([np.radians(60), 0, 0, 0, 0, 0]))
     assert pictures.head_first(nosing) == 1.0, "head down"
