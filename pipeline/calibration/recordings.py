@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
 from pipeline.calibration import depth_steps, estimation
 from pipeline.calibration.depth_steps import PARAMETERS, StepFrame, StepProfiles
@@ -22,7 +22,7 @@ from pipeline.mapping.edge_agreement import relative_slopes
 from pipeline.mapping.picture_agreement import beats
 from pipeline.recordings import extraction
 from pipeline.recordings.extraction import ExtractionPlan
-from pipeline.recordings.recording import DepthCamera, Recording, grid_size, reproject, reproject_confidence
+from pipeline.recordings.recording import DepthCamera, Recording
 
 FRAMES, RATE_HZ = 90, 10.0
 """frames that are read, at most this many per second: two thirds for the estimate, the others confirm it"""
@@ -170,32 +170,11 @@ def _delayed(recording: Recording, delay_s: float) -> Recording:
 
 
 def _reprojected(recording: Recording, found: DepthEstimate) -> Recording:
-    """Reproject depth from the estimated camera into the color camera."""
-    intrinsics, size = recording.intrinsics, recording.color_size
-    assert intrinsics is not None and recording.depth_size is not None, recording.where
-    lenses = _depth_intrinsics(recording)
-    row = {number: at for at, number in enumerate(recording.index.tolist())}
-
-    stored = recording.read_confidence
-
-    def seen_by_color(number: int) -> tuple[np.ndarray, DepthCamera, np.ndarray, tuple[int, int]]:
-        lens = _scaled(lenses[row[number]], found.focal)
-        known = extraction.known_depth(recording.read_depth(number), np.inf)
-        return known, DepthCamera(lens, found.depth_from_color), intrinsics[row[number]], size
-
-    def confidence(number: int) -> UInt8[np.ndarray, "height width"] | None:
-        assert stored is not None, recording.where
-        seen, rest = stored(number), seen_by_color(number)
-        return None if seen is None else reproject_confidence(seen, *rest)
-
-    return replace(
-        recording,
-        read_depth=lambda number: reproject(*seen_by_color(number)),
-        read_confidence=stored and confidence,
-        depth_size=grid_size(recording.depth_size, size),
-        depth_camera=None,
-        remarks=(*recording.remarks, f"depth is reprojected: {describe(found, ('camera',))}"),
-    )
+    """Let depth and confidence be reprojected from the estimated camera into the color camera."""
+    lens = _scaled(np.median(_depth_intrinsics(recording), axis=0), found.focal)
+    remark = f"depth is reprojected: {describe(found, ('camera',))}"
+    camera = DepthCamera(lens, found.depth_from_color)
+    return replace(recording, depth_camera=camera, remarks=(*recording.remarks, remark))
 
 
 def describe(found: DepthEstimate, parts: Sequence[str] = PARTS) -> str:
@@ -221,7 +200,8 @@ def as_given(found: DepthCalibration) -> dict[str, str]:
     """Return the keys of `given.GivenCalibration`, as TOML, that state what is clear."""
     said, estimate = {}, found.estimate
     if estimate is not None and "camera" in found.clear:
-        lens = _scaled(np.median(_depth_intrinsics(found.recording), axis=0), estimate.focal)
+        lens = np.median(_depth_intrinsics(found.recording), axis=0)
+        lens = lens if "camera" in found.used else _scaled(lens, estimate.focal)
         said["depth_intrinsics"] = [round(float(each), 2) for each in lens[[0, 1, 0, 1], [0, 1, 2, 2]]]
         said["depth_from_color"] = [round(float(each), 5) for each in estimate.depth_from_color.ravel()]
     if estimate is not None and "delay" in found.clear:

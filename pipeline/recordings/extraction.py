@@ -20,7 +20,7 @@ from pipeline.mapping.edge_agreement import edge_contrast, relative_gradient
 from pipeline.mapping.picture_agreement import CLOCKS, PictureAgreement, PosedPicture
 from pipeline.recordings import conventions, errors, upright
 from pipeline.recordings.conventions import PoseCheck
-from pipeline.recordings.recording import Picture, Recording, grid_size, reproject, reproject_confidence
+from pipeline.recordings.recording import Picture, Recording, grid_size, reproject
 
 JPEG = b"\xff\xd8"
 MAX_DEPTH_SIDE_PX = 640
@@ -342,11 +342,16 @@ def confidence_of(
     confidence = recording.read_confidence(number)
     if confidence is None:
         return np.zeros(depth.shape, np.uint8)
-    if recording.depth_camera is not None:
+    if recording.depth_camera is not None:  # that of the surface which is nearest in each pixel
         assert recording.intrinsics is not None, recording.where
-        known = known_depth(recording.read_depth(number), np.inf)
-        color = recording.intrinsics[np.searchsorted(recording.index, number)], recording.color_size
-        confidence = reproject_confidence(confidence, known, recording.depth_camera, *color)
+        known, row = (
+            known_depth(recording.read_depth(number), np.inf),
+            np.searchsorted(recording.index, number),
+        )
+        confidence = _sampled(confidence, known.shape)
+        color = recording.depth_camera, recording.intrinsics[row], recording.color_size
+        seen = [reproject(np.where(confidence >= level, known, 0), *color) for level in range(3)]
+        confidence = np.sum([(seen[0] > 0) & (seen[0] == each) for each in seen[1:]], axis=0, dtype=np.uint8)
     return _sampled(np.minimum(confidence, 2), depth.shape)
 
 

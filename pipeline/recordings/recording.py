@@ -7,7 +7,6 @@ checks and rotates them.
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
@@ -138,19 +137,3 @@ def reproject(
             inside = (corner >= 0).all(1) & (corner < (width, height)).all(1)
             np.minimum.at(nearest, corner[inside, 1] * width + corner[inside, 0], z[inside])
     return np.where(np.isfinite(nearest), nearest, np.float32(0)).reshape(size)
-
-
-def reproject_confidence(
-    confidence: UInt8[np.ndarray, "stored_height stored_width"],
-    depth: Float[np.ndarray, "depth_height depth_width"],
-    camera: DepthCamera,
-    color_intrinsics: Float[np.ndarray, "3 3"],
-    color_size: tuple[int, int],
-) -> UInt8[np.ndarray, "height width"]:
-    """Return the confidence (0 to 2) of the surface that `reproject` gives each cell, 0 without one."""
-    confidence = cv2.resize(confidence, depth.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-    any_level, medium, high = (
-        reproject(np.where(confidence >= level, depth, 0), camera, color_intrinsics, color_size)
-        for level in range(3)
-    )
-    return np.sum([(any_level > 0) & (each == any_level) for each in (medium, high)], axis=0).astype(np.uint8)

@@ -131,26 +131,25 @@ def test_what_is_given_is_kept():
 
 
 def test_confidence_moves_along_with_corrected_depth():
+    plain = _recording(focal=0.95)
+    stored = plain.read_depth(3)
+    near, limit = stored < np.median(stored[stored > 0]), np.median(stored[stored > 0])
+    levels = replace(plain, read_confidence=lambda _: np.where(near, 2, 1).astype(np.uint8))
+    found = recordings.calibrate(levels)
+    assert "camera" in found.used
+    depth = extraction.stored_depth(found.recording, 3, 6.0)
+    confidence = extraction.confidence_of(found.recording, 3, depth)
+    assert np.mean(depth != stored) > 0.1, "depth moves"
+    np.testing.assert_array_equal(confidence, np.select([depth == 0, depth < limit], [0, 2], 1))
+
+
+@pytest.mark.parametrize("used", [(), recordings.PARTS])
+def test_what_is_said_is_the_same_once_it_is_used(used):
     recording = _recording()
-    stored = recording.read_depth(3)
-    near = stored < np.median(stored[stored > 0])
-    levels = replace(
-        recording,
-        read_confidence=lambda number: None if number == 2 else np.where(near, 2, 1).astype(np.uint8),
-    )
-    parallel = rigid.make(np.eye(3), np.array([0.2, 0, 0]))
-    moved = recordings._changed(levels, recordings.DepthEstimate(0.9, parallel, 0.0, np.zeros(8)), ["camera"])
-    assert (
-        moved.read_confidence(2) is None
-        and recordings._changed(
-            recording, recordings.DepthEstimate(0.9, parallel, 0.0, np.zeros(8)), ["camera"]
-        ).read_confidence
-        is None
-    )
-    depth, found = moved.read_depth(3), moved.read_confidence(3)
-    assert found.shape == depth.shape and ((found > 0) == (depth > 0)).all()
-    limit = np.median(stored[stored > 0])
-    np.testing.assert_array_equal(found[depth > 0], np.where(depth[depth > 0] < limit, 2, 1))
+    found = recordings.DepthEstimate(0.9, rigid.make(np.eye(3), np.array([0.025, 0, 0])), 0.0, np.zeros(8))
+    applied = recordings._changed(recording, found, used)
+    keys = recordings.as_given(recordings.DepthCalibration(applied, found, recordings.PARTS, used))
+    assert keys["depth_intrinsics"] == str([0.9 * FOCAL, 0.9 * FOCAL, 80.0, 60.0])
 
 
 def test_what_fits_includes_the_delay_that_is_given():
