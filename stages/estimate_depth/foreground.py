@@ -52,16 +52,22 @@ def color_view(color: UInt8[np.ndarray, "height width 3"], view: View) -> ColorV
     return ColorView(view, small, cv2.GaussianBlur(lab, (3, 3), SOFTNESS_PX))
 
 
+def aligned_colors(
+    target: ColorView, source: ColorView
+) -> tuple[Float[np.ndarray, "height width 2"], Region, Float[np.ndarray, "height width 3"]]:
+    """Return where a source shows a target's points of the map, whether it sees them, and its colors."""
+    there, known = views.warp(target.view, source.view)
+    color = cameras.sample_bilinear(source.lab, there).astype(np.float32)
+    if known.any():  # exposure and white balance change
+        color += np.median((target.lab - color)[known], axis=0)
+    return there, known, color
+
+
 def difference(
     target: ColorView, source: ColorView
 ) -> tuple[Float[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
     """Return the color difference to a source, beyond the slack, and where the source sees the surface."""
-    there, known = views.warp(target.view, source.view)
-    shown = cameras.sample_bilinear(source.lab, there)
-    if known.sum() < MIN_SEEN:
-        return np.zeros(known.shape, np.float32), np.zeros(known.shape, bool)
-    # exposure and white balance change between recordings
-    shown = shown + np.median((target.lab - shown)[known], axis=0)
+    _, known, shown = aligned_colors(target, source)
     shown = np.where(known[..., None], shown, target.lab)
     around = np.ones((2 * SLACK_PX + 1,) * 2, np.uint8)
     low, high = cv2.erode(shown, around), cv2.dilate(shown, around)

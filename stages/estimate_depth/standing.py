@@ -14,11 +14,10 @@ import scipy.ndimage
 from jaxtyping import Bool, Float
 
 from pipeline.core.progress import track
-from pipeline.geometry import cameras, subsampling
+from pipeline.geometry import subsampling
 from pipeline.mapping.bundle_adjustment import MAD_TO_SIGMA
 from pipeline.segmentation.grabcut import dilated
-from stages.estimate_depth import views
-from stages.estimate_depth.foreground import ColorView
+from stages.estimate_depth.foreground import ColorView, aligned_colors
 
 REFERENCES, ROUNDS = 24, 3
 """Frames spread over the recording whose colors are compared, and rounds of segmenting these."""
@@ -63,8 +62,9 @@ def _in_front(shown, frame: int, blocked: dict[int, Mask], own, bandwidth: Lab) 
     for other, cover in blocked.items():
         if other == frame:
             continue
-        there, known, color = _colors(target, shown[other])
-        known &= cv2.remap(cover.astype(np.uint8), *_index(there), cv2.INTER_NEAREST, borderValue=1) == 0
+        there, known, color = aligned_colors(target, shown[other])
+        at = there - 0.5
+        known &= cv2.remap(cover.astype(np.uint8), at[..., 0], at[..., 1], cv2.INTER_NEAREST) == 0
         distance = (((color - target.lab) / bandwidth) ** 2).sum(-1)
         density += np.exp(-distance / 2) * known
         seen += known
@@ -75,24 +75,11 @@ def _in_front(shown, frame: int, blocked: dict[int, Mask], own, bandwidth: Lab) 
     return cv2.ximgproc.guidedFilter(guide, log_odds, RADIUS_PX, EDGE**2) > 0
 
 
-def _colors(target: ColorView, source: ColorView) -> tuple[np.ndarray, Mask, Lab]:
-    """Return where a source shows a target's points of the map, whether it sees them, and its colors."""
-    there, known = views.warp(target.view, source.view)
-    color = cameras.sample_bilinear(source.lab, there).astype(np.float32)
-    if known.any():  # exposure and white balance change while the phone circles
-        color += np.median((target.lab - color)[known], axis=0)
-    return there, known, color
-
-
-def _index(there: Float[np.ndarray, "height width 2"]) -> tuple[np.ndarray, np.ndarray]:
-    return there[..., 0] - 0.5, there[..., 1] - 0.5
-
-
 def _noise(shown: Sequence[ColorView], chosen: Sequence[int]) -> Float[np.ndarray, "3"]:
     """Return the standard deviation (robust) of colors around the median of the other pictures."""
     off, step = [], np.s_[::NOISE_STRIDE, ::NOISE_STRIDE]
     for frame in chosen[::NOISE_STRIDE]:
-        seen = [_colors(shown[frame], shown[other])[1:] for other in chosen if other != frame]
+        seen = [aligned_colors(shown[frame], shown[other])[1:] for other in chosen if other != frame]
         color = np.stack([np.where(known[step][..., None], color[step], np.nan) for known, color in seen])
         often = np.isfinite(color[..., 0]).sum(0) >= MIN_SEEN
         off.append(shown[frame].lab[step][often] - np.nanmedian(color[:, often], axis=0))

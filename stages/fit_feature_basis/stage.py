@@ -1,17 +1,25 @@
 """The stage: frames of all training recordings -> the feature basis."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
 
 from pipeline.backends.daisy import fit_basis
 from pipeline.backends.descriptors import Describer
 from pipeline.core import devices, progress
 from pipeline.data import qa
 from pipeline.data.clips import Clip
+from pipeline.geometry.subsampling import evenly
 from stages.fit_feature_basis.config import Config
-from stages.fit_feature_basis.sampling import sample_descriptors
 
+FRAMES_PER_RECORDING = 16
+"""Frames described per recording: a minute at one every four seconds, so that each recording counts alike."""
+STRIDE_PX = 16
+"""Distance between sampled descriptors, color pixels: about their own size, nearer ones repeat each
+other."""
 MIN_VARIANCE_PERCENT = 35.0
 """variance that 16 axes hold of DAISY on any textured room; noise and plain pictures hold less"""
 MIN_DESCRIPTORS = 2000
@@ -46,3 +54,12 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
             qa.Check("recordings", float(len(clips))),
         ],
     )
+
+
+def sample_descriptors(
+    clips: Iterable[Clip], describe: Callable[[np.ndarray, int], np.ndarray]
+) -> Float[np.ndarray, "sample channel"]:
+    """Describe `FRAMES_PER_RECORDING` frames of each recording, evenly spread in time."""
+    shown = ((clip, evenly(len(clip), FRAMES_PER_RECORDING, rounded=True)) for clip in clips)
+    described = (describe(clip.color(int(frame)), STRIDE_PX) for clip, frames in shown for frame in frames)
+    return np.concatenate([raw.reshape(-1, raw.shape[-1]) for raw in described])
