@@ -104,6 +104,16 @@ def test_presence_is_decided_by_appearance_and_motion(similarity, moved, presume
     assert abs(found) < segmenter.LOG_ODDS_LIMIT + segmenter.PRESENCE_LIMIT
 
 
+@pytest.mark.parametrize(
+    ("share", "session", "turnaround"), [(1.0, "ok", "ok"), (0.5, "ok", "warn"), (0, "fail", "fail")]
+)
+def test_a_circled_animal_is_in_view_nearly_always(share, session, turnaround):
+    seen = [frame < 20 * share for frame in range(20)]
+    summary = writing.Summary(seen, [0.9] * 20, [0.1 * each for each in seen])
+    states = [writing.checks_of(summary, 0.0, np.ones(10), circled)[0].status for circled in (False, True)]
+    assert states == [session, turnaround]
+
+
 def test_temporally_implausible_masks_are_reported():
     count, rng = 100, np.random.default_rng(0)
     good = Summary([True] * 60 + [False] * 40, [0.95] * count, [0.05] * 60 + [0.0] * 40)
