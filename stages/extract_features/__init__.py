@@ -1,1 +1,1 @@
-"""Project the dense descriptors of one video onto the shared basis; `pictures` draws the quality page."""
+"""Project the dense descriptors of one video onto the shared basis."""

@@ -17,8 +17,8 @@ from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.masks import Segmentation
 from stages.segment_agent.segmenter import Mask
 
-LOW_CONFIDENCE = 0.75
-"""probability below which presence is uncertain"""
+LOW_CONFIDENCE, CIRCLED = 0.75, 80
+"""probability below which presence is uncertain; least percent of a turnaround's frames with its animal"""
 RIGHT_IOU, WRONG_IOU = 0.75, 0.6
 """mean IoU that `evaluate` requires, and an estimate below that of all good masks: on nine sessions their
 estimates are at most 0.07 off, those of bad masks up to 0.14 too high and 0.22 too low"""
@@ -99,14 +99,11 @@ def checks_of(
     estimated: Float[np.ndarray, "frame"] | None = None,
     circled: bool = False,
 ) -> list[Check]:
-    """Return the checks of masks; without an ``estimated`` IoU, jumps of the area over time.
-
-    An animal that is ``circled`` is in view nearly always, and the estimate does not see where it is missed.
-    """
+    """Return the checks of masks; without an ``estimated`` IoU, jumps of its area. ``circled``: in a turnaround."""
     visible, confidence = np.array(summary.visible), np.array(summary.confidence)
     unsure = confidence[np.isfinite(confidence)] < LOW_CONFIDENCE
     checks = [
-        Check("agent visible", _percent(visible), "%", 80 if circled else None, 2, better="higher"),
+        Check("agent visible", _percent(visible), "%", CIRCLED if circled else None, 2, better="higher"),
         Check("frames of low confidence", _percent(unsure), "%", warn=12, fail=30),
     ]
     if estimated is None:
