@@ -99,7 +99,7 @@ def checks_of(
     estimated: Float[np.ndarray, "frame"] | None = None,
     circled: bool = False,
 ) -> list[Check]:
-    """Return the checks of masks; without an ``estimated`` IoU, jumps of its area. ``circled``: in a turnaround."""
+    """Return the checks of masks, ``circled``: of a turnaround. Without ``estimated`` IoU: jumps of area."""
     visible, confidence = np.array(summary.visible), np.array(summary.confidence)
     unsure = confidence[np.isfinite(confidence)] < LOW_CONFIDENCE
     checks = [
