@@ -20,7 +20,7 @@ from pipeline.mapping.edge_agreement import edge_contrast, relative_gradient
 from pipeline.mapping.picture_agreement import CLOCKS, PictureAgreement, PosedPicture
 from pipeline.recordings import conventions, errors, upright
 from pipeline.recordings.conventions import PoseCheck
-from pipeline.recordings.recording import Picture, Recording, grid_size, reproject
+from pipeline.recordings.recording import Picture, Recording, grid_size
 
 JPEG = b"\xff\xd8"
 MAX_DEPTH_SIDE_PX = 640
@@ -308,11 +308,7 @@ def _posed_picture(
 def stored_depth(recording: Recording, number: int, max_depth_m: float) -> Float[np.ndarray, "height width"]:
     """Read one frame's depth in meters, as stored (not rotated), at most `MAX_DEPTH_SIDE_PX` large."""
     depth = known_depth(recording.read_depth(number), max_depth_m)
-    if recording.depth_camera is not None:
-        assert recording.intrinsics is not None, recording.where
-        row = int(np.searchsorted(recording.index, number))
-        color = recording.intrinsics[row], recording.color_size
-        depth = known_depth(reproject(depth, recording.depth_camera, *color), max_depth_m)
+    depth = known_depth(recording.reprojected(number, depth), max_depth_m)
     return _sampled(depth, reduced_size(depth.shape, MAX_DEPTH_SIDE_PX))
 
 
@@ -333,24 +329,16 @@ def _decoded(stored: Picture, size: tuple[int, int], where: str) -> UInt8[np.nda
 def confidence_of(
     recording: Recording, number: int, depth: Float[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width"]:
-    """Return the confidence of a frame's `stored_depth`, 0 to 2.
-
-    It is 2 if the recording has none, 0 if only this frame lacks it.
-    """
+    """Return the confidence, 0 to 2, of `stored_depth`: 2 if the recording has none, 0 if it lacks here."""
     if recording.read_confidence is None:
         return np.where(depth > 0, 2, 0).astype(np.uint8)
     confidence = recording.read_confidence(number)
     if confidence is None:
         return np.zeros(depth.shape, np.uint8)
     if recording.depth_camera is not None:  # that of the surface which is nearest in each pixel
-        assert recording.intrinsics is not None, recording.where
-        known, row = (
-            known_depth(recording.read_depth(number), np.inf),
-            np.searchsorted(recording.index, number),
-        )
+        known = known_depth(recording.read_depth(number), np.inf)
         confidence = _sampled(confidence, known.shape)
-        color = recording.depth_camera, recording.intrinsics[row], recording.color_size
-        seen = [reproject(np.where(confidence >= level, known, 0), *color) for level in range(3)]
+        seen = [recording.reprojected(number, np.where(confidence >= level, known, 0)) for level in range(3)]
         confidence = np.sum([(seen[0] > 0) & (seen[0] == each) for each in seen[1:]], axis=0, dtype=np.uint8)
     return _sampled(np.minimum(confidence, 2), depth.shape)
 

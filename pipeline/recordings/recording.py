@@ -79,6 +79,14 @@ class Recording:
         """Share (0..1) of the listed frames whose picture, depth or metadata are missing."""
         return max(0, self.listed - len(self.index)) / max(self.listed, 1)
 
+    def reprojected(self, number: int, depth: Float[np.ndarray, "_ _"]) -> Float[np.ndarray, "height width"]:
+        """Return a frame's depth, meters, 0 = unknown, as the color camera sees it (see `reproject`)."""
+        if self.depth_camera is None:
+            return depth
+        assert self.intrinsics is not None, self.where
+        row = int(np.searchsorted(self.index, number))
+        return reproject(depth, self.depth_camera, self.intrinsics[row], self.color_size)
+
 
 def pose_from_matrix(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Float[np.ndarray, "frame 7"]:
     """Convert matrices to poses (quaternion xyzw, translation); NaN where one is not a rigid motion."""

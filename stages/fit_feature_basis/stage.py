@@ -15,6 +15,7 @@ from pipeline.data.clips import Clip
 from pipeline.geometry.subsampling import evenly
 from stages.fit_feature_basis.config import Config
 
+Describe = Callable[[np.ndarray, int], np.ndarray]
 FRAMES_PER_RECORDING = 16
 """Frames described per recording: a minute at one every four seconds, so that each recording counts alike."""
 STRIDE_PX = 16
@@ -56,9 +57,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
     )
 
 
-def sample_descriptors(
-    clips: Iterable[Clip], describe: Callable[[np.ndarray, int], np.ndarray]
-) -> Float[np.ndarray, "sample channel"]:
+def sample_descriptors(clips: Iterable[Clip], describe: Describe) -> Float[np.ndarray, "sample channel"]:
     """Describe `FRAMES_PER_RECORDING` frames of each recording, evenly spread in time."""
     shown = ((clip, evenly(len(clip), FRAMES_PER_RECORDING, rounded=True)) for clip in clips)
     described = (describe(clip.color(int(frame)), STRIDE_PX) for clip, frames in shown for frame in frames)

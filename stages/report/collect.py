@@ -172,7 +172,7 @@ def read_chapter(
         ]
         label = labels.get(video or "", RecordingLabel())
         notes.append(Note(video, label, qa["status"], qa["good"], qa["bad"], qa["checks"], pictures))
-    read = {name.partition("/")[0] for manifest in manifests for name in manifest["inputs"]}
+    read: set[str] = {name.partition("/")[0] for manifest in manifests for name in manifest["inputs"]}
     depends_on = frozenset(PAGE_OF.get(name, name) for name in read)
     return ChapterReport(chapter, notes, dict(manifests[0]["config"]) if manifests else {}, depends_on)
 
