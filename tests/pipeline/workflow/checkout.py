@@ -177,7 +177,9 @@ def _fields(stage: str) -> str:
             {
                 need.option or need.artifact
                 for need in dag.needs_of(node, "recordings")
-                if not (need.others or need.homes != "any" or dag.NODES[need.artifact].of_several)
+                if not (
+                    need.others or need.mapped or need.homes != "any" or dag.NODES[need.artifact].of_several
+                )
             }
             for node in nodes
         )
