@@ -47,6 +47,8 @@ WHOLE_SHARE = 0.6
 """masks count fully from this share of that area on, as seen from one meter"""
 MIN_MASK_WEIGHT = 0.03
 """lower bound of that weight: where the animal is occluded, neighboring frames constrain it better"""
+PRECISION_BY_PICTURES = 20.0
+"""prior precision of roots registered without depth: masks without thin parts push them 2 to 7 cm away"""
 GRID_CHANNELS = 4
 """channels of each grid"""
 KNOT_FRAMES = 10
@@ -143,6 +145,7 @@ def build(
     usable_frames = torch.nonzero(has_root & store.views.agent_seen & (by_frame.count > 0))[:, 0]
     has_scene = torch.tensor([video.has_scene for video in videos])[frame_table(lengths)]
     free = [video.camera_free for video in videos]
+    mapped = torch.tensor([video.camera_free and bool(video.clip and video.clip.mapped) for video in videos])
     motion = MotionTable(camera, root, rest, lengths, free, KNOT_FRAMES)
     body = ArticulatedBody(rest, torch.from_numpy(template.bone_scale_m).float(), agent_shape)
     surface = TemplateSurface.of(template.mesh, template.feature, np.random.default_rng(seed))
@@ -164,6 +167,7 @@ def build(
         agent_frames=usable_frames,
         agent_rays=by_frame,
         trust=trust * mask_weights(store.views),
+        root_precision=torch.where(mapped, PRECISION_BY_PICTURES, 1.0)[frame_table(lengths)],
         camera_precision=prior_precision(motion, np.concatenate([video.confidence for video in videos])),
         floor_m=floor_m,
     )
@@ -227,9 +231,8 @@ def replace_outliers(
     """
     root, time = video.world_from_agent.copy(), video.timestamp_s
     known = np.all(np.isfinite(root), axis=(1, 2))
-    certain = known
-    if video.agent_confidence is not None:
-        certain = known & (video.agent_confidence >= DOUBTFUL_ROOT)
+    doubted = video.agent_confidence is not None and video.agent_confidence < DOUBTFUL_ROOT
+    certain = known & ~np.asarray(doubted)
     inlier = np.ones(len(root), bool)
     if certain.sum() < 2:
         return root, inlier

@@ -227,7 +227,7 @@ def prior_terms(
         terms["still"] = STILL_WEIGHT, _smooth_length(bone_step)
         terms["root still"] = ROOT_STILL * STILL_WEIGHT, _smooth_length(root_step)
     terms = {name: (weights.motion_prior * weight, values) for name, (weight, values) in terms.items()}
-    terms["root"] = ROOT_WEIGHT, problem.trust[pose.frame] * root_error
+    terms["root"] = ROOT_WEIGHT, (problem.trust * problem.root_precision)[pose.frame] * root_error
     if run >= 3 and problem.scene.fused and weights.planted:
         terms["planted"] = weights.planted, foot_skate(problem, pose, run)
     return terms

@@ -59,6 +59,8 @@ class Problem:
     agent_rays: "RaysByFrame"
     trust: Float[Tensor, "frame"]
     """weight of each frame's mask, 0..1: less where the root was an outlier or little is in view"""
+    root_precision: Float[Tensor, "frame"]
+    """prior precision of each frame's root, relative to that of one registered to depth"""
     camera_precision: Float[Tensor, "knot"]
     """prior precision of each knot's camera correction, relative to that of a camera at even odds"""
     floor_m: float

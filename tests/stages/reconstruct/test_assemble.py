@@ -1,6 +1,7 @@
 """Uncertain roots that jump away from certain neighbors are dropped and their masks down-weighted."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -8,6 +9,8 @@ import torch
 from pipeline.data.motion import MotionTable
 from pipeline.geometry import rigid
 from stages.reconstruct import assemble, rays
+from stages.reconstruct.body import Pose, prior_terms
+from stages.reconstruct.config import LossWeights
 from stages.reconstruct.optimize import split_segments
 from stages.reconstruct.problem import MAX_PRECISE, prior_precision
 from tests.stages.reconstruct.test_optimize import WIDE, film, problem
@@ -105,6 +108,21 @@ def test_masks_are_weighted_by_visibility(monkeypatch):
     assert 0.15 < after[2] / before[2] < 0.35 and after[3] == assemble.MIN_MASK_WEIGHT
     rest = torch.arange(len(before)) > 3
     torch.testing.assert_close(after[rest], before[rest])
+
+
+def test_roots_are_held_more_firmly_in_recordings_without_depth():
+    _, videos = problem()
+    mapped = dataclasses.replace(videos[0], clip=SimpleNamespace(mapped=True))
+    (before, _), (after, _) = problem(videos=videos), problem(videos=[mapped, videos[1]])
+    first = after.video == 0
+    assert (before.root_precision == 1).all() and (after.root_precision[~first] == 1).all()
+    assert (after.root_precision[first] == assemble.PRECISION_BY_PICTURES).all()
+    frame = torch.nonzero(first)[:3, 0]
+    moved = Pose.of(after, frame)
+    moved.world_from_agent[:, :3, 3] += 0.05
+    twist = torch.zeros(3, after.motion.bone.shape[1], 6)
+    loose, firm = (prior_terms(each, moved, twist, 3, LossWeights())["root"][1] for each in (before, after))
+    torch.testing.assert_close(firm, assemble.PRECISION_BY_PICTURES * loose)
 
 
 def test_camera_prior_precision_follows_registration_confidence():
