@@ -5,6 +5,8 @@ the heading of the path, is subtracted from the noisy body before the UNet reads
 a resting animal, and free of heading for a walking one.
 """
 
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -221,16 +223,8 @@ class OneStageDenoiser(BodyDenoiser):
 
     velocity_std: Tensor
 
-    def __init__(
-        self,
-        unet: SequenceDenoiser,
-        prior: GaussianPrior,
-        posture_channels: int,
-        frames: int,
-        schedule: Schedule = STANDARD,
-        rate_hz: float = RATE_HZ,
-    ):
-        super().__init__(unet, prior, posture_channels, frames, schedule, rate_hz)
+    def __init__(self, *arguments: Any, **options: Any):
+        super().__init__(*arguments, **options)
         self.register_buffer("velocity_std", torch.ones(PATH_CHANNELS))
 
     def steps(self, x: Sequences, t: Steps, control: Paths) -> Float[Tensor, "batch 3 frame"]:

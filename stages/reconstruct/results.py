@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import KDTree
 from torch import Tensor
+from torch.nn import functional
 
 from pipeline.data import motion, ply
 from pipeline.data.motion import FEATURE_VOLUME, INTERPOLATED, TRACKS, Motion, gaps_s
@@ -107,13 +108,18 @@ def scene_surface(problem: Problem) -> Mesh:
 
 @torch.no_grad()
 def measured_points(problem: Problem) -> Float[np.ndarray, "point 3"]:
-    """Return a subsample of the measured points of the scene, world, meters."""
-    rays = problem.store.scene
-    index = torch.nonzero(rays.depth > 0)[:, 0]
-    rays = rays.at(index[:: max(1, len(index) // MAX_POINTS)])
-    pose = problem.motion.world_from_camera(rays.frame)
-    points = (pose[:, :3, :3] @ (rays.direction * rays.depth[:, None])[..., None])[..., 0] + pose[:, :3, 3]
-    return points.cpu().numpy()
+    """Return a subsample of the measured points of the scene, world, meters: of the thumbnails of frames,
+    since the rays are too sparse on walls that are far away or were filmed briefly.
+    """
+    views, frame = problem.store.views, torch.unique(problem.store.scene.frame).long()
+    frame = frame[:: max(1, len(frame) * views.depth[0].numel() // MAX_POINTS)]
+    shown = torch.nonzero((views.depth[frame] > 0) & (views.outside_px[frame] > THUMBNAIL))
+    pixel, frame = (shown[:, [2, 1]] + 0.5) * THUMBNAIL, frame[shown[:, 0]]
+    lens, pose = views.intrinsics[frame], problem.motion.world_from_camera(frame)
+    direction = (pixel - lens[:, :2, 2]) / lens[:, :2, :2].diagonal(dim1=1, dim2=2)
+    depth = views.depth[frame, shown[:, 1], shown[:, 2]].float()[:, None]
+    points = functional.pad(direction, (0, 1), value=1.0) * depth
+    return ((pose[:, :3, :3] @ points[..., None])[..., 0] + pose[:, :3, 3]).cpu().numpy()
 
 
 @torch.no_grad()

@@ -8,12 +8,12 @@ import torch
 
 from pipeline.data.motion import MotionTable
 from pipeline.geometry import rigid
-from stages.reconstruct import assemble, rays
+from stages.reconstruct import assemble, rays, results
 from stages.reconstruct.body import Pose, prior_terms
 from stages.reconstruct.config import LossWeights
 from stages.reconstruct.optimize import split_segments
 from stages.reconstruct.problem import MAX_PRECISE, prior_precision
-from tests.stages.reconstruct.test_optimize import WIDE, film, problem
+from tests.stages.reconstruct.test_optimize import ROOM_M, WIDE, film, problem
 
 
 def doubted(confidence: np.ndarray, leap_m: float = 2.0) -> assemble.RegisteredVideo:
@@ -108,6 +108,19 @@ def test_masks_are_weighted_by_visibility(monkeypatch):
     assert 0.15 < after[2] / before[2] < 0.35 and after[3] == assemble.MIN_MASK_WEIGHT
     rest = torch.arange(len(before)) > 3
     torch.testing.assert_close(after[rest], before[rest])
+
+
+def test_the_surface_is_kept_wherever_depth_was_measured():
+    """Rays of far walls are sparse; thumbnails measure the walls of the room everywhere, and not the ball."""
+    built, _ = problem()
+    points = results.measured_points(built)
+    outermost = np.abs(points).max(1)
+    np.testing.assert_allclose(outermost, ROOM_M, atol=0.1)
+    rays_of_scene = built.store.scene.at(torch.nonzero(built.store.scene.depth > 0)[:, 0])
+    assert len(points) > 2 * len(rays_of_scene)
+    turnaround = torch.nonzero(built.video == 1)[:, 0]
+    built.store.views.depth[turnaround] = 9.0
+    np.testing.assert_array_equal(results.measured_points(built), points)
 
 
 def test_roots_are_held_more_firmly_in_recordings_without_depth():
