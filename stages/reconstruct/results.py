@@ -30,7 +30,7 @@ FREE, SURFACE, UNSEEN = 0, 1, 2
 AGENT_STEP_M = 0.01
 """resolution of the extracted agent: at 0.02 a tail disappears"""
 SEEN_WITHIN_M = 0.03
-"""the scene's surface is removed where no measured point is this near: backs, which are 4 cm behind, and rims"""
+"""the scene's surface is removed where no measured point is this near: backs, 4 cm behind, and rims"""
 SMOOTHING_S = 0.7
 """window of the filter of motion, longer than a stride"""
 TRACK_POINTS = 200
