@@ -9,14 +9,13 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import KDTree
 from torch import Tensor
-from torch.nn import functional
 
 from pipeline.data import motion, ply
 from pipeline.data.motion import FEATURE_VOLUME, INTERPOLATED, TRACKS, Motion, gaps_s
 from pipeline.data.templates import SkinTable
 from pipeline.fields import fields, marching_cubes
 from pipeline.fields.fields import Reconstruction
-from pipeline.geometry import cameras, rigid, subsampling
+from pipeline.geometry import cameras, rigid, rigid_torch, subsampling
 from pipeline.geometry.meshes import Mesh
 from stages.reconstruct.assemble import RegisteredVideo, scene_first
 from stages.reconstruct.body import NEAREST_M
@@ -99,10 +98,10 @@ def interpolate_gaps(
     return root, bones
 
 
-def scene_surface(problem: Problem) -> Mesh:
-    """Return the shared scene's surface in the world, meters, where measured points are near."""
+def scene_surface(problem: Problem, measured: KDTree) -> Mesh:
+    """Return the shared scene's surface in the world, meters, where `measured_points` are near."""
     mesh = marching_cubes.extract_scene(problem.scene, -1, problem.scene.lattice_m)
-    near, _ = KDTree(measured_points(problem)).query(mesh.vertices, distance_upper_bound=SEEN_WITHIN_M)
+    near, _ = measured.query(mesh.vertices, distance_upper_bound=SEEN_WITHIN_M)
     return marching_cubes.keep_vertices(mesh, np.isfinite(near))
 
 
@@ -115,15 +114,13 @@ def measured_points(problem: Problem) -> Float[np.ndarray, "point 3"]:
     frame = frame[:: max(1, len(frame) * views.depth[0].numel() // MAX_POINTS)]
     shown = torch.nonzero((views.depth[frame] > 0) & (views.outside_px[frame] > THUMBNAIL))
     pixel, frame = (shown[:, [2, 1]] + 0.5) * THUMBNAIL, frame[shown[:, 0]]
-    lens, pose = views.intrinsics[frame], problem.motion.world_from_camera(frame)
-    direction = (pixel - lens[:, :2, 2]) / lens[:, :2, :2].diagonal(dim1=1, dim2=2)
     depth = views.depth[frame, shown[:, 1], shown[:, 2]].float()[:, None]
-    points = functional.pad(direction, (0, 1), value=1.0) * depth
-    return ((pose[:, :3, :3] @ points[..., None])[..., 0] + pose[:, :3, 3]).cpu().numpy()
+    points = cameras.unproject(pixel, views.intrinsics[frame]) * depth
+    return rigid_torch.apply(problem.motion.world_from_camera(frame), points[:, None])[:, 0].cpu().numpy()
 
 
 @torch.no_grad()
-def feature_volume(problem: Problem) -> SceneFeatures:
+def feature_volume(problem: Problem, measured: KDTree) -> SceneFeatures:
     """Sample the shared scene on a lattice of `VOXEL_M`: surface by its field, free space by depth."""
     field = problem.scene
     low = np.floor(np.array(field.shape.low_m) / VOXEL_M) * VOXEL_M
@@ -134,11 +131,11 @@ def feature_volume(problem: Problem) -> SceneFeatures:
     distance = field.distance(encoded).cpu().numpy()
     feature = field.color_and_feature(encoded)[1].cpu().numpy()
     free = seen_free(problem, points).cpu().numpy()
-    near, _ = KDTree(measured_points(problem)).query(points.cpu().numpy(), distance_upper_bound=VOXEL_M)
-    measured = np.isfinite(near)
-    solid = (distance < 0.5 * VOXEL_M) & measured | (distance < 0) & ~free
+    near, _ = measured.query(points.cpu().numpy(), distance_upper_bound=VOXEL_M)
+    seen = np.isfinite(near)
+    solid = (distance < 0.5 * VOXEL_M) & seen | (distance < 0) & ~free
     occupancy = np.where(solid, SURFACE, np.where(free, FREE, UNSEEN)).astype(np.uint8)
-    features = np.where(measured & solid, feature.T, 0).astype(np.float16)
+    features = np.where(seen & solid, feature.T, 0).astype(np.float16)
     return SceneFeatures(features.reshape(-1, *size), occupancy.reshape(size), low)
 
 
@@ -181,13 +178,14 @@ def write(
         path.parent.mkdir(exist_ok=True)
         motion.save(path, of_video)
     agent = marching_cubes.extract_agent(problem.agent, AGENT_STEP_M)
-    ply.write_ply(folder / "scene.ply", scene_surface(problem))
+    measured = KDTree(measured_points(problem))
+    ply.write_ply(folder / "scene.ply", scene_surface(problem, measured))
     ply.write_ply(folder / "agent.ply", agent)
     body, skin = reconstruction.body, skin_weights(problem, agent)
     rest, scale_m = (part.detach().cpu().numpy() for part in (body.agent_from_bone_rest, body.bone_scale_m))
     SkinTable(skin, rest, scale_m).write(folder)
     fields.save(folder, reconstruction)
-    volume = feature_volume(problem)
+    volume = feature_volume(problem, measured)
     FEATURE_VOLUME.save(
         folder / "feature_volume.npz", compress=True, voxel_m=np.asarray(VOXEL_M, np.float64), **vars(volume)
     )

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import KDTree
 
 from pipeline.data import motion as motion_files
 from pipeline.fields import fields, marching_cubes
@@ -38,10 +39,11 @@ def test_all_phases_run_on_another_device(form, tmp_path):
             assert all(map(is_on_device, (*module.parameters(), *module.buffers())))
         assert all(is_on_device(value) for table in tables for value in vars(table).values())
         motion = results.motions(problem, videos, 0.75)["v002"]
-        assert len(results.scene_surface(problem).vertices) >= 0
+        measured = KDTree(results.measured_points(problem))
+        assert len(results.scene_surface(problem, measured).vertices) >= 0
         agent = marching_cubes.extract_agent(problem.agent, 0.04)
         assert np.isfinite(results.skin_weights(problem, agent)).all()
-        results.feature_volume(problem)
+        results.feature_volume(problem, measured)
         reconstruction = Reconstruction(
             problem.scene, problem.agent, problem.body, assemble.scene_ids(videos)
         )

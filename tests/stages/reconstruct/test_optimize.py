@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import KDTree
 
 from pipeline.fields import fields, marching_cubes
 from pipeline.fields.fields import Field, FieldShape, Reconstruction
@@ -391,7 +392,7 @@ def test_positional_networks_without_codes_train_and_survive_saving(tmp_path):
 
 
 def test_volume_marks_free_surface_and_unobserved_space(solved):
-    volume = results.feature_volume(solved[0])
+    volume = results.feature_volume(solved[0], KDTree(results.measured_points(solved[0])))
 
     def at(*point: float) -> int:
         return int(
