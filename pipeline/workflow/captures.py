@@ -32,6 +32,8 @@ _NEEDED: dict[Flow, tuple[tuple[Role, str], ...]] = {
 }
 SHOWN_LETTERS, LONGEST_NAME_BYTES = 40, 200
 """of a recording's name: file systems allow 255 bytes, and sidecars append to it"""
+UNUSED = "unused"
+"""Role of a recording that the build leaves out."""
 _ANIMAL = re.compile(r"[a-z][a-z0-9-]{0,30}\Z")
 _NAMED = re.compile(r"turnaround_([^\W_](?:[^\W_]|-)*)")
 TABLES = (".csv", ".npz")
@@ -45,7 +47,7 @@ class Remarks:
     """What the user says about one recording, in the recipe's `[videos]` or in a sidecar; None: not given."""
 
     role: str | None = None
-    """`walkthrough`, `turnaround`, `session` or `heldout`; otherwise the name decides."""
+    """`walkthrough`, `turnaround`, `session`, `heldout` or `unused`; otherwise the name decides."""
     split: str | None = None
     """`train` or `test` for a session; otherwise the last session is the test."""
     synchronized_with: str | None = None
@@ -189,7 +191,7 @@ def role_of(name: str, remark: Remarks, where: str) -> Role:
             return role
     if remark.role is None:
         return "session"
-    what, remedy = f"{name!r} cannot have the role {remark.role!r}", f"roles: {', '.join(ROLES)}"
+    what, remedy = f"{name!r} cannot have the role {remark.role!r}", f"roles: {', '.join(ROLES)}, {UNUSED}"
     raise InputError("CAP-041", what, where, remedy)
 
 

@@ -48,7 +48,8 @@ def read(home: Home, cache: sources.Cache) -> Plan:
     if names:
         digest_of = functools.partial(cache.get, read=artifact.digest_of_file)
         said = captures.remarks(folder, names, recipe.get(recipes.VIDEOS_TABLE, {}), where)
-        hashes = {name: sources.recording_digest(folder / name, digest_of) for name in names}
+        said = {name: remark for name, remark in said.items() if remark.role != captures.UNUSED}
+        hashes = {name: sources.recording_digest(folder / name, digest_of) for name in said}
     else:
         captures.refuse_unknown_files(folder, flow)
         said = recipes.builtin_remarks(flow, recipe, where)

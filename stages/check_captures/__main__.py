@@ -66,6 +66,9 @@ def _said(
         try:
             own = {name: overrides[name]} if name in overrides else {}
             remark = captures.remarks(folder, [name], own, str(recipe))[name]
+            if remark.role == captures.UNUSED:
+                print(f"{printable(repr(name))}  left out: its role is {captures.UNUSED!r}\n")
+                continue
             files.append((folder / name, captures.role_of(name, remark, str(folder))))
             said[name] = remark
         except InputError as error:

@@ -238,6 +238,20 @@ def test_file_names_are_never_executed(small_checkout):
     assert {video["file"] for video in videos} >= set(HOSTILE)
 
 
+def test_unused_recordings_are_left_out_and_keep_their_ids(small_checkout):
+    def ids():
+        assert small_checkout.plan().returncode == 0
+        videos = json.loads((small_checkout.folder / "build/toy/plan/videos.json").read_text())
+        return {video["file"]: video["id"] for video in videos}
+
+    small_checkout.record("walkthrough.r3d", "turnaround.r3d", "a.r3d", "b.r3d")
+    before = ids()
+    small_checkout.write("captures/toy/a.r3d.toml", 'role = "unused"\n')
+    assert ids() == {name: each for name, each in before.items() if name != "a.r3d"}
+    small_checkout.write("captures/toy/a.r3d.toml", "")
+    assert ids() == before
+
+
 def test_unknown_agents_are_refused_with_a_reason(small_checkout):
     small_checkout.write("captures/toy/scan/inner/rgb.mp4", "")
     small_checkout.write("captures/toy/scan/inner/odometry.csv", "")

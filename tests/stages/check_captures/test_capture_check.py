@@ -371,6 +371,8 @@ def test_program_reports_all_problems_and_fails_like_a_build(tmp_path, capsys):
     (tmp_path / "notes.txt").write_text("x")
     (tmp_path / ".monday.mov.icloud").write_text("x")
     (tmp_path / "b\udcff.r3d").write_bytes(b"PK")
+    (tmp_path / "dark.r3d").write_bytes(b"PK")
+    (tmp_path / "dark.r3d.toml").write_text('role = "unused"\n')
     assert front.main([str(tmp_path)]) == 2
     describe_capture = capsys.readouterr().out
     for expected in (
@@ -380,6 +382,7 @@ def test_program_reports_all_problems_and_fails_like_a_build(tmp_path, capsys):
         "CAP-001",
         "CAP-004 exported/metadata.json: ",
         "notes.txt",
+        "'dark.r3d'  left out: its role is 'unused'",
         "'.monday.mov.icloud' (only in iCloud: download it in Finder)",
         "CAP-003); convert other videos to .mp4",
         "CAP-040",
