@@ -85,6 +85,11 @@ class PnPResult:
         return len(self.matches.pixel) >= MIN_INLIERS and self.inlier_ratio >= MIN_SHARE
 
 
+def nominal(size: tuple[int, int]) -> Lens:
+    """Return the lens to start from for pictures of (height, width)."""
+    return Lens(FOCAL_SHARE * max(size), 0.0, size)
+
+
 def locate(
     matches: Matches, lens: Lens, seed: int, *, within_px: float | None = None, calibrate: bool = False
 ) -> PnPResult | None:
@@ -114,11 +119,17 @@ def locate(
     return PnPResult(rigid.inverse(camera_from_world), agreeing, float(inlier.mean()), camera.focal_length)
 
 
+def locate_all(matches: Sequence[Matches], lens: Lens, seed: int) -> Float[np.ndarray, "frame 4 4"]:
+    """Return the reliable poses of frames one by one, NaN for the others."""
+    found = [locate(each, lens, seed) for each in matches]
+    unknown = np.full((4, 4), np.nan)
+    return np.stack([each.world_from_camera if each and each.reliable else unknown for each in found])
+
+
 def calibrate(matches: Sequence[Matches], size: tuple[int, int], seed: int) -> Lens | None:
     """Calibrate the lens over all frames; None if no frame has a reliable pose."""
     most = np.argsort([-len(each.pixel) for each in matches], kind="stable")[:FRAMES]
-    nominal = Lens(FOCAL_SHARE * max(size), 0.0, size)
-    free = [locate(matches[frame], nominal, seed, calibrate=True) for frame in most]
+    free = [locate(matches[frame], nominal(size), seed, calibrate=True) for frame in most]
     focal = [(each.focal_px, len(each.matches.pixel)) for each in filter(None, free) if each.reliable]
     if not focal:
         return None

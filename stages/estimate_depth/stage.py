@@ -20,7 +20,7 @@ from pipeline.geometry import cameras
 from pipeline.geometry.meshes import RayCaster
 from pipeline.mapping.sift import Keypoints
 from pipeline.segmentation.recognizer import load
-from stages.estimate_depth import depth, foreground, landmarks, lens, tracking, views, writing
+from stages.estimate_depth import depth, foreground, landmarks, lens, sequence, tracking, views, writing
 from stages.estimate_depth.config import Config
 from stages.estimate_depth.foreground import ColorView
 from stages.estimate_depth.lens import Lens
@@ -28,6 +28,8 @@ from stages.estimate_depth.tracking import MapViews, Tracked, TrackingInput
 
 MIN_PLACED, MIN_FRAMES = 0.3, 10
 """Least share and number of frames with a camera pose in the map."""
+ENOUGH_PLACED = 0.9
+"""Share of frames placed from single ones on, below which the video is placed as a whole as well."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +55,16 @@ def run(
     """
     pictures, walk = Pictures.open(inputs.pictures), Clip.open(next(iter(inputs.frames.values())))
     walk_cameras = SceneCameras.open(inputs.scene_template)
-    caster = RayCaster(ply.read_ply(inputs.scene_template / "mesh.ply"))
+    mesh = ply.read_ply(inputs.scene_template / "mesh.ply")
+    caster = RayCaster(mesh)
     network = None if config.backend == "contact" else MonocularDepth(config.backend, config.weights, device)
     known = landmarks.build(walk, walk_cameras, caster)
     keyframes = landmarks.keyframe_numbers(walk_cameras).tolist()
     walk_views = [_walk_view(walk, walk_cameras, frame, caster) for frame in keyframes]
     room = MapViews(caster, [each.view for each in walk_views])
-    found, tracked = _placed(pictures, known, room, config)
-    placed = np.flatnonzero(np.isfinite(tracked.world_from_camera[:, 0, 0]))
+    bounds = np.stack([mesh.vertices.min(0), mesh.vertices.max(0)])
+    found, tracked = _placed(pictures, known, room, bounds, config)
+    placed = np.flatnonzero(tracked.placed)
     if len(placed) < max(MIN_FRAMES, MIN_PLACED * len(pictures)):
         raise _unrecognized(pictures, f"{len(placed)} of {len(pictures)} frames find a place in the map")
     log(f"focal length {found.focal_px:.1f} px; {len(placed)} of {len(pictures)} frames placed")
@@ -99,22 +103,32 @@ def _walk_view(walk: Clip, walk_cameras: SceneCameras, frame: int, caster: RayCa
 
 
 def _placed(
-    pictures: Pictures, known: landmarks.Landmarks, room: MapViews, config: Config
+    pictures: Pictures, known: landmarks.Landmarks, room: MapViews, bounds: np.ndarray, config: Config
 ) -> tuple[Lens, Tracked]:
-    """Calibrate the lens and estimate the camera poses."""
+    """Calibrate the lens and estimate the camera poses: by frames, then, if many have none, as a whole."""
     frames = range(len(pictures))
     keypoints = [landmarks.describe(pictures.color(each)) for each in track(frames, "detecting keypoints")]
     matches = [known.match(each) for each in track(keypoints, "matching the map")]
+
+    def tracked(found: Lens, localized: np.ndarray) -> tuple[Lens, Tracked]:
+        gray = [views.small_gray(found.undistorted(pictures.color(frame))) for frame in frames]
+        scale = gray[0].shape[1] / pictures.color_size[1]
+        small = [Keypoints(each.pixel * scale, each.descriptors) for each in keypoints]
+        footage = TrackingInput(pictures.timestamp_s, gray, small, found.resized(gray[0].shape))
+        placed = tracking.place(footage, localized, room, config.seed)
+        return Lens(placed.lens.focal_px / scale, found.radial, pictures.color_size), placed
+
     found = lens.calibrate(matches, pictures.color_size, config.seed)
-    if found is None:
-        raise _unrecognized(pictures, "no frame shows anything that the walk-through shows as well")
-    located = [lens.locate(each, found, config.seed) for each in matches]
-    gray = [views.small_gray(found.undistorted(pictures.color(frame))) for frame in frames]
-    scale = gray[0].shape[1] / pictures.color_size[1]
-    small = [Keypoints(each.pixel * scale, each.descriptors) for each in keypoints]
-    footage = TrackingInput(pictures.timestamp_s, gray, small, found.resized(gray[0].shape))
-    tracked = tracking.place(footage, located, room, config.seed)
-    return Lens(tracked.lens.focal_px / scale, found.radial, pictures.color_size), tracked
+    by_frames = None if found is None else tracked(found, lens.locate_all(matches, found, config.seed))
+    if by_frames is not None and by_frames[1].placed.mean() >= ENOUGH_PLACED:
+        return by_frames
+    log("many frames alone find no place in the map; placing the video as a whole")
+    whole = sequence.place(pictures, matches, found, bounds, config.seed)
+    as_whole = None if whole is None else tracked(*whole)
+    results = [each for each in (by_frames, as_whole) if each is not None]
+    if not results:
+        raise _unrecognized(pictures, "neither single frames nor the whole fit the map in one place")
+    return max(results, key=lambda each: each[1].placed.sum())
 
 
 def _depth_net(
@@ -130,5 +144,6 @@ def _depth_net(
 
 def _unrecognized(pictures: Pictures, what: str) -> InputError:
     film = "film it in the room of the walk-through, with furniture in view and little moved since"
-    remedy = f"{film}; or record it with depth; or take it out of the captures"
+    unused = 'leave it out by role = "unused" in its .toml file or the recipe'
+    remedy = f"{film}; or record it with depth; or {unused}"
     return InputError("MAP-007", what, str(pictures.folder), remedy)

@@ -53,6 +53,11 @@ class Tracked:
     lens: Lens
     """Of the small pictures, refined with the cameras."""
 
+    @property
+    def placed(self) -> Bool[np.ndarray, "frame"]:
+        """Return which frames have a pose."""
+        return np.isfinite(self.world_from_camera[:, 0, 0])
+
 
 @dataclass(frozen=True)
 class TrackingInput:
@@ -75,12 +80,11 @@ class MapViews:
     walk: Sequence[View]
 
 
-def place(footage: TrackingInput, located: Sequence[PnPResult | None], room: MapViews, seed: int) -> Tracked:
-    """Estimate all cameras; ``located`` are the poses by landmarks."""
-    poses = np.full((len(located), 4, 4), np.nan)
-    for frame, each in enumerate(located):
-        if each is not None and each.reliable:
-            poses[frame] = each.world_from_camera
+def place(
+    footage: TrackingInput, localized: Float[np.ndarray, "frame 4 4"], room: MapViews, seed: int
+) -> Tracked:
+    """Estimate all cameras; ``localized`` are those by landmarks, NaN where unknown."""
+    poses = localized.copy()
     discard_stray_segments(footage.timestamp_s, poses, np.isfinite(poses[:, 0, 0]))
     sure = np.isfinite(poses[:, 0, 0])
     if sure.any():  # the others by their distance from a localized one

@@ -76,7 +76,7 @@ def report_quality(folder: Path, pictures: Pictures, estimated: Estimated) -> No
     certain = np.mean([(each.confidence == 2).mean() for each in depths])
     checks = [
         qa.Check("frames placed in the map", placed, "%", warn=80.0, better="higher"),
-        qa.Check("placed by landmarks alone, the others tracked", alone, "%", warn=30.0, better="higher"),
+        qa.Check("placed by landmarks, the others tracked", alone, "%", warn=30.0, better="higher"),
         qa.Check("focal length, calibrated", estimated.lens.focal_px, "px"),
         qa.Check("radial distortion, calibrated", estimated.lens.radial),
         qa.Check("known depth", 100 * float(known), "%", warn=50.0, better="higher"),

@@ -6,7 +6,7 @@ import pytest
 from pipeline.geometry.meshes import RayCaster
 from stages.estimate_depth import foreground, landmarks, tracking, views
 from stages.estimate_depth.landmarks import Matches
-from stages.estimate_depth.lens import Lens, PnPResult
+from stages.estimate_depth.lens import Lens
 from tests.stages.estimate_depth import filmed_room
 
 COUNT, LOCATED = 24, 8
@@ -48,10 +48,9 @@ def test_cameras_are_tracked_over_short_gaps_only(filmed, covered, monkeypatch):
         [landmarks.describe(each) for each in shown],
         lens,
     )
-    matches = Matches(np.zeros((100, 2)), np.zeros((100, 3)))
-    located = [PnPResult(path[frame], matches, 1.0, lens.focal_px) for frame in range(LOCATED)]
-    found = tracking.place(footage, [*located, *[None] * (COUNT - LOCATED)], room, seed=0)
-    placed = np.isfinite(found.world_from_camera[:, 0, 0])
+    localized = np.where(np.arange(COUNT)[:, None, None] < LOCATED, path, np.nan)
+    found = tracking.place(footage, localized, room, seed=0)
+    placed = found.placed
     assert placed[:LOCATED].all() and not placed[hidden].any()
     beyond = slice(LOCATED + covered, COUNT)
     if covered < tracking.NEIGHBORS[-1]:
