@@ -97,11 +97,11 @@ def checks(outcomes: list[SessionOutcome]) -> list[qa.Check]:
     share = sum(outcome.poses is not None for outcome in outcomes) / max(len(outcomes), 1)
     figures = [outcome.status["figures"] for outcome in outcomes if outcome.poses is not None]
     gaps = [figure["depth_gap_m"] for figure in figures if figure["depth_gap_m"] is not None]
-    gap = float(np.median(gaps) * 100) if gaps else None
     confidence = float(np.mean([figure["confidence"] for figure in figures])) if figures else None
+    gap_cm = [100 * float(np.median(gaps))] if gaps else []
     return [
         qa.Check("recordings registered", share, "share", 0.99, 0.5, "higher"),
-        qa.Check("depth against the template", gap, "cm, median", 2.5, 6.0),
+        *(qa.Check("depth against the template", each, "cm, median", 2.5, 6.0) for each in gap_cm),
         qa.Check("camera confidence", confidence, "mean probability", 0.6, 0.2, "higher"),
     ]
 

@@ -62,18 +62,21 @@ def nearest_frame(walk: Float[np.ndarray, "walk 4 4"], world_from_camera: Float[
     return int(np.argmin(distance_m + rigid.rotation_angle(walk[:, :3, :3], world_from_camera[:3, :3])))
 
 
-def checks(result: Registered | Rejected) -> list[Check]:
-    """Return the quality checks."""
+def checks(result: Registered | Rejected, *, mapped: bool) -> list[Check]:
+    """Return the quality checks; ``mapped``: the cameras and the static depth are from the map itself."""
     if isinstance(result, Rejected):
         return [Check("registered", 0.0, "", 0.5, 0.5, "higher")]
     agreeing = float(result.inliers.mean()) if len(result.inliers) else None
     roots = result.roots.world_from_agent
     gap_cm = finite(result.aligned.median_gap_m * 100)
-    return [
-        Check("registered", 1.0, "", 0.5, 0.5, "higher"),
+    by_depth = [
         Check("frame votes that agree", agreeing, "share", 0.5, 0.25, "higher"),
         Check("depth against the template", gap_cm, "cm, median", 2.5, 6.0),
         Check("static depth within 5 cm", finite(result.aligned.median_fit), "share", 0.6, 0.35, "higher"),
+    ]
+    return [
+        Check("registered", 1.0, "", 0.5, 0.5, "higher"),
+        *([] if mapped else by_depth),
         Check("appearance of frames and renderings", result.appearance, "share", 0.5, None, "higher"),
         Check("camera confidence", float(result.confidence.mean()), "mean probability", 0.6, 0.2, "higher"),
         Check("animal placed", float(result.roots.visible.mean()), "share of frames", 0.4, None, "higher"),

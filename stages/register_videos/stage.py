@@ -66,6 +66,6 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") ->
         out,
         good="template edges lie on the frames' edges, the animal's outline fits, paths stay in free space",
         bad="edges are shifted, paths cross walls, the animal faces backwards",
-        checks=pictures.checks(result), pictures=pictures.pictures(result, clip, maps),
+        checks=pictures.checks(result, mapped=clip.mapped), pictures=pictures.pictures(result, clip, maps),
     )  # fmt: skip
     return result

@@ -197,7 +197,9 @@ def test_unmeasured_values_are_null(maps):
     )
     figures = pictures.status(found, np.arange(3.0), truth)["figures"]
     assert (figures["depth_gap_m"], figures["depth_fit"]) == (None, None)
-    assert [check.status for check in pictures.checks(found) if "depth" in check.name] == ["warn", "warn"]
+    measured = [check for check in pictures.checks(found, mapped=False) if "depth" in check.name]
+    assert [check.status for check in measured] == ["warn", "warn"]
+    assert not any("depth" in check.name for check in pictures.checks(found, mapped=True))
 
 
 def test_rejection_names_the_nearest_frame_of_the_walkthrough():
