@@ -85,6 +85,13 @@ def fit(steps: StepProfiles, free: Sequence[str] = PARAMETERS) -> ParameterFit |
     return ParameterFit(values, covariances)
 
 
+def contrast(steps: StepProfiles) -> float:
+    """Return the mean relative gradient at the points; NaN without any."""
+    if not len(steps.frame):
+        return np.nan
+    return float(_blurred(steps.gradient, FINE_PX)[:, steps.gradient.shape[1] // 2].mean())
+
+
 def _blurred(
     gradient: Float[np.ndarray, "point offset"], blur_px: float
 ) -> Float[np.ndarray, "point offset"]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from pipeline.calibration import depth_steps, estimation
 from pipeline.calibration.depth_steps import PARAMETERS, StepFrame, StepProfiles
@@ -47,6 +47,8 @@ PARALLEL = tuple(name for name in PARAMETERS if name not in ROTATION)
 CAMERA = PARAMETERS[:6]
 PARTS = ("camera", "delay")
 """what may be corrected"""
+_Sampled = tuple[int, StepFrame]
+"""row of a frame in its recording, and the frame, still without depth"""
 
 
 @dataclass(frozen=True)
@@ -129,11 +131,7 @@ def calibrate(recording: Recording, given: GivenCalibration = NOTHING) -> DepthC
         return DepthCalibration(recording, None)
     differs = {"camera": found.camera_is_clear(), "delay": found.delay_is_clear(step_s)}
     clear = tuple(name for name, differing in differs.items() if differing)
-    if not clear:
-        return DepthCalibration(recording, found)
-    better = _changed(recording, found, clear)
-    contrasts = extraction.edge_contrasts((recording, better), others, FARTHEST_M)
-    if not beats(contrasts[:, 1], contrasts[:, 0], tests=1):
+    if not clear or not _confirmed(recording, others, found, clear):
         return DepthCalibration(recording, found)
     given_camera = given.describes_camera or recording.depth_camera is not None
     fixed = {"camera": given_camera, "delay": given.delay_s is not None}
@@ -221,26 +219,22 @@ def _scaled(intrinsics: Float[np.ndarray, "3 3"], focal: float) -> Float[np.ndar
     return intrinsics * np.array([[focal, 1, 1], [1, focal, 1], [1, 1, 1]])
 
 
-@dataclass(frozen=True)
-class _Sampled:
-    """One frame of a recording, still without depth."""
-
-    row: int
-    steps: StepFrame
+def _stated(recording: Recording) -> DepthEstimate:
+    pose = np.eye(4) if recording.depth_camera is None else recording.depth_camera.depth_from_color
+    return DepthEstimate(1.0, pose, 0.0, np.zeros(len(PARAMETERS)))
 
 
-def _frames(recording: Recording) -> tuple[list[_Sampled], Int[np.ndarray, "other"]]:
-    """Read frames for an estimate, and return the rows of others."""
+def _frames(recording: Recording) -> tuple[list[_Sampled], list[_Sampled]]:
+    """Read frames for an estimate, and others that may confirm it."""
     chosen = extraction.choose_frames(recording.timestamp_s, RATE_HZ)
     chosen = chosen[chosen < len(recording.index) - 1]
     rows = chosen[evenly(len(chosen), FRAMES, rounded=True)]
-    confirming = np.arange(len(rows)) % EVERY == EVERY - 1
-    lenses, found = _depth_intrinsics(recording), []
+    lenses, read = _depth_intrinsics(recording), ([], [])
     size = extraction.reduced_size(recording.color_size, SIDE_PX)
     assert recording.intrinsics is not None
     intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, size)
     dense = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-    for row in rows[~confirming].tolist():
+    for number, row in enumerate(rows.tolist()):
         first, second = (extraction.picture(recording, each, size) for each in (row, row + 1))
         if first is None or second is None:
             continue
@@ -249,26 +243,39 @@ def _frames(recording: Recording) -> tuple[list[_Sampled], Int[np.ndarray, "othe
         flow = moved / np.float32(recording.timestamp_s[row + 1] - recording.timestamp_s[row])
         slopes = relative_slopes(grays[0])
         none = np.zeros((1, 1), np.float32)
-        found.append(_Sampled(row, StepFrame(slopes, intrinsics[row], flow, none, lenses[row])))
-    return found, rows[confirming]
+        frame = StepFrame(slopes, intrinsics[row], flow, none, lenses[row])
+        read[number % EVERY == EVERY - 1].append((row, frame))
+    return read
 
 
 def _profiles(recording: Recording, frames: Sequence[_Sampled], camera: DepthEstimate) -> StepProfiles:
     """Return profiles for the depth that belongs to the frames if the camera is right."""
     times, steps = recording.timestamp_s, []
-    for frame in frames:
-        other = int(nearest(times, times[[frame.row]] + camera.delay_s)[0])
+    for row, frame in frames:
+        other = int(nearest(times, times[[row]] + camera.delay_s)[0])
         depth = extraction.known_depth(recording.read_depth(int(recording.index[other])), FARTHEST_M)
-        lens = _scaled(frame.steps.depth_intrinsics, camera.focal)
-        later_s = float(times[other] - times[frame.row])
-        steps.append(replace(frame.steps, depth=depth, depth_intrinsics=lens, later_s=later_s))
+        lens = _scaled(frame.depth_intrinsics, camera.focal)
+        later_s = float(times[other] - times[row])
+        steps.append(replace(frame, depth=depth, depth_intrinsics=lens, later_s=later_s))
     return depth_steps.profiles(steps, rigid.inverse(camera.depth_from_color), camera.delay_s)
+
+
+def _confirmed(
+    recording: Recording, others: Sequence[_Sampled], found: DepthEstimate, parts: Sequence[str]
+) -> bool:
+    """Return whether outlines of other frames lie on edges significantly more often than as stated."""
+    stated = _stated(recording)
+    changed = found if "camera" in parts else stated
+    changed = replace(changed, delay_s=found.delay_s if "delay" in parts else 0.0)
+    steps = [[_profiles(recording, [frame], camera) for frame in others] for camera in (changed, stated)]
+    better, before = (np.array([estimation.contrast(each) for each in row]) for row in steps)
+    return beats(better, before, tests=1)
 
 
 def _estimated(recording: Recording, frames: Sequence[_Sampled]) -> DepthEstimate | None:
     """Estimate the camera, turned if that is significant; None where too little is seen."""
-    stated = np.eye(4) if recording.depth_camera is None else recording.depth_camera.depth_from_color
-    camera, best, start = DepthEstimate(1.0, stated, 0.0, np.zeros(len(PARAMETERS))), -np.inf, None
+    camera, best, start = _stated(recording), -np.inf, None
+    stated = camera.depth_from_color
     for delay_s in START_DELAYS_S:
         tried = replace(camera, delay_s=delay_s)
         score, value = estimation.start(_profiles(recording, frames[::EVERY], tried))
@@ -286,7 +293,7 @@ def _estimated(recording: Recording, frames: Sequence[_Sampled]) -> DepthEstimat
     derivative = steps.derivative[:, : len(CAMERA)]
     moved = derivative @ _difference(stated, estimate)
     errors = np.einsum("pi,ij,pj->p", derivative, covariance, derivative)
-    side = max(frames[0].steps.slopes.shape)
+    side = max(frames[0][1].slopes.shape)
     shift, shift_error = (float(np.sqrt(np.mean(each)) / side) for each in (moved**2, errors))
     return replace(estimate, shift=shift, shift_error=shift_error)
 

@@ -4,7 +4,7 @@
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -16,7 +16,6 @@ from pipeline.data import images
 from pipeline.geometry import align, cameras, rigid
 from pipeline.geometry.subsampling import evenly
 from pipeline.mapping import picture_agreement
-from pipeline.mapping.edge_agreement import edge_contrast, relative_gradient
 from pipeline.mapping.picture_agreement import CLOCKS, PictureAgreement, PosedPicture
 from pipeline.recordings import conventions, errors, upright
 from pipeline.recordings.conventions import PoseCheck
@@ -43,8 +42,8 @@ MAX_STRETCHED, MAX_OFF_CENTER = 0.03, 0.15
 AGREEMENT_PAIRS, AGREEMENT_GAP_S = 40, 1.2
 """pairs of pictures whose agreement is checked, and seconds between the two"""
 SHARPNESS_WIDTH_PX = 240
-DARK = 0.15
-"""mean brightness (0..1) below which a picture loses quality"""
+DARK, BLURRED_SHARE = 0.15, 0.4
+"""a picture is dark below this mean brightness (0..1), blurred below this share of the median sharpness"""
 
 
 @dataclass(frozen=True)
@@ -268,22 +267,6 @@ def picture_agreement_of(
     shown = [(views[first], views[second]) for first, second in pairs.tolist()]
     step_s = float(np.median(np.diff(plan.timestamp_s))) if len(plan.chosen) > 1 else 0.0
     return picture_agreement.check([(a, b) for a, b in shown if a is not None and b is not None], step_s)
-
-
-def edge_contrasts(
-    readings: Sequence[Recording], rows: Int[np.ndarray, "frame"], max_depth_m: float
-) -> Float[np.ndarray, "frame reading"]:
-    """Return `edge_contrast` of frames of a recording by its readings, which differ in depth."""
-    found = []
-    for row in rows.tolist():
-        color = picture(readings[0], row)
-        if color is not None:
-            gray, number = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), int(readings[0].index[row])
-            depths = [stored_depth(each, number, max_depth_m) for each in readings]
-            gray = cv2.resize(gray, depths[0].shape[::-1], interpolation=cv2.INTER_AREA)
-            gradient = relative_gradient(gray)
-            found.append([edge_contrast(gradient, depth) for depth in depths])
-    return np.array(found, float).reshape(-1, len(readings))
 
 
 def _posed_picture(

@@ -9,10 +9,12 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.geometry.subsampling import evenly
+from pipeline.mapping.edge_agreement import edge_contrast, relative_gradient
 from pipeline.mapping.picture_agreement import beats
 from pipeline.recordings import errors, extraction, text_files
 from pipeline.recordings.containers import FolderContainer
@@ -84,8 +86,13 @@ def open_recording(path: Path) -> Recording:
         depth_camera=camera,
         remarks=(*remarks, text_files.depth_camera_remark(camera, lens[0])),
     )
-    rows = evenly(len(index), FRAMES, rounded=True)
-    as_stored, as_raw = extraction.edge_contrasts((stored, raw), rows, FARTHEST_M).T
+    contrasts = []
+    for number in index[evenly(len(index), FRAMES, rounded=True)].tolist():
+        color = container.color(files["color"][number])
+        gradient = relative_gradient(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY))
+        depths = [extraction.stored_depth(each, number, FARTHEST_M) for each in (stored, raw)]
+        contrasts.append([edge_contrast(gradient, depth) for depth in depths])
+    as_stored, as_raw = np.array(contrasts).T
     return stored if beats(as_stored, as_raw, tests=1) else raw
 
 

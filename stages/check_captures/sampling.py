@@ -14,15 +14,13 @@ from pipeline.geometry import rigid
 from pipeline.geometry.subsampling import evenly
 from pipeline.mapping.picture_agreement import PictureAgreement
 from pipeline.recordings import errors, extraction
-from pipeline.recordings.extraction import MIN_FRAMES, ExtractionPlan
+from pipeline.recordings.extraction import BLURRED_SHARE, MIN_FRAMES, ExtractionPlan
 from pipeline.recordings.recording import Recording
 
 RATE_HZ, SIDE_PX = 10.0, 640
 """of the pictures"""
 DEPTH_SIDE_PX = 192
 """longer side of the sampled depth"""
-BLURRED_SHARE = 0.4
-"""share of the recording's median sharpness below which a picture is blurred"""
 BLURRED = 4.0
 """absolute sharpness below which a picture is blurred"""
 

@@ -11,7 +11,7 @@ from pipeline.geometry import cameras
 from pipeline.recordings import errors, extraction
 from pipeline.recordings.recording import Recording
 from stages.extract_frames.config import Config
-from stages.extract_frames.writing import BLURRED_SHARE, MAX_LOST, SHEET_FRAMES, thumbnail
+from stages.extract_frames.writing import MAX_LOST, SHEET_FRAMES, thumbnail
 
 
 def write(folder: Path, recording: Recording, config: Config) -> None:
@@ -49,7 +49,7 @@ def write(folder: Path, recording: Recording, config: Config) -> None:
     )
     log(f"{recording.where}: {recording.kind}, {len(chosen)} pictures; cameras and depth come from the map")
     lost = 1 - (1 - recording.incomplete) * len(chosen) / len(rows)
-    blurred = float((sharpness < BLURRED_SHARE * max(float(np.median(sharpness)), 1e-6)).mean())
+    blurred = float((sharpness < extraction.BLURRED_SHARE * max(float(np.median(sharpness)), 1e-6)).mean())
     qa.write(
         folder,
         good="upright, sharp pictures",

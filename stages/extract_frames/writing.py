@@ -19,8 +19,6 @@ from stages.extract_frames.config import Config
 
 MAX_LOST = 0.5
 """maximum share of damaged pictures (0..1)"""
-BLURRED_SHARE = 0.4
-"""a frame less sharp than this share of the median is blurred"""
 SHEET_FRAMES = 12
 SHEET_HEIGHT_PX = 200
 
@@ -113,7 +111,7 @@ def report_quality(
     """Write the quality checks, the share of usable frames and a contact sheet."""
     timestamp_s = plan.timestamp_s[written.usable]
     duration_s = float(timestamp_s[-1] - timestamp_s[0])
-    blurred = written.sharpness < BLURRED_SHARE * max(float(np.median(written.sharpness)), 1e-6)
+    blurred = written.sharpness < extraction.BLURRED_SHARE * max(float(np.median(written.sharpness)), 1e-6)
     dropped = float((~written.usable).mean()) - written.lost
     with_poses = float(plan.odometry_from_camera is not None)
     missing = 1 - len(timestamp_s) / max(round(duration_s * rate_hz) + 1, 1)

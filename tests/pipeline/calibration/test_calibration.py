@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 
@@ -128,6 +129,28 @@ def test_what_is_given_is_kept():
     right = recordings.with_given(recording, GivenCalibration(depth_intrinsics=lens, delay_s=0.2))
     assert recordings.calibrate(right).clear == ()
     assert not right.read_depth(FRAMES - 1).any(), "there is no depth of that time"
+
+
+def test_delay_of_a_given_coarse_camera_is_corrected():
+    """Depth of half the resolution, whose outlines wander by two of its pixels, from a described camera."""
+    focal, coarse, wander_px, size = 0.7, 2, 2, (60, 80)
+    recording = _recording(focal=focal, shift_m=(0.05, 0.0), delay_s=0.1)
+
+    def depth(number):
+        read = cv2.resize(recording.read_depth(number), size[::-1], interpolation=cv2.INTER_NEAREST)
+        bend = np.random.default_rng(number).standard_normal((15, 20, 2)).astype(np.float32)
+        bend = wander_px * cv2.resize(bend, size[::-1])
+        at = (
+            np.stack(np.meshgrid(*(np.arange(side, dtype=np.float32) for side in size[::-1])), axis=-1) + bend
+        )
+        return cv2.remap(read, at, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+
+    lens = LENS * np.array([[focal / coarse, 1, 1 / coarse], [1, focal / coarse, 1 / coarse], [1, 1, 1]])
+    camera = DepthCamera(lens, rigid.make(np.eye(3), np.array([0.05, 0.0, 0.0])))
+    coarser = replace(recording, depth_size=size, read_depth=depth, depth_camera=camera)
+    calibrated = recordings.calibrate(coarser)
+    assert calibrated.used == ("delay",) and calibrated.estimate is not None
+    assert calibrated.estimate.delay_s == pytest.approx(0.1, abs=0.01)
 
 
 def test_confidence_moves_along_with_corrected_depth():
