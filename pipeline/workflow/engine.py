@@ -42,9 +42,11 @@ def homes(config: Mapping[str, Any]) -> list[str]:
     if config.get("homes"):
         path = Path(config["homes"])
         try:
-            with path.open(newline="") as file:
+            with path.open(newline="", encoding="utf-8-sig") as file:
                 rows = list(csv.DictReader(file, delimiter="\t"))
             named = [(row["agent"], row.get("variant") or variant) for row in rows]
+            if not named:
+                raise csv.Error("it has no rows")
         except (OSError, UnicodeDecodeError, KeyError, csv.Error) as error:
             remedy = "write a tab-separated table with a column `agent` and, if needed, `variant`"
             raise InputError("REC-003", f"is no list of homes: {error}", str(path), remedy) from error

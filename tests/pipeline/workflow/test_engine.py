@@ -27,11 +27,11 @@ def test_homes_are_one_agent_several_or_a_table(tmp_path):
     assert engine.homes({"agent": "luna", "variant": "no_scene"}) == ["luna/variants/no_scene"]
     assert engine.homes({"agents": ["luna", "cat"]}) == ["luna", "cat"]
     table = tmp_path / "homes.tsv"
-    table.write_text("agent\tvariant\nluna\t\ncat\tno_scene\n")
+    table.write_text("\ufeffagent\tvariant\nluna\t\ncat\tno_scene\n")  # as spreadsheets save it
     assert engine.homes({"homes": str(table)}) == ["luna", "cat/variants/no_scene"]
 
 
-@pytest.mark.parametrize("text", ["name\nluna\n", "\xff\xfe\x00"])
+@pytest.mark.parametrize("text", ["name\nluna\n", "agent\n", "", "\xff\xfe\x00"])
 def test_invalid_table_of_homes_is_refused(tmp_path, text):
     (tmp_path / "homes.tsv").write_bytes(text.encode("latin-1"))
     with pytest.raises(InputError, match="REC-003"):
