@@ -16,6 +16,9 @@ from pipeline.recordings.containers import FolderContainer
 from pipeline.recordings.movies import Movie
 from pipeline.recordings.recording import Recording
 
+MIN_NUMBERED = 0.6
+"""least share of the video that depth reaches; less may be its own count at half the video's rate"""
+
 
 def open_recording(path: Path) -> Recording:
     """Open a video file, or a folder with one video and its depth. Raises InputError CAP-001..011."""
@@ -33,10 +36,9 @@ def open_recording(path: Path) -> Recording:
         raise errors.no_depth(container.where, "depth/ holds no numbered PNG or EXR pictures")
     index = np.array(sorted(depth.keys() & set(movie.complete.tolist())), int)
     if len(index) == 0:
-        why = "no depth picture carries the number of a video frame, counted from 0"
-        raise errors.no_frames(container.where, why)
+        raise errors.no_frames(container.where, "no depth picture has a video frame's number, from 0")
     errors.refuse_numbers_from_1(depth, len(movie), "depth/", container.where)
-    if max(depth) + 1 < 0.5 * len(movie):
+    if max(depth) + 1 < MIN_NUMBERED * len(movie):
         why = f"{len(movie)} video frames, but depth up to number {max(depth)}: name it by the frame"
         raise errors.broken_metadata(container.where, why)
     size = _depth(container, depth[int(index[0])], None).shape

@@ -56,8 +56,7 @@ def open_recording(path: Path) -> Recording:
     first = int(index[0])
     sizes = container.color(files["color"][first]).shape[:2], container.meters(files["depth"][first]).shape
     kinect = sizes == (KINECT_SIZE, KINECT_SIZE)
-    default = KINECT_DEPTH if kinect else None
-    intrinsics, remarks = text_files.read_intrinsics(container, len(index), default)
+    intrinsics, remarks = text_files.read_intrinsics(container, len(index), KINECT_DEPTH if kinect else None)
     camera, camera_remarks = text_files.depth_camera(container, intrinsics[0], sizes)
     stored = Recording(
         where=container.where,

@@ -49,9 +49,8 @@ def open_recording(path: Path) -> Recording:
     if not present.any():
         absent = [name for pair in pairs for name in pair if name not in container.names]
         named = f"{len(absent)} of {2 * len(pairs)} listed files do not exist, e.g. {' '.join(absent[:1])}"
-        raise errors.no_frames(
-            container.where, named if absent else "no color picture has depth within 20 ms"
-        )
+        why = named if absent else "no color picture has depth within 20 ms"
+        raise errors.no_frames(container.where, why)
     paired, pairs = paired[present], [pair for pair, there in zip(pairs, present, strict=True) if there]
     color_size, depth_size = container.color(pairs[0][0]).shape[:2], container.meters(pairs[0][1]).shape
     default = DEFAULT if color_size == DEFAULT_SIZE else None

@@ -211,6 +211,15 @@ def test_depth_of_every_second_frame_is_complete(tmp_path):
     assert (len(recording.index), recording.incomplete) == (20, 0.0)
 
 
+def test_depth_that_counts_by_itself_at_half_the_rate_is_refused(tmp_path):
+    """Depth at 30 Hz beside video at 60: every frame would get the depth of another time."""
+    path = made_formats.video_and_depth(tmp_path / "a", walk(40))
+    for number in range(20, 40):
+        (path / f"depth/{number:06d}.png").unlink()
+    with pytest.raises(InputError, match="CAP-004.*40 video frames, but depth up to number 19"):
+        open_recording(path)
+
+
 def test_record3d_files_that_are_numbered_from_1_are_refused(tmp_path):
     """Renamed by another program: every frame would get the time and pose of its neighbor."""
     made = walk(20)
