@@ -179,6 +179,7 @@ reproduce: .venv/.ok
 
 # Hash all files in build/<agent> and captures/<agent>; a build itself compares only keys, sizes and times.
 verify: .venv/.ok
+	$(CHECK_NAME)
 	@$(PYTHON) -SE -m pipeline.workflow.verify $(HOME_OF:build/%=%)
 
 # All builds, or that of AGENT (or of its VARIANT) alone.

@@ -198,7 +198,7 @@ def test_jobs_and_copies_are_named_by_their_files(small_checkout):
 
 def test_an_unknown_animal_is_refused_before_anything_is_built(small_checkout):
     small_checkout.record("walkthrough.r3d", "turnaround_cat.r3d", "turnaround_dog.r3d", "a.r3d")
-    for command in ("export", "simulate", "serve"):
+    for command in ("export", "simulate", "serve", "verify"):
         refused = small_checkout.make(command, "AGENT=toy", "NAME=bird")
         assert refused.returncode == 2 and "REC-007" in refused.stderr and "cat, dog" in refused.stderr
         assert "begins (" not in refused.stderr
