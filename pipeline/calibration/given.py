@@ -27,11 +27,6 @@ class GivenCalibration:
     delay_s: float | None = None
     """Depth shows what pictures showed this long before, seconds."""
 
-    @property
-    def describes_camera(self) -> bool:
-        """Whether the depth camera is not to be estimated."""
-        return self.registered or bool(self.depth_intrinsics or self.depth_from_color)
-
 
 NOTHING = GivenCalibration()
 

@@ -133,7 +133,7 @@ def calibrate(recording: Recording, given: GivenCalibration = NOTHING) -> DepthC
     clear = tuple(name for name, differing in differs.items() if differing)
     if not clear or not _confirmed(recording, others, found, clear):
         return DepthCalibration(recording, found)
-    given_camera = given.describes_camera or recording.depth_camera is not None
+    given_camera = given.registered or recording.depth_camera is not None
     fixed = {"camera": given_camera, "delay": given.delay_s is not None}
     used = tuple(name for name in clear if not fixed[name])
     return DepthCalibration(_changed(recording, found, used), found, clear, used, given.delay_s or 0.0)
