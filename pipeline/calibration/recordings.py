@@ -5,12 +5,13 @@ moves by more than a pixel of a phone's depth, and if its steps then lie on edge
 significantly more often.
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from pipeline.calibration import depth_steps, estimation
 from pipeline.calibration.depth_steps import PARAMETERS, StepFrame, StepProfiles
@@ -34,6 +35,8 @@ ROUNDS = 3
 """maximum linearizations with the same parameters"""
 START_DELAYS_S = (0.0, -0.1, 0.1, -0.2, 0.2)
 """delays of depth that are tried to begin with, seconds"""
+READ_AHEAD = 4
+"""pictures that are kept in memory while depth is moved along with them"""
 MAX_REST = 0.75
 """depth farther in time than this share of a frame's step is not used for a delayed recording"""
 MIN_SHIFT = 1 / 192
@@ -145,23 +148,33 @@ def _changed(recording: Recording, found: DepthEstimate, parts: Sequence[str]) -
 
 
 def _delayed(recording: Recording, delay_s: float) -> Recording:
-    """Take the depth of the frame that was stored ``delay_s`` later; nothing is known where there is none."""
+    """Take the depth of the frame that was stored ``delay_s`` later; nothing is known where there is none.
+
+    What remains, up to half a frame, is corrected by the motion of the picture.
+    """
     rows = nearest(recording.timestamp_s, recording.timestamp_s + delay_s)
-    missing = np.abs(recording.timestamp_s[rows] - recording.timestamp_s - delay_s)
-    step_s = float(np.median(np.diff(recording.timestamp_s)))
-    other = dict(zip(recording.index.tolist(), recording.index[rows].tolist(), strict=True))
-    lost = set(recording.index[missing > MAX_REST * step_s].tolist())
-    rest_s = delay_s - float(np.median(recording.timestamp_s[rows] - recording.timestamp_s))
-    remark = f"depth is taken from frames {delay_s:.3f} s later, {abs(rest_s):.3f} s of it remain"
+    newer_s = recording.timestamp_s[rows] - recording.timestamp_s - delay_s
+    known = np.abs(newer_s) <= MAX_REST * float(np.median(np.diff(recording.timestamp_s)))
+    row_of = {number: row for row, number in enumerate(recording.index.tolist())}
+    other = {number: int(recording.index[rows[row]]) for number, row in row_of.items()}
+    remark = f"depth is taken from frames {delay_s:.3f} s later, moved along with the picture for the rest"
     confidence = recording.read_confidence
+    seen = replace(recording, read_color=functools.lru_cache(READ_AHEAD)(recording.read_color))
 
     def depth(number: int) -> Float[np.ndarray, "height width"]:
-        read = recording.read_depth(other[number])
-        return np.zeros_like(read) if number in lost else read
+        return known[row_of[number]] * recording.read_depth(other[number])
+
+    def moved(number: int, image: np.ndarray) -> np.ndarray:
+        if (motion := _motion(seen, row_of[number], image.shape)) is None:
+            return image
+        at = cameras.pixel_grid(*image.shape) - 0.5 + newer_s[row_of[number]] * motion[1]
+        x, y = (at[..., axis].astype(np.float32) for axis in (0, 1))
+        return cv2.remap(image, x, y, cv2.INTER_NEAREST)
 
     return replace(
-        recording,
+        seen,
         read_depth=depth,
+        moved=moved,
         read_confidence=None if confidence is None else lambda number: confidence(other[number]),
         remarks=(*recording.remarks, remark),
     )
@@ -233,19 +246,26 @@ def _frames(recording: Recording) -> tuple[list[_Sampled], list[_Sampled]]:
     size = extraction.reduced_size(recording.color_size, SIDE_PX)
     assert recording.intrinsics is not None
     intrinsics = cameras.scale_intrinsics(recording.intrinsics, recording.color_size, size)
-    dense = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     for number, row in enumerate(rows.tolist()):
-        first, second = (extraction.picture(recording, each, size) for each in (row, row + 1))
-        if first is None or second is None:
-            continue
-        grays = [cv2.cvtColor(color, cv2.COLOR_RGB2GRAY) for color in (first, second)]
-        moved = dense.calc(grays[0], grays[1], np.zeros((*size, 2), np.float32))
-        flow = moved / np.float32(recording.timestamp_s[row + 1] - recording.timestamp_s[row])
-        slopes = relative_slopes(grays[0])
-        none = np.zeros((1, 1), np.float32)
-        frame = StepFrame(slopes, intrinsics[row], flow, none, lenses[row])
-        read[number % EVERY == EVERY - 1].append((row, frame))
+        if (motion := _motion(recording, row, size)) is not None:
+            gray, none = motion[0], np.zeros((1, 1), np.float32)
+            frame = StepFrame(relative_slopes(gray), intrinsics[row], motion[1], none, lenses[row])
+            read[number % EVERY == EVERY - 1].append((row, frame))
     return read
+
+
+def _motion(
+    recording: Recording, row: int, size: tuple[int, int]
+) -> tuple[UInt8[np.ndarray, "height width"], Float[np.ndarray, "height width 2"]] | None:
+    """Return a frame's gray picture and its motion to the next one, pixels per second; None if damaged."""
+    other = row + 1 if row + 1 < len(recording.index) else row - 1
+    colors = (extraction.picture(recording, each, size) for each in (row, other))
+    grays = [cv2.cvtColor(color, cv2.COLOR_RGB2GRAY) for color in colors if color is not None]
+    if len(grays) < 2:
+        return None
+    dense = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    flow = dense.calc(grays[0], grays[1], np.zeros((*size, 2), np.float32))
+    return grays[0], flow / np.float32(recording.timestamp_s[other] - recording.timestamp_s[row])
 
 
 def _profiles(recording: Recording, frames: Sequence[_Sampled], camera: DepthEstimate) -> StepProfiles:

@@ -292,7 +292,8 @@ def stored_depth(recording: Recording, number: int, max_depth_m: float) -> Float
     """Read one frame's depth in meters, as stored (not rotated), at most `MAX_DEPTH_SIDE_PX` large."""
     depth = known_depth(recording.read_depth(number), max_depth_m)
     depth = known_depth(recording.reprojected(number, depth), max_depth_m)
-    return _sampled(depth, reduced_size(depth.shape, MAX_DEPTH_SIDE_PX))
+    depth = _sampled(depth, reduced_size(depth.shape, MAX_DEPTH_SIDE_PX))
+    return depth if recording.moved is None else recording.moved(number, depth)
 
 
 def _sampled(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -323,7 +324,8 @@ def confidence_of(
         confidence = _sampled(confidence, known.shape)
         seen = [recording.reprojected(number, np.where(confidence >= level, known, 0)) for level in range(3)]
         confidence = np.sum([(seen[0] > 0) & (seen[0] == each) for each in seen[1:]], axis=0, dtype=np.uint8)
-    return _sampled(np.minimum(confidence, 2), depth.shape)
+    confidence = _sampled(np.minimum(confidence, 2), depth.shape)
+    return confidence if recording.moved is None else recording.moved(number, confidence)
 
 
 def reduced_size(size: tuple[int, int], max_side_px: int) -> tuple[int, int]:

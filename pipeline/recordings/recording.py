@@ -69,6 +69,8 @@ class Recording:
     """the app's own mesh of the room, meters, in the poses' world; None without"""
     depth_camera: DepthCamera | None = None
     """the depth camera; None if depth is registered to the color camera"""
+    moved: Callable[[int, np.ndarray], np.ndarray] | None = None
+    """moves a frame's depth or confidence, as the color camera sees it, to the time of its picture"""
     remarks: tuple[str, ...] = ()
     """assumptions and omissions, one sentence each"""
     listed: int = 0

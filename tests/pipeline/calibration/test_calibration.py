@@ -153,6 +153,14 @@ def test_delay_of_a_given_coarse_camera_is_corrected():
     assert calibrated.estimate.delay_s == pytest.approx(0.1, abs=0.01)
 
 
+def test_half_a_frame_of_a_delay_is_corrected_by_the_motion_of_the_picture():
+    recording, right = _recording(delay_s=0.15), _recording()
+    late = recordings.with_given(recording, GivenCalibration(delay_s=0.15))
+    numbers = range(10, FRAMES - 10, 5)
+    off = [[_off(each, right, number) for number in numbers] for each in (late, replace(late, moved=None))]
+    assert np.mean(off[0]) < 0.5 * np.mean(off[1])
+
+
 def test_confidence_moves_along_with_corrected_depth():
     plain = _recording(focal=0.95)
     stored = plain.read_depth(3)
