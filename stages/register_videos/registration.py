@@ -35,8 +35,6 @@ MIN_MEASURED = 0.2
 MIN_RECOGNIZED = 0.2
 """Least share of localized frames with inlier votes if no vote is certain: sessions of the room itself have
 0.37 and more, sessions of a flat with the same shape and furniture 0.1."""
-FLOOR_QUANTILE = 0.02
-"""Quantile of the template's heights that is the floor's."""
 EYE_HEIGHT_M = 1.5
 """Camera height for the initialization in the middle of the room, meters."""
 
@@ -46,6 +44,8 @@ class Maps:
     """Templates and localizers that a recording is registered to."""
 
     scene: Mesh
+    floor_m: float
+    """Height of the scene's floor, world."""
     agent: Mesh
     scene_localizer: Localizer
     agent_localizer: Localizer
@@ -53,11 +53,6 @@ class Maps:
     """Features of the scene's vertices; None: no feature-metric alignment."""
     walk: Walkthrough | None = None
     """The walk-through, for aligning recordings without odometry to its pictures; None: not aligned."""
-
-    @property
-    def floor_m(self) -> float:
-        """Height of the scene's floor, world."""
-        return float(np.quantile(self.scene.vertices[:, 1], FLOOR_QUANTILE))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from pipeline.core.devices import Device
 from pipeline.data import ply, qa
 from pipeline.data.clips import Clip, Masks
 from pipeline.data.features import open_features
-from pipeline.data.templates import SceneCameras, read_vertex_features
+from pipeline.data.templates import SceneCameras, read_floor, read_vertex_features
 from pipeline.localization import localizer as localizers
 from stages.register_videos import pictures, registration
 from stages.register_videos.config import Config
@@ -45,6 +45,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: Device = "cpu") ->
         scene_features = read_vertex_features(inputs.scene_template).astype(np.float32)
     maps = Maps(
         scene=ply.read_ply(inputs.scene_template / "mesh.ply"),
+        floor_m=read_floor(inputs.scene_template),
         agent=ply.read_ply(inputs.agent_template / "agent.ply"),
         scene_localizer=localizers.load(inputs.scene_localizer, device),
         agent_localizer=localizers.load(inputs.agent_localizer, device),

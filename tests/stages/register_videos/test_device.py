@@ -34,7 +34,7 @@ def test_sessions_are_localized_on_another_device(tmp_path):
     with simulated_device():
         localizer, agent_localizer = (localizers.load(folder, DEVICE) for folder in folders)
         assert all(map(is_on_device, (*localizer.model.parameters(), *agent_localizer.model.buffers())))
-        maps = registration.Maps(scene, agent, localizer, agent_localizer)
+        maps = registration.Maps(scene, 0.0, agent, localizer, agent_localizer)
         found = registration.register(clip, masks, maps, config, np.random.default_rng(0))
         standing = StandingSurface(RayCaster(scene), 0.0)
         roots = agent_roots.find_roots(

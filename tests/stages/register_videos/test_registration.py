@@ -31,7 +31,7 @@ def maps() -> registration.Maps:
     agent = Mesh(
         np.eye(3, dtype=np.float32) * 0.1, np.array([[0, 1, 2]], np.int32), np.full((3, 3), 90, np.uint8)
     )
-    return registration.Maps(mesh, agent, scene, scene)
+    return registration.Maps(mesh, 0.0, agent, scene, scene)
 
 
 @pytest.mark.slow
