@@ -13,14 +13,9 @@ from pipeline.behavior.simulator import AnimalBatch
 from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.core.config import refuse_unknown
 from pipeline.core.videos import PERSON
+from pipeline.environments import spaces
 from pipeline.environments.floor import to_local, to_world
 from pipeline.environments.rendering import bird_view, known_mode
-from pipeline.environments.spaces import (
-    FAR,
-    person_action_space,
-    person_observation,
-    person_observation_space,
-)
 from pipeline.environments.world import ANIMAL_NUMBERS, AnimalWorld, checked, others_seen
 
 GOAL_M = 3.0
@@ -50,11 +45,12 @@ class PersonAnimalEnv(ParallelEnv):
         self.possible_agents = [PERSON, *self.world.batches]
         self.agents: list[str] = []
         numbers = 4 + (len(self.world.names) - 1) * (1 + ANIMAL_NUMBERS)
-        self.observation_spaces: dict[str, gymnasium.Space] = {PERSON: person_observation_space(self.world)}
-        self.action_spaces: dict[str, gymnasium.Space] = {PERSON: person_action_space(self.world)}
+        box, seen, done = gymnasium.spaces.Box, spaces.person_observation_space, spaces.person_action_space
+        self.observation_spaces: dict[str, gymnasium.Space] = {PERSON: seen(self.world)}
+        self.action_spaces: dict[str, gymnasium.Space] = {PERSON: done(self.world)}
         for name in self.world.batches:
-            self.observation_spaces[name] = gymnasium.spaces.Box(-FAR, FAR, (numbers,), np.float32)
-            self.action_spaces[name] = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+            self.observation_spaces[name] = box(-spaces.FAR, spaces.FAR, (numbers,), np.float32)
+            self.action_spaces[name] = box(-1.0, 1.0, (2,), np.float32)
 
     def observation_space(self, agent: str) -> gymnasium.Space:
         """Return what an agent observes."""
@@ -76,6 +72,7 @@ class PersonAnimalEnv(ParallelEnv):
 
     def step(self, actions: Mapping[str, Any]):
         """Let 0.1 s pass; actions (2 or 3 in -1..1) are parts of highest speeds, or of the farthest goal."""
+        spaces.require_reset(self)
         refuse_unknown(actions, self.agents, where="step: actions", kind="agent")
         for name, batch in self.world.batches.items():
             if name in actions:
@@ -99,10 +96,8 @@ class PersonAnimalEnv(ParallelEnv):
 
     def render(self):
         """Return a picture from above (`rgb_array`)."""
+        spaces.require_reset(self)
         return bird_view(self.world, 0) if self.render_mode == "rgb_array" else None
-
-    def close(self) -> None:
-        """Nothing to close."""
 
     @staticmethod
     def _goal_world(batch: AnimalBatch, action: Any) -> Float[np.ndarray, "1 3"]:
@@ -121,8 +116,8 @@ class PersonAnimalEnv(ParallelEnv):
             velocity = to_local(world.persons.velocity, heading)
             others = others_seen(world, name, place, heading).reshape(1, -1)
             numbers = np.concatenate([offset, velocity, others], axis=-1)
-            seen[name] = numbers.astype(np.float32).clip(-FAR, FAR)[0]
-        return {PERSON: {name: value[0] for name, value in person_observation(world).items()}} | seen
+            seen[name] = numbers.astype(np.float32).clip(-spaces.FAR, spaces.FAR)[0]
+        return {PERSON: {name: value[0] for name, value in spaces.person_observation(world).items()}} | seen
 
 
 def heading_of(batch: AnimalBatch) -> Float[np.ndarray, "animal"]:

@@ -8,8 +8,8 @@ import numpy as np
 
 from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.core import threads
+from pipeline.environments import spaces
 from pipeline.environments.rendering import PictureWindow, bird_view, known_mode
-from pipeline.environments.spaces import person_action_space, person_observation, person_observation_space
 from pipeline.environments.world import AnimalWorld
 
 
@@ -27,8 +27,8 @@ class PersonEnv(gymnasium.Env):
         """Open a build (`build/<agent>`); ``opening`` is what `AnimalWorld.opened` takes."""
         self.world = AnimalWorld.opened(build, **opening)
         self.config, self.render_mode = self.world.config, known_mode(render_mode, self.metadata)
-        self.observation_space = person_observation_space(self.world)
-        self.action_space = person_action_space(self.world)
+        self.observation_space = spaces.person_observation_space(self.world)
+        self.action_space = spaces.person_action_space(self.world)
         self.window: PictureWindow | None = None
 
     @threads.single_threaded()
@@ -44,6 +44,7 @@ class PersonEnv(gymnasium.Env):
     @threads.single_threaded()
     def step(self, action: Any):
         """Let 0.1 s pass; an action (2 or 3 numbers in -1..1) is a part of the highest speeds."""
+        spaces.require_reset(self)
         outcome = self.world.step([action])
         self.frame += 1
         reward, over, late = self.world.judge(outcome, self.frame)
@@ -59,6 +60,7 @@ class PersonEnv(gymnasium.Env):
 
     def render(self):
         """Return a picture from above (`rgb_array`)."""
+        spaces.require_reset(self)
         return bird_view(self.world, 0) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
@@ -68,7 +70,7 @@ class PersonEnv(gymnasium.Env):
             self.window = None
 
     def _observation(self) -> dict[str, np.ndarray]:
-        return {name: value[0] for name, value in person_observation(self.world).items()}
+        return {name: value[0] for name, value in spaces.person_observation(self.world).items()}
 
     def _show(self) -> None:
         if self.render_mode == "human":

@@ -1,6 +1,6 @@
 """Observation and action spaces for Gymnasium."""
 
-from typing import assert_never
+from typing import Any, assert_never
 
 import gymnasium
 import numpy as np
@@ -58,6 +58,12 @@ def person_observation(world: AnimalWorld) -> dict[str, Shaped[np.ndarray, "pers
             case _:
                 assert_never(seen)
     return parts
+
+
+def require_reset(env: Any) -> None:
+    """Raise Gymnasium's error where an environment was not reset, which counts its frames from then on."""
+    if not hasattr(env, "frame"):
+        raise gymnasium.error.ResetNeeded("call reset() before step() and render()")
 
 
 def person_action_space(world: AnimalWorld) -> gymnasium.spaces.Box:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from stable_baselines3.common.vec_env import VecEnv
 
-from pipeline.environments.spaces import person_action_space, person_observation, person_observation_space
+from pipeline.environments import spaces
 from pipeline.environments.world import AnimalWorld
 
 
@@ -30,7 +30,8 @@ class PersonStableVecEnv(VecEnv):
         """
         self.world = AnimalWorld.opened(build, **opening)
         self.config, self.split, self.render_mode = self.world.config, split, None
-        super().__init__(num_envs, person_observation_space(self.world), person_action_space(self.world))
+        seen, done = spaces.person_observation_space(self.world), spaces.person_action_space(self.world)
+        super().__init__(num_envs, seen, done)
         self.rng = np.random.default_rng()
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
@@ -44,7 +45,7 @@ class PersonStableVecEnv(VecEnv):
         self._reset_options()
         self.world.begin(self.num_envs, self.rng, self.split)
         self._inform()
-        return person_observation(self.world)
+        return spaces.person_observation(self.world)
 
     def step_async(self, actions: Any) -> None:
         """Keep the actions (person x command) for `step_wait`."""
@@ -52,11 +53,12 @@ class PersonStableVecEnv(VecEnv):
 
     def step_wait(self):
         """Let 0.1 s pass everywhere and begin ended episodes anew."""
+        spaces.require_reset(self)
         outcome = self.world.step(self.actions)
         self.frame += 1
         reward, over, late = self.world.judge(outcome, self.frame)
         late &= ~over
-        observation = person_observation(self.world)
+        observation = spaces.person_observation(self.world)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         ended = np.flatnonzero(over | late)
         for row in ended:
@@ -70,7 +72,7 @@ class PersonStableVecEnv(VecEnv):
             self.world.restart(ended, self.split)
             self.frame[ended] = 0
             self._inform()
-            observation = person_observation(self.world)
+            observation = spaces.person_observation(self.world)
         return observation, reward.astype(np.float32), over | late, infos
 
     def _inform(self) -> None:

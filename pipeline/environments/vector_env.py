@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.vector.utils import batch_space
 
 from pipeline.behavior.trajectories import RATE_HZ
-from pipeline.environments.spaces import person_action_space, person_observation, person_observation_space
+from pipeline.environments import spaces
 from pipeline.environments.world import AnimalWorld, checked
 
 
@@ -25,8 +25,8 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
         """Open a build (`build/<agent>`); ``opening`` is what `AnimalWorld.opened` takes."""
         self.world = AnimalWorld.opened(build, **opening)
         self.config, self.num_envs, self.render_mode = self.world.config, num_envs, None
-        self.single_observation_space = person_observation_space(self.world)
-        self.single_action_space = person_action_space(self.world)
+        self.single_observation_space = spaces.person_observation_space(self.world)
+        self.single_action_space = spaces.person_action_space(self.world)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
@@ -38,10 +38,11 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
         self.world.begin(self.num_envs, self.np_random, self.split)
         world = self.world
         info = {"distance_m": world.distance_m, "share_known": world.share_known, "home": world.home}
-        return person_observation(world), info
+        return spaces.person_observation(world), info
 
     def step(self, actions: Any):
         """Let 0.1 s pass everywhere (actions: person x command); where an episode ended, begin another."""
+        spaces.require_reset(self)
         again = np.flatnonzero(self.ended)
         numbers = checked(actions, (self.num_envs, self.world.action_size))
         outcome = self.world.step(np.where(self.ended[:, None], 0.0, numbers))
@@ -57,4 +58,4 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
             "flees": lived & outcome.flees,
             "home": self.world.home,
         }
-        return person_observation(self.world), reward, terminated, truncated, info
+        return spaces.person_observation(self.world), reward, terminated, truncated, info

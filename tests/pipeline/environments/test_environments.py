@@ -66,6 +66,27 @@ def test_pettingzoo_checks_pass():
     parallel_seed_test(lambda: PersonAnimalEnv(AnimalWorld(world.residents, QUICK)), num_cycles=40)
 
 
+def test_steps_and_pictures_before_reset_raise_the_error_of_gymnasium():
+    from pipeline.environments.parallel_env import PersonAnimalEnv
+    from pipeline.environments.person_env import PersonEnv
+    from pipeline.environments.vector_env import PersonVectorEnv
+
+    world = small_world()
+    env, many, both = (
+        PersonEnv(world, render_mode="rgb_array"),
+        PersonVectorEnv(world, 2),
+        PersonAnimalEnv(world),
+    )
+    both.render_mode = "rgb_array"
+    too_early = [env.render, lambda: env.step(np.zeros(3)), lambda: many.step(np.zeros((2, 3)))]
+    for call in (*too_early, both.render, lambda: both.step({"person": np.zeros(3)})):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="reset"):
+            call()
+    for each in (env, both):
+        each.reset(seed=0)
+        assert each.render().shape == (400, 400, 3)
+
+
 def test_vectorized_episodes_restart_and_are_seeded(build):
     lives = []
     for _ in range(2):

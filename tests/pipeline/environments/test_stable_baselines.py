@@ -8,6 +8,7 @@ import pytest
 from pipeline.behavior.trajectories import TEST
 from tests.pipeline.environments.small_world import QUICK, small_world
 
+gymnasium = pytest.importorskip("gymnasium")
 pytest.importorskip("stable_baselines3")
 
 
@@ -44,6 +45,8 @@ def test_the_split_may_be_given_as_an_option():
     from pipeline.environments.stable_baselines import PersonStableVecEnv
 
     env = PersonStableVecEnv(small_world(), 6)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="reset"):
+        env.step(np.zeros((6, 3)))
     data = env.world.habitat.data
     tested = {int(video) for video in data.video[data.split == TEST]}
     env.set_options({"split": "test"})
