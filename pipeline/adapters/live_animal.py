@@ -4,13 +4,13 @@
 the pose. `pipeline.adapters.mujoco_animal`, `usd_animal` and `ros2_animal` are adapters of it.
 """
 
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.behavior.simulator import Simulator
+from pipeline.behavior.simulator import Simulator, SimulatorState
 from pipeline.behavior.trajectories import RATE_HZ
 from pipeline.core.errors import InputError
 from pipeline.environments.config import EnvironmentConfig
@@ -19,15 +19,6 @@ from pipeline.geometry import rigid
 
 ZUP_FROM_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """From the world of a build (+y up) to that of programs with +z up; as in the export `mjcf`."""
-
-
-@dataclass(frozen=True)
-class AnimalPose:
-    """An animal at one time."""
-
-    time_s: float
-    world_from_agent: Float[np.ndarray, "4 4"]
-    agent_from_bone: Float[np.ndarray, "bone 4 4"]
 
 
 class LiveAnimal:
@@ -54,15 +45,16 @@ class LiveAnimal:
         self.before = self.after = self.simulator.reset(seed)
 
     @property
-    def pose(self) -> AnimalPose:
+    def pose(self) -> SimulatorState:
         """The current pose, interpolated between the simulator's adjacent frames."""
         share = np.array([(self.time_s - self.before.time_s) * RATE_HZ])
         frames = self.before, self.after
         tracks = np.stack([[each.world_from_agent, *each.agent_from_bone] for each in frames], axis=1)
         root, *bones = (rigid.interpolate(np.arange(2.0), track, share)[0] for track in tracks)
-        return AnimalPose(self.time_s, root, np.stack(bones))
+        now = {"world_from_agent": root, "agent_from_bone": np.stack(bones)}
+        return replace(self.after, time_s=self.time_s, **now)
 
-    def advance(self, seconds: float, observer_world: Float[np.ndarray, "3"]) -> AnimalPose:
+    def advance(self, seconds: float, observer_world: Float[np.ndarray, "3"]) -> SimulatorState:
         """Advance time with the observer's eyes at a position (world, meters) and return the new pose.
 
         Raises SIM-012 if time or position are not finite, or time is negative.

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.adapters.live_animal import ZUP_FROM_WORLD, AnimalPose, LiveAnimal
+from pipeline.adapters.live_animal import ZUP_FROM_WORLD, LiveAnimal
+from pipeline.behavior.simulator import SimulatorState
 from pipeline.geometry import rigid
 
 mujoco: Any = import_module("mujoco")  # compiled: type checkers see no functions in it
@@ -35,14 +36,14 @@ class MujocoAnimal:
         """Where the observer is in the world of the build (+y up), meters."""
         return ZUP_FROM_WORLD[:3, :3].T @ self.data.xpos[self.observer]
 
-    def step(self, steps: int = 1) -> AnimalPose:
+    def step(self, steps: int = 1) -> SimulatorState:
         """Let ``steps`` of the model's time steps pass, for the animal and for everything else."""
         for _ in range(steps):
             self._put(self.animal.advance(self.model.opt.timestep, self.observer_world))
             mujoco.mj_step(self.model, self.data)
         return self.animal.pose
 
-    def _put(self, pose: AnimalPose) -> None:
+    def _put(self, pose: SimulatorState) -> None:
         zup_from_bone = ZUP_FROM_WORLD @ pose.world_from_agent @ pose.agent_from_bone
         self.data.mocap_pos[self.mocap] = zup_from_bone[:, :3, 3]
         self.data.mocap_quat[self.mocap] = rigid.quaternion_from_rotation(zup_from_bone[:, :3, :3])

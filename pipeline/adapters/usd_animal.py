@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.adapters.live_animal import AnimalPose, LiveAnimal
+from pipeline.adapters.live_animal import LiveAnimal
+from pipeline.behavior.simulator import SimulatorState
 from pipeline.geometry import rigid
 
 Gf: Any
@@ -37,13 +38,13 @@ class UsdAnimal:
             attribute.Clear()
         self._put(animal.pose)
 
-    def step(self, seconds: float, observer_world: Float[np.ndarray, "3"]) -> AnimalPose:
+    def step(self, seconds: float, observer_world: Float[np.ndarray, "3"]) -> SimulatorState:
         """Let time pass with the observer's eyes at a place (world of the build, meters)."""
         pose = self.animal.advance(seconds, observer_world)
         self._put(pose)
         return pose
 
-    def _put(self, pose: AnimalPose) -> None:
+    def _put(self, pose: SimulatorState) -> None:
         joints = np.concatenate([pose.world_from_agent[None], pose.agent_from_bone])
         turns = rigid.quaternion_from_rotation(joints[:, :3, :3])
         places = np.ascontiguousarray(joints[:, :3, 3], np.float32)

@@ -6,15 +6,19 @@ are denoised as one sequence without a goal (Tevet et al. 2022). `sampler_of` ch
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import assert_never
 
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.behavior.config import Ego
 from pipeline.behavior.diffusion import Schedule
-from pipeline.behavior.model import Architecture, Scaling
+from pipeline.behavior.model import Architecture, Scaling, load
 from pipeline.behavior.path_encoding import PATH_CHANNELS_OF
 from pipeline.behavior.planning import Array, PlanCondition, SampledPlan, Sampler, TorchNetworks, filled
+from pipeline.behavior.trajectories import RATE_HZ
+from pipeline.core.errors import InputError
 
 MEAN_STEP, LOG_STD_STEP = 0.0, 1.0
 """Steps at which the networks, given a zero sample, predict mean and log standard deviation."""
@@ -38,6 +42,20 @@ def sampler_of(
             return GaussianSampler(*settings)
         case _:
             assert_never(architecture.family)
+
+
+def load_playable(model: Path, device: str) -> tuple[Sampler, Ego]:
+    """Read a trained model (`behavior/`) that animals live by, and its ego frame. Raises what `load` raises,
+    SIM-006 for models whose plans cannot be chained or have another rate than players.
+    """
+    architecture, nets, scaling, schedule, _ = load(model)
+    if architecture.family != "diffusion":
+        what = f"plans of the family {architecture.family} cannot be chained"
+        raise InputError("SIM-006", what, str(model), "give a model of the family diffusion")
+    if architecture.rate_hz != RATE_HZ:
+        what = f"plans of {architecture.rate_hz:g} frames a second cannot be played"
+        raise InputError("SIM-006", what, str(model), f"give a model of {RATE_HZ} frames a second")
+    return sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling), architecture.ego
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from pipeline.behavior.perception import (
     PerceptionEnsemble,
 )
 from pipeline.behavior.trajectories import ABSENT_M, FUTURE, KINDS, PAST, RATE_HZ, anticipated_frames
-from pipeline.core.errors import InputError, other_versions_refused
+from pipeline.core.errors import other_versions_refused
 from pipeline.geometry import rigid
 
 
@@ -331,16 +331,6 @@ def contract(
         "schedule": {**asdict(schedule), "alpha_bar": schedule.alpha_bar.tolist()},
         "sampling": asdict(sampling),
     }
-
-
-def refuse_unplayable(architecture: Architecture, where: str) -> None:
-    """Raise InputError SIM-006 for models whose plans cannot be chained or have another rate than players."""
-    if architecture.family != "diffusion":
-        what = f"plans of the family {architecture.family} cannot be chained"
-        raise InputError("SIM-006", what, where, "give a model of the family diffusion")
-    if architecture.rate_hz != RATE_HZ:
-        what = f"plans of {architecture.rate_hz:g} frames a second cannot be played"
-        raise InputError("SIM-006", what, where, f"give a model of {RATE_HZ} frames a second")
 
 
 def load(folder: Path) -> tuple[Architecture, BehaviorNets, Scaling, Schedule, Float[np.ndarray, "bone 4 4"]]:

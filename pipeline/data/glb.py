@@ -33,6 +33,10 @@ class Skin:
     bone_names: tuple[str, ...]
 
 
+ROUNDING = 1e-4
+"""Keys by which the end may lie before the last key: files hold times in single precision."""
+
+
 @dataclass(frozen=True)
 class Action:
     """One named animation: keyframes in seconds, root in the world, bones in the agent frame."""
@@ -41,6 +45,14 @@ class Action:
     time_s: Float[np.ndarray, " frame"]
     world_from_agent: Float[np.ndarray, "frame 4 4"]
     agent_from_bone: Float[np.ndarray, "frame bone 4 4"]
+
+    def resampled(self, rate_hz: float) -> "Action":
+        """Return it with even keys from time 0 on: rotations by slerp, translations linearly."""
+        begin, end = self.time_s[[0, -1]]
+        time_s = np.arange(int(np.floor((end - begin) * rate_hz + ROUNDING)) + 1) / rate_hz
+        poses = self.world_from_agent, self.agent_from_bone
+        query_s = np.minimum(begin + time_s, end)
+        return Action(self.name, time_s, *rigid.interpolate_body(self.time_s, *poses, query_s))
 
 
 def static(mesh: Mesh, name: str) -> bytes:

@@ -3,10 +3,11 @@
 `write_ply` and `read_ply` are exact inverses for float32 data. Reading checks counts, indices and finiteness.
 """
 
+import re
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped, UInt8
 
 from pipeline.core.errors import InputError
 from pipeline.geometry.meshes import Mesh
@@ -48,7 +49,10 @@ def read_ply(path: Path) -> Mesh:
 
 
 def _parse(data: bytes) -> Mesh:
-    end = data.index(b"end_header\n") + len(b"end_header\n")
+    last = re.search(rb"^end_header\r?\n", data, re.MULTILINE)
+    if last is None:
+        raise ValueError("its header has no end")
+    end = last.end()
     lines = [line.split() for line in data[:end].decode("ascii", "replace").splitlines()]
     if ["format", "binary_little_endian", "1.0"] not in lines:
         raise ValueError("only binary_little_endian 1.0 is read")
@@ -78,5 +82,13 @@ def _parse(data: bytes) -> Mesh:
     if not np.isfinite(vertices).all():
         raise ValueError("vertices are not finite")
     has_color = set(_COLOR) <= {name for _, name in vertex_columns}
-    color = np.stack([table[name] for name in _COLOR], axis=-1).astype(np.uint8) if has_color else None
-    return Mesh(vertices, index, color)
+    color = np.stack([table[name] for name in _COLOR], axis=-1) if has_color else None
+    return Mesh(vertices, index, None if color is None else _bytes(color))
+
+
+def _bytes(color: Shaped[np.ndarray, "vertex 3"]) -> UInt8[np.ndarray, "vertex 3"]:
+    """Return colors as bytes: floats are 0..1, integers up to the most that their type holds."""
+    full = np.iinfo(color.dtype).max if color.dtype.kind in "iu" else 1
+    if not ((color >= 0) & (color <= full)).all():
+        raise ValueError(f"colors are not within 0 and {full}")
+    return np.rint(color / full * 255).astype(np.uint8)

@@ -20,7 +20,7 @@ from pipeline.backends.descriptors import Describer
 from pipeline.behavior.path_encoding import REST_SPEED_M_S
 from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.scenes import Scenes
-from pipeline.behavior.support import SUPPORTED, Support, floor_level, with_headroom
+from pipeline.behavior.support import SUPPORTED, Support, floor_level, level_beneath, with_headroom
 from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, Trajectory
 from pipeline.core.errors import InputError
 from pipeline.data import npz
@@ -111,16 +111,11 @@ class ReconstructedHome:
         """Return the height of the root above its support in the last of ``count`` frames, meters, clipped to
         the animal's usual range at rest or in motion.
         """
-        support = Support.of(self.volume, self.marks, self.stands_m)
-        assert support is not None, "checked by `load`"
         before, root = track.world_from_agent[count - 2 : count, :3, 3]
         step_s = track.timestamp_s[count - 1] - track.timestamp_s[count - 2]
         moves = bool(np.hypot(*(root - before)[[0, 2]]) > REST_SPEED_M_S * step_s)
-        column = np.floor((root[[0, 2]] - support.corner) / support.voxel_m).astype(int)
-        column = np.clip(column, 0, np.array(support.tops.shape[:2]) - 1)
-        tops = support.tops[tuple(column)]
-        beneath = tops[tops <= root[1]]
-        top = beneath.max() if len(beneath) else self.floor_m
+        level = level_beneath(self.volume, self.marks, root[None])[0]
+        top = self.volume.origin[1] + level * self.volume.voxel_m if np.isfinite(level) else self.floor_m
         return float(np.clip(root[1] - top, *self.stands_m[int(moves)]))
 
 

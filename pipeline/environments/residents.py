@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.baselines.samplers import sampler_of
-from pipeline.behavior import model as behavior
+from pipeline.baselines.samplers import load_playable
 from pipeline.behavior.config import Ego
-from pipeline.behavior.planning import Sampler, TorchNetworks
+from pipeline.behavior.planning import Sampler
 from pipeline.behavior.simulator import AnimalBatch
 from pipeline.behavior.trajectories import as_companions
 from pipeline.core.config import refuse_unknown
@@ -55,10 +54,8 @@ class Resident:
             artifact.require(folder, *NEEDED, remedy=remedy)
         habitats, residents = open_homes(build, animals, homes), {}
         for name, folder in animals.items():
-            architecture, nets, scaling, schedule, _ = behavior.load(folder / "behavior")
-            behavior.refuse_unplayable(architecture, str(folder))
-            sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
-            residents[name] = cls(sampler, habitats[name], architecture.ego)
+            sampler, ego = load_playable(folder / "behavior", device)
+            residents[name] = cls(sampler, habitats[name], ego)
         return residents
 
     def batch(self, config: EnvironmentConfig) -> AnimalBatch:

@@ -36,9 +36,8 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
         self.split = (options or {}).get("split", "train")
         self.frame, self.ended = np.zeros(self.num_envs, int), np.zeros(self.num_envs, bool)
         self.world.begin(self.num_envs, self.np_random, self.split)
-        world = self.world
-        info = {"distance_m": world.distance_m, "share_known": world.share_known, "home": world.home}
-        return spaces.person_observation(world), info
+        info = {name: getattr(self.world, name) for name in ("distance_m", "share_known", "home")}
+        return spaces.person_observation(self.world), info
 
     def step(self, actions: Any):
         """Let 0.1 s pass everywhere (actions: person x command); where an episode ended, begin another."""

@@ -15,6 +15,10 @@ FOCUS_MARGIN_M = 0.05
 """points up to this far above the focus count as below it"""
 BIN_M = 0.02
 """bin size of the histogram of heights"""
+LEVEL_SURFACE = 0.9
+"""A surface whose normal has a larger vertical component is level."""
+LEVEL_SHARE, LEVEL_BAND_M = 0.25, 0.03
+"""Share of the largest level's area that a floor has; it is averaged over heights this close to its bin."""
 BANDS_M = (0.05, 0.03, 0.02)
 """inlier distances of successive plane fits"""
 AXIS_LIMITS_DEG = (6.0, 4.0)
@@ -40,9 +44,8 @@ def fit_ground(
     distance_m = np.linalg.norm((points_world - focus)[:, [0, 2]], axis=1)
     height = points_world[:, 1]
     weight = np.exp(-((distance_m / reach_m) ** 2)) * (height < focus[1] + FOCUS_MARGIN_M)
-    counts, edges = np.histogram(
-        height, np.arange(height.min() - BIN_M, height.max() + 2 * BIN_M, BIN_M), weights=weight
-    )
+    bins = np.arange(height.min() - BIN_M, height.max() + 2 * BIN_M, BIN_M)
+    counts, edges = np.histogram(height, bins, weights=weight)
     offset, slope = edges[counts.argmax()] + BIN_M / 2, np.zeros(2)
     for band in BANDS_M:
         close = np.abs(height - offset - points_world[:, [0, 2]] @ slope) < band
@@ -50,6 +53,17 @@ def fit_ground(
         solution = np.linalg.lstsq(design, height[close] * weight[close], rcond=None)[0]
         slope, offset = solution[:2], solution[2]
     return GroundPlane(float(offset), slope)
+
+
+def lowest_level(height_m: Float[np.ndarray, "part"], area: Float[np.ndarray, "part"]) -> float:
+    """Return the height of a floor: of level surface (meters), with its area, the lowest level that has more
+    than a quarter of the area of the largest.
+    """
+    bins = np.arange(height_m.min() - BIN_M, height_m.max() + 2 * BIN_M, BIN_M)
+    share, edges = np.histogram(height_m, bins, weights=area)
+    lowest = edges[np.flatnonzero(share > LEVEL_SHARE * share.max())[0]] + BIN_M / 2
+    near = np.abs(height_m - lowest) < LEVEL_BAND_M
+    return float(np.average(height_m[near], weights=area[near]))
 
 
 def floor_direction(

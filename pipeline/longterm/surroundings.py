@@ -11,6 +11,7 @@ from jaxtyping import Float
 from pipeline.behavior.trajectories import Trajectory
 from pipeline.data import ply
 from pipeline.geometry import rigid, signed_distance
+from pipeline.geometry.ground import LEVEL_SURFACE, lowest_level
 from pipeline.geometry.meshes import Mesh
 from pipeline.geometry.signed_distance import SignedDistance, SurfacePoints
 
@@ -19,10 +20,6 @@ VERTICAL_SURFACE = 0.7
 """A surface whose normal has a smaller vertical component is steep; half of the points are sampled there."""
 MARGIN_M = 0.15
 """Margin of the signed distance grid around the mesh."""
-LEVEL_SURFACE = 0.9
-"""A surface whose normal has a larger vertical component is level."""
-BIN_M, FLOOR_BAND_M = 0.02, 0.03
-"""Bin size of the histogram of heights; the floor is the median of points this close to its bin."""
 
 
 @dataclass(frozen=True)
@@ -67,13 +64,11 @@ class MotionScene:
 
     @property
     def floor_m(self) -> float:
-        """Height of the floor: the lowest level with a quarter or more of the points of the largest level."""
+        """Height of the floor."""
         level = self.surface.points[self.surface.normals[:, 1] > LEVEL_SURFACE, 1]
         if not len(level):
             return float(self.surface.points[:, 1].min())
-        count, edges = np.histogram(level, np.arange(level.min() - BIN_M, level.max() + 3 * BIN_M, BIN_M))
-        lowest = edges[np.flatnonzero(count > 0.25 * count.max())[0]] + BIN_M / 2
-        return float(np.median(level[np.abs(level - lowest) < FLOOR_BAND_M]))
+        return lowest_level(level, np.ones(len(level)))
 
     def around(
         self,

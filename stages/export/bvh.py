@@ -21,7 +21,7 @@ def write(folder: Path, agent: Agent) -> ExportRecord:
     names, lost = list(agent.skin.bone_names), []
     for action in agent.actions:
         file = folder / f"{action.name}.flat.bvh"
-        file.write_text(flat(action, names))
+        file.write_text(flat(action, names, agent.rate_hz))
         truth = (action.world_from_agent[:, None] @ action.agent_from_bone)[..., :3, 3]
         lost.append(read_places(file, names) - truth)
     lost_mm = 1000 * np.linalg.norm(np.concatenate(lost), axis=-1)
@@ -31,7 +31,7 @@ def write(folder: Path, agent: Agent) -> ExportRecord:
     return ExportRecord("own writer", loss, "own reader, with forward kinematics", remark)
 
 
-def flat(action: Action, names: list[str]) -> str:
+def flat(action: Action, names: list[str], rate_hz: float) -> str:
     """Return BVH text with every bone a child of the root with six channels: lossless."""
     lines = ["HIERARCHY", "ROOT agent", "{", "OFFSET 0 0 0", _ROOT_CHANNELS]
     for name in names:
@@ -39,9 +39,8 @@ def flat(action: Action, names: list[str]) -> str:
     poses = np.concatenate([action.world_from_agent[:, None], action.agent_from_bone], 1)
     angles = Rotation.from_matrix(poses[..., :3, :3].reshape(-1, 3, 3)).as_euler(_ORDER, degrees=True)
     channels = np.concatenate([poses[..., :3, 3], angles.reshape(*poses.shape[:2], 3)], -1)
-    step_s = action.time_s[-1] / max(len(action.time_s) - 1, 1)
     rows = [" ".join(f"{value:.6f}" for value in row) for row in channels.reshape(len(poses), -1)]
-    head = [*lines, "}", "MOTION", f"Frames: {len(rows)}", f"Frame Time: {step_s:.8f}"]
+    head = [*lines, "}", "MOTION", f"Frames: {len(rows)}", f"Frame Time: {1 / rate_hz:.8f}"]
     return "\n".join([*head, *rows, ""])
 
 

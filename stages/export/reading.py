@@ -13,7 +13,6 @@ from pipeline.data import gaussian_ply, images, motion, npz
 from pipeline.data import glb as gltf
 from pipeline.data.glb import Action, Skin
 from pipeline.data.motion import Motion
-from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh
 from pipeline.geometry.subsampling import evenly
 
@@ -25,6 +24,8 @@ class Agent:
     mesh: Mesh
     skin: Skin
     actions: list[Action]
+    rate_hz: float
+    """keys per second of all motions"""
     skinning_loss_mm: dict[str, float]
     """linear weights against the reconstruction's dual quaternions"""
     retargeting_loss_mm: dict[str, float] = field(default_factory=dict)
@@ -80,7 +81,7 @@ def agent(simulator: Path, take: Path | None, rate_hz: float) -> Agent:
         names = ("timestamp_s", "world_from_agent", "agent_from_bone")
         made = npz.load(take, names)
         actions = [*actions, Action("generated", *(made[name].astype(np.float64) for name in names))]
-    return Agent(mesh, skin, [_resampled(action, rate_hz) for action in actions], loss_mm)
+    return Agent(mesh, skin, [action.resampled(rate_hz) for action in actions], rate_hz, loss_mm)
 
 
 def room(simulator: Path) -> Mesh:
@@ -116,11 +117,3 @@ def camera_frames(
 def gaussians(splats: Path) -> dict[str, Float[np.ndarray, "point 62"]]:
     """Read both clouds as standard rows."""
     return {name: gaussian_ply.read(splats / f"{name}.ply") for name in ("scene", "agent")}
-
-
-def _resampled(action: Action, rate_hz: float) -> Action:
-    count = int(np.floor((action.time_s[-1] - action.time_s[0]) * rate_hz + 1e-4)) + 1
-    query_s = np.minimum(action.time_s[0] + np.arange(count) / rate_hz, action.time_s[-1])
-    body = action.world_from_agent, action.agent_from_bone
-    resampled = rigid.interpolate_body(action.time_s, *body, query_s)
-    return Action(action.name, query_s - query_s[0], *resampled)

@@ -22,7 +22,7 @@ def onto(agent: Agent, other: Agent) -> Agent:
         "retargeting_max": float(residual_mm.max()),
         "retargeting_shape_distance": 1000 * retargeting.shape_distance_m(source, target),
     }
-    return Agent(other.mesh, other.skin, actions, other.skinning_loss_mm, loss_mm)
+    return Agent(other.mesh, other.skin, actions, agent.rate_hz, other.skinning_loss_mm, loss_mm)
 
 
 def _body(agent: Agent) -> SkinnedShape:

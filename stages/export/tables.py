@@ -15,6 +15,8 @@ COLUMNS = (
     "time_s", "x", "y", "z", "qw", "qx", "qy", "qz", "speed_m_s",
     "observer_x", "observer_y", "observer_z", "distance_m", "in_view", "confidence",
 )  # fmt: skip
+DECIMALS = 6
+"""Decimals in the CSV file: micrometers and microseconds, however long a recording is."""
 
 
 def rows(session: Motion) -> Float[np.ndarray, "frame 15"]:
@@ -39,8 +41,8 @@ def write(folder: Path, sessions: Mapping[str, Motion]) -> ExportRecord:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["video", *COLUMNS])
         for video, table in tables.items():
-            for row in table:
-                writer.writerow([video, *("" if np.isnan(value) else f"{value:.6g}" for value in row)])
+            for row in np.round(table, DECIMALS).tolist():
+                writer.writerow([video, *("" if np.isnan(value) else value for value in row)])
     every = np.concatenate(list(tables.values()))
     videos = [video for video, table in tables.items() for _ in range(len(table))]
     columns = {"video": videos, **dict(zip(COLUMNS, every.T, strict=True))}

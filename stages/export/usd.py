@@ -58,9 +58,8 @@ def _mesh(pxr: Any, stage: Any, path: str, mesh: Mesh) -> Any:
 def _write_agent(pxr: Any, path: Path, agent: Agent, action: Action) -> None:
     """One root joint carries `world_from_agent`; the bones are its children."""
     stage = _stage(pxr, path)
-    rate_hz = (len(action.time_s) - 1) / max(action.time_s[-1], 1e-9)
-    stage.SetTimeCodesPerSecond(rate_hz)
-    stage.SetFramesPerSecond(rate_hz)
+    stage.SetTimeCodesPerSecond(agent.rate_hz)
+    stage.SetFramesPerSecond(agent.rate_hz)
     stage.SetStartTimeCode(0)
     stage.SetEndTimeCode(len(action.time_s) - 1)
     root = pxr.UsdSkel.Root.Define(stage, "/agent")

@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.data.glb import Action
-from pipeline.geometry import rigid
 from pipeline.geometry.subsampling import runs
 
 
@@ -43,8 +42,5 @@ def cut(motion: SessionClip, frames: slice) -> SessionClip:
 
 def animation(motion: SessionClip, rate_hz: float) -> Action:
     """Resample to even keys from the first to the last frame: rotations by slerp, translations linearly."""
-    time_s = motion.timestamp_s
-    count = int(np.floor((time_s[-1] - time_s[0]) * rate_hz + 1e-6)) + 1
-    query_s = time_s[0] + np.arange(count) / rate_hz
-    body = rigid.interpolate_body(time_s, motion.world_from_agent, motion.agent_from_bone, query_s)
-    return Action(motion.name, query_s - query_s[0], *body)
+    poses = motion.world_from_agent, motion.agent_from_bone
+    return Action(motion.name, motion.timestamp_s, *poses).resampled(rate_hz)

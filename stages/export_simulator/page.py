@@ -18,7 +18,7 @@ import numpy as np
 from stages.export_simulator.actions import SessionClip
 from stages.export_simulator.contract import rigid_rows
 
-_BUNDLE = "web/dist"
+_BUNDLE = resources.files("stages.export_simulator").joinpath("web/dist")
 _BUNDLED = {"page": "page.js.gz", "worker": "worker.js.gz", "ort.wasm": "ort.wasm.gz"}
 _STEPS = 4096.0
 
@@ -58,8 +58,7 @@ def light_page(contract: Mapping[str, Any], assets: Mapping[str, Asset], files: 
 
 def compressed(contract: Mapping[str, Any], assets: Mapping[str, Asset]) -> dict[str, bytes]:
     """Compress all that the page unpacks; the same content always gives the same bytes."""
-    bundle = resources.files("stages.export_simulator").joinpath(_BUNDLE)
-    files = {name: bundle.joinpath(file).read_bytes() for name, file in _BUNDLED.items()}
+    files = {name: _BUNDLE.joinpath(file).read_bytes() for name, file in _BUNDLED.items()}
     files["simulator"] = gzip.compress(json.dumps(contract).encode(), 9, mtime=0)
     return files | {name: gzip.compress(planes(asset), 9, mtime=0) for name, asset in assets.items()}
 
@@ -78,16 +77,15 @@ def _tag(name: str, assets: Mapping[str, Asset], more: str = "", content: str = 
 
 
 def _assembled(contract: Mapping[str, Any], tags: list[str], connect: str) -> str:
-    bundle = resources.files("stages.export_simulator").joinpath(_BUNDLE)
     name = html.escape(str(contract["name"]))
     pieces = {
         "@@TITLE@@": f"{name}: a behavior simulator",
         "@@NAME@@": name,
         "@@CONNECT@@": connect,
-        "@@NOTICES@@": bundle.joinpath("NOTICES.txt").read_text(),
-        "@@STYLE@@": bundle.joinpath("style.css").read_text(),
+        "@@NOTICES@@": _BUNDLE.joinpath("NOTICES.txt").read_text(),
+        "@@STYLE@@": _BUNDLE.joinpath("style.css").read_text(),
         "@@ASSETS@@": "\n".join(tags),
-        "@@SCRIPT@@": bundle.joinpath("boot.js").read_text(),
+        "@@SCRIPT@@": _BUNDLE.joinpath("boot.js").read_text(),
     }
-    text = bundle.joinpath("page.html").read_text()
+    text = _BUNDLE.joinpath("page.html").read_text()
     return re.sub("|".join(pieces), lambda mark: pieces[mark[0]], text)  # at once: a piece may hold a mark

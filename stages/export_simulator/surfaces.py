@@ -6,15 +6,12 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from pipeline.fields.gaussians import BAND0, OPACITY, ROTATION, SCALE
+from pipeline.geometry.ground import LEVEL_SURFACE, lowest_level
 from pipeline.geometry.meshes import Mesh, area_normals
 
 _SPLAT_ROW = np.dtype(
     [("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
 )
-_LEVEL_M, _UPRIGHT = 0.02, 0.9
-"""Thickness of the layers among which the floor is sought; least upward part of a floor's normal."""
-_NEAR_LEVELS = 1.5
-"""The floor is averaged over the lowest level and those that touch it, half thicknesses."""
 _STEPS = 8192.0  # places and sizes are rounded to 0.06 mm: finer digits do not compress
 
 
@@ -38,14 +35,10 @@ def floor_height_m(mesh: Mesh, agent_positions_world: Float[np.ndarray, "frame 3
     normals = area_normals(corners)
     area = np.linalg.norm(normals, axis=1)
     height = corners[..., 1].mean(1)
-    level = (normals[:, 1] > _UPRIGHT * area) & (height < np.median(agent_positions_world[:, 1]))
+    level = (normals[:, 1] > LEVEL_SURFACE * area) & (height < np.median(agent_positions_world[:, 1]))
     if not level.any():
         return float(np.percentile(mesh.vertices[:, 1], 2))
-    edges = np.arange(height[level].min() - _LEVEL_M, height[level].max() + 2 * _LEVEL_M, _LEVEL_M)
-    share, _ = np.histogram(height[level], edges, weights=area[level])
-    lowest = np.flatnonzero(share > 0.25 * share.max())[0]
-    near = level & (np.abs(height - edges[lowest] - _LEVEL_M / 2) < _NEAR_LEVELS * _LEVEL_M)
-    return float(np.average(height[near], weights=area[near]))
+    return lowest_level(height[level], area[level])
 
 
 def orient_towards(mesh: Mesh, inside: Float[np.ndarray, "3"]) -> Mesh:

@@ -5,13 +5,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, assert_never
 
-import numpy as np
-
 from pipeline.data import glb
 from pipeline.data.qa import Check, Picture
 from stages.export_simulator import page, pictures
 from stages.export_simulator.config import Config, Layout
-from stages.export_simulator.contract import MIN_SUPPORTED, contract
+from stages.export_simulator.contract import MIN_SUPPORTED, contract, loss_mm
 from stages.export_simulator.export import SimulatorParts
 from stages.export_simulator.page import Asset
 from stages.export_simulator.reading import BehaviorAssets
@@ -126,7 +124,7 @@ def page_checks(sizes_mb: Mapping[str, float], animals: int = 1) -> list[Check]:
 
 def quality(parts: SimulatorParts, sizes_mb: Mapping[str, float], supported: float | None) -> dict[str, Any]:
     """Return checks and pictures of the simulator for `qa.write`."""
-    residual_mm = parts.residual_m * 1000
+    lost_mm = loss_mm(parts.residual_m)
     carried = "recorded motion that the scene carries"
     visits = pictures.visits(parts.scene, parts.setting.floor_m, parts.motions)
     about = "the room from above: where the animal (amber) and the person (blue) have been"
@@ -137,9 +135,9 @@ def quality(parts: SimulatorParts, sizes_mb: Mapping[str, float], supported: flo
         "bad": "limbs of `agent.glb` that thin out at the joints, or a page too big to send",
         "checks": [
             *page_checks(sizes_mb),
-            Check("skinning loss, mean", float(residual_mm.mean()), "mm", warn=2.0, fail=10.0),
-            Check("skinning loss, 99th percentile", float(np.percentile(residual_mm, 99)), "mm", warn=10.0),
-            Check("skinning loss, largest", float(residual_mm.max()), "mm", warn=15.0),
+            Check("skinning loss, mean", lost_mm["mean"], "mm", warn=2.0, fail=10.0),
+            Check("skinning loss, 99th percentile", lost_mm["p99"], "mm", warn=10.0),
+            Check("skinning loss, largest", lost_mm["max"], "mm", warn=15.0),
             Check(carried, supported, "share", MIN_SUPPORTED, better="higher"),
             Check("sessions to replay", len(parts.motions), "", warn=1, better="higher"),
         ],

@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.baselines.samplers import sampler_of
-from pipeline.behavior import model as behavior
+from pipeline.baselines.samplers import load_playable
 from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
-from pipeline.behavior.planning import TorchNetworks
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import Simulator
 from pipeline.behavior.trajectories import TRAIN, BehaviorData, Trajectory
@@ -234,10 +232,8 @@ def _simulator(
     chaining: ReplanningConfig,
     device: str,
 ) -> Simulator:
-    architecture, nets, scaling, schedule, _ = behavior.load(_required(inputs, "behavior"))
-    behavior.refuse_unplayable(architecture, str(inputs.behavior))
-    sampler = sampler_of(architecture, TorchNetworks(nets, device), schedule, scaling)
-    return Simulator(sampler, data, scenes, architecture.ego, sampling=sampling, chaining=chaining)
+    sampler, ego = load_playable(_required(inputs, "behavior"), device)
+    return Simulator(sampler, data, scenes, ego, sampling=sampling, chaining=chaining)
 
 
 def _sampling(c: Config, animals: Sequence[str] = (), name: str = "") -> PlanSamplingConfig:

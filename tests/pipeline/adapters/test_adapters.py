@@ -39,7 +39,7 @@ def exported_agent() -> reading.Agent:
         tuple(f"bone_{bone:02d}" for bone in range(len(REST))),
     )
     still = Action("still", np.arange(5) / 30, np.tile(np.eye(4), (5, 1, 1)), np.tile(REST, (5, 1, 1, 1)))
-    return reading.Agent(mesh, skin, [still], {})
+    return reading.Agent(mesh, skin, [still], 10.0, {})
 
 
 def test_poses_are_interpolated_for_any_step_length(animal):

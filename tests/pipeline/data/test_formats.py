@@ -105,6 +105,35 @@ def test_meshes_round_trip_and_damage_is_refused(tmp_path):
         ply.read_ply(tmp_path / "a.ply")
 
 
+@pytest.mark.parametrize(("kind", "full"), [("<f4", 1), ("<f8", 1), ("u1", 255), ("<u2", 65535)])
+def test_meshes_of_other_programs_are_read(tmp_path, kind, full):
+    """A header with Windows line ends, and colors of any type."""
+    names = {"<f4": "float", "<f8": "double", "u1": "uchar", "<u2": "ushort"}
+    color = np.array([[0, 51, 255], [255, 102, 0], [204, 0, 153]], np.uint8)
+    table = np.zeros(
+        3, [*((axis, "<f4") for axis in "xyz"), *((name, kind) for name in ("red", "green", "blue"))]
+    )
+    table["x"], table["y"] = [0, 1, 0], [0, 0, 1]
+    for name, values in zip(("red", "green", "blue"), color.T / 255 * full, strict=True):
+        table[name] = values
+    header = ["ply", "format binary_little_endian 1.0", "comment end_header is below", "element vertex 3"]
+    header += [*(f"property float {axis}" for axis in "xyz")]
+    header += [*(f"property {names[kind]} {name}" for name in ("red", "green", "blue"))]
+    header += ["element face 1", "property list uchar int vertex_indices", "end_header", ""]
+    faces = bytes([3]) + np.arange(3, dtype="<i4").tobytes()
+    (tmp_path / "a.ply").write_bytes("\r\n".join(header).encode() + table.tobytes() + faces)
+    mesh = ply.read_ply(tmp_path / "a.ply")
+    np.testing.assert_array_equal(mesh.color, color)
+    np.testing.assert_array_equal(mesh.vertices[:, :2], [[0, 0], [1, 0], [0, 1]])
+    table["red"] = -1.0 if kind.startswith("<f") else 0
+    (tmp_path / "a.ply").write_bytes("\n".join(header).encode() + table.tobytes() + faces)
+    if kind.startswith("<f"):
+        with pytest.raises(InputError, match="ART-020.*colors"):
+            ply.read_ply(tmp_path / "a.ply")
+    else:
+        assert (ply.read_ply(tmp_path / "a.ply").color[:, 0] == 0).all()
+
+
 def test_damaged_mask_is_refused(tmp_path):
     (tmp_path / "a.png").write_bytes(b"not a picture")
     with pytest.raises(InputError, match="CAP-021"):

@@ -1,5 +1,6 @@
 """Exports preserve motion, positions and units in every format."""
 
+import csv
 import importlib
 import json
 import shutil
@@ -15,6 +16,7 @@ from pipeline.core.errors import InputError
 from pipeline.data import glb, images, npz
 from pipeline.data.glb import Action
 from pipeline.data.motion import Motion
+from pipeline.geometry import rigid
 from stages.export import bvh, cameras, mjcf, neuro, reading, retarget, splats, tables, usd, writing
 from stages.export import glb as glb_export
 from tests.stages.export import moving_tube
@@ -32,7 +34,7 @@ def agent() -> reading.Agent:
         Action(name, track.timestamp_s, track.world_from_agent, track.agent_from_bone.astype(np.float64))
         for name, track in (("walk", small_world.trajectory(20, 0)), ("turn", small_world.trajectory(12, 1)))
     ]
-    return reading.Agent(mesh, skin, actions, {"mean": 0.1, "max": 0.5})
+    return reading.Agent(mesh, skin, actions, 10.0, {"mean": 0.1, "max": 0.5})
 
 
 @pytest.fixture
@@ -41,7 +43,7 @@ def session() -> Motion:
     agent = track.world_from_agent.copy()
     agent[4] = np.nan
     return Motion(
-        track.timestamp_s,
+        track.timestamp_s + 4321.00123,
         track.world_from_camera,
         agent,
         track.agent_from_bone,
@@ -56,7 +58,7 @@ def test_retargeted_motion_is_exported_with_its_residual(agent: reading.Agent, t
     rest = agent.skin.agent_from_bone_rest.copy()
     rest[:, :3, 3] *= stretch
     mesh = replace(agent.mesh, vertices=(agent.mesh.vertices * stretch).astype(np.float32))
-    long = reading.Agent(mesh, replace(agent.skin, agent_from_bone_rest=rest), [], {"mean": 0.2})
+    long = reading.Agent(mesh, replace(agent.skin, agent_from_bone_rest=rest), [], 30.0, {"mean": 0.2})
     moved = retarget.onto(agent, long)
     record = glb_export.write(tmp_path, moved, glb.static(agent.mesh, "room"))
     assert record.loss_mm["skinning_mean"] == 0.2 and record.loss_mm["retargeting_mean"] < 2, "mm"
@@ -205,6 +207,33 @@ def test_usd_joints_have_their_poses(agent: reading.Agent, tmp_path: Path) -> No
     assert usd.write(tmp_path, agent, small_world.room()).loss_mm["joints"] < 0.01, "mm"
 
 
+@pytest.mark.parametrize("rate_hz", [12.5, 30.0, 60.0])
+def test_keys_are_even_however_the_page_rounds_its_times(
+    agent: reading.Agent, rate_hz: float, tmp_path: Path
+) -> None:
+    pxr = pytest.importorskip("pxr.Usd")
+    seconds = np.arange(131) / 30 + 1e-7
+    poses = [
+        rigid.interpolate_body(a.time_s, a.world_from_agent, a.agent_from_bone, seconds % 1)
+        for a in agent.actions
+    ]
+    actions = [
+        Action(a.name, seconds - seconds[0], *found) for a, found in zip(agent.actions, poses, strict=True)
+    ]
+    (tmp_path / "agent.glb").write_bytes(glb.skinned(agent.mesh, agent.skin, actions))
+    about = {"agent": {"skinning_residual_mm": {"mean": 0.1}}}
+    (tmp_path / "simulator.json").write_text(json.dumps(about))
+    again = reading.agent(tmp_path, None, rate_hz)
+    for action in again.actions:
+        np.testing.assert_array_equal(action.time_s, np.arange(len(action.time_s)) / rate_hz)
+    usd.write(tmp_path, again, small_world.room())
+    stage = pxr.Stage.Open(str(tmp_path / "agent_walk.usdc"))
+    assert stage.GetTimeCodesPerSecond() == rate_hz and stage.GetEndTimeCode() == len(action.time_s) - 1
+    assert f"Frame Time: {1 / rate_hz:.8f}" in bvh.flat(
+        again.actions[0], list(agent.skin.bone_names), rate_hz
+    )
+
+
 def test_mjcf_compiles_and_moves(agent: reading.Agent, tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     occupancy = np.pad(np.ones((20, 1, 20), np.uint8), ((0, 0), (0, 5), (0, 0)))
@@ -219,7 +248,13 @@ def test_scientific_formats_round_trip(session: Motion, tmp_path: Path) -> None:
     assert neuro.write_movement(tmp_path, {"v002": session}).loss_mm["largest"] < 1e-6, "mm"
     assert neuro.write_nwb(tmp_path, {"v002": session}).loss_mm["largest"] < 1e-6, "mm"
     tables.write(tmp_path, {"v002": session})
-    assert len((tmp_path / "frames.csv").read_text().splitlines()) == 16
+    with open(tmp_path / "frames.csv", newline="") as file:
+        written = list(csv.DictReader(file))
+    assert len(written) == 15 and written[4]["x"] == "", "unknown"
+    seconds = [float(row["time_s"]) for row in written]
+    np.testing.assert_allclose(
+        seconds, session.timestamp_s, atol=1e-6, rtol=0, err_msg="also of long recordings"
+    )
 
 
 def test_extras_agree_with_the_locks_and_exclude_torch() -> None:
