@@ -71,6 +71,28 @@ def test_animals_perceive_each_other_as_in_python(home: Path, animals: Path, chr
         assert wrong == []
 
 
+def test_recordings_beside_are_those_of_the_selected_animal(
+    home: Path, take: Path, chromium: Browser
+) -> None:
+    listed = "[...document.querySelectorAll('#replay option')].map(({ value }) => value)"
+    document = json.loads((home / "simulator.json").read_bytes())
+    names = [clip["name"] for clip in document["animals"][1]["clips"]]
+    address = f"{(home / 'index.html').as_uri()}#replay={names[1]}&animal=dog"
+    with browser.shown(chromium, address, size=(1280, 720)) as (page, wrong):
+        assert page.evaluate(listed) == ["", *names]
+        assert page.evaluate("ats.state().replay.name") == names[1] == page.input_value("#replay")
+        page.set_input_files("#open-file", take / "dog/take.npz")
+        page.wait_for_function("ats.state().replay?.name === 'take'")
+        assert page.evaluate(listed) == ["", *names, "take"]
+        page.evaluate("ats.select('cat')")
+        assert page.evaluate(listed) == ["", *(clip["name"] for clip in document["animals"][0]["clips"])]
+        assert page.evaluate("ats.state().replay") is None and page.input_value("#replay") == ""
+        page.evaluate("ats.select('dog')")
+        assert page.evaluate(listed) == ["", *names, "take"]
+        page.select_option("#replay", "take")
+        assert page.evaluate("ats.state().replay.name") == "take" and wrong == []
+
+
 def test_plan_has_the_goal_of_the_intent(home: Path, chromium: Browser) -> None:
     with browser.shown(chromium, (home / "index.html").as_uri()) as (page, wrong):
         page.wait_for_function(ALL_PLAN, timeout=60_000)

@@ -11,6 +11,9 @@ export class Backdrop {
     this.renderer = renderer;
     this.still = new THREE.WebGLRenderTarget(1, 1, {
       type: THREE.HalfFloatType,
+      // pixel on pixel: interpolation would cost as much as all else that is drawn
+      minFilter: THREE.NearestFilter,
+      magFilter: THREE.NearestFilter,
       depthTexture: new THREE.DepthTexture(1, 1, THREE.UnsignedIntType),
     });
     const material = new THREE.ShaderMaterial({

@@ -48,7 +48,7 @@ class Simulator {
     this.residents = [];
     for (const [index, contract] of (this.contract.animals ?? [this.contract]).entries())
       this.residents.push(await Resident.open(this, contract, index));
-    const { state, ignored } = readState(this.contract, this.residents[0].clips.list);
+    const { state, ignored } = this.addressed;
     this.state = state;
     this.now = 0;
     this.appoint();
@@ -123,10 +123,23 @@ class Simulator {
     this.keep(written(take), `${this.fileName}.${ending}`);
   }
 
-  // Let the state say who is selected and what everybody does.
+  // What the address says.
+  get addressed() {
+    return readState(this.contract, (name) => this.resident(name).clips.list);
+  }
+
+  // The resident of a name, by default the first.
+  resident(name) {
+    return this.residents.find((resident) => resident.name === name) ?? this.residents[0];
+  }
+
+  // Let the state say who is selected and what everybody does. A clip of another animal ends.
   appoint() {
     const doings = readDoings(this.state.does, this.contract) ?? {};
-    this.selected = this.residents.find(({ name }) => name === this.state.animal) ?? this.residents[0];
+    this.selected = this.resident(this.state.animal);
+    const { list } = this.selected.clips;
+    if (!list.some(({ name }) => name === this.state.replay)) this.state.replay = '';
+    panel.showClips(list, this.state.replay);
     for (const resident of this.residents) {
       const does = doings[resident.name] ?? '';
       if (resident.timeline) resident.change(does);
@@ -198,7 +211,7 @@ class Simulator {
       ),
     );
     addEventListener('hashchange', () => {
-      const { state, ignored } = readState(this.contract, this.residents[0].clips.list);
+      const { state, ignored } = this.addressed;
       Object.assign(this.state, state);
       this.appoint();
       this.complain([...ignored, ...this.furnish()]);
@@ -425,8 +438,8 @@ class Simulator {
         file.name.replace(/\.npz$/, ''),
         await arrays(new Uint8Array(await file.arrayBuffer())),
       );
-      panel.addClip(clip);
       this.state.replay = clip.name;
+      panel.showClips(this.selected.clips.list, clip.name);
       this.panel.refresh();
       this.changed('replay');
     } catch (error) {

@@ -16,7 +16,7 @@ const TOOLS = {
 };
 
 export function buildPanel(state, contract, on) {
-  const { controls, clips = contract.animals[0].clips } = contract;
+  const { controls } = contract;
   const sync = [];
   const change = (key, value) => {
     state[key] = value;
@@ -59,7 +59,6 @@ export function buildPanel(state, contract, on) {
     at('seed').value = state.seed;
   });
 
-  for (const clip of clips) addClip(clip);
   at('open').addEventListener('click', () => at('open-file').click());
   at('open-file').addEventListener('change', (event) => {
     if (event.target.files.length) on.open(event.target.files[0]);
@@ -169,8 +168,12 @@ function residents(state, contract, change, employ) {
   });
 }
 
-export function addClip({ name, label = name }) {
-  at('replay').append(Object.assign(document.createElement('option'), { value: name, textContent: label }));
+// What can be replayed beside the selected animal: its own clips, and takes that were opened for it.
+export function showClips(clips, chosen) {
+  const option = ({ name: value, label: textContent = value }) =>
+    Object.assign(document.createElement('option'), { value, textContent });
+  at('replay').replaceChildren(option({ name: '', label: 'none' }), ...clips.map(option));
+  at('replay').value = chosen;
 }
 
 export function showPlaying(playing) {

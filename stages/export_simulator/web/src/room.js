@@ -18,8 +18,8 @@ import { Cutaway } from './cutaway.js';
 import { Steadiness } from './steadiness.js';
 
 const HEADROOM_M = 1.9; // what hangs higher above the floor is cut away, so that one can look in
-// drawn per pixel of the screen, most and least; wanted ms a frame, of which 1.15 times are tolerated: 15 a second
-const PIXELS = { software: [0.75, 0.3, 58], graphics: [2, 0.6, 28] };
+// drawn per pixel of the screen, most and least; wanted ms a frame, of which 1.15 times are tolerated: 19 a second
+const PIXELS = { software: [0.75, 0.3, 46], graphics: [2, 0.6, 28] };
 const WALL_M = 0.35; // a wall's thickness, with what leans on it
 const FOG_M = 0.5; // Gaussians nearer to the eye are hidden
 const FURTHEST_M = 14; // how far away the view may go

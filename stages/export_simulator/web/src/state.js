@@ -35,9 +35,12 @@ export function defaults({ controls: { interactivity, samples, steps }, animals 
   };
 }
 
-// The settings of an address, and what of it was ignored: {state, ignored: ['key=value', ...]}.
-export function readState(contract, clips, hash = location.hash) {
+// The settings of an address, and what of it was ignored: {state, ignored: ['key=value', ...]}. clipsOf: from the
+// name of an animal to its clips.
+export function readState(contract, clipsOf, hash = location.hash) {
   const state = defaults(contract);
+  const address = new URLSearchParams(hash.slice(1));
+  const clips = clipsOf(address.get('animal'));
   const { interactivity, samples, steps } = contract.controls;
   const number = (least, most) => (text) =>
     text !== '' && Number(text) >= least && Number(text) <= most ? Number(text) : null;
@@ -63,7 +66,7 @@ export function readState(contract, clips, hash = location.hash) {
     ...Object.fromEntries(SWITCHES.map((key) => [key, among([0, 1])])),
   };
   const ignored = [];
-  for (const [key, text] of new URLSearchParams(hash.slice(1))) {
+  for (const [key, text] of address) {
     const value = Object.hasOwn(read, key) ? (read[key](text) ?? null) : null;
     if (value === null) ignored.push(`${key}=${text}`);
     else state[key] = value;
