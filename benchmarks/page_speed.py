@@ -3,10 +3,11 @@
     python -m benchmarks.page_speed build/cat build/pair
 
 Opens the pages of builds (of one animal, or of a home of several) from disk in headless Chromium, with software rendering on a given number of cores. The
-first animal is the first frame that shows it; times are relative to the start of the navigation. Reports medians over
-several loads, each in a new browser. Needs Chromium, and a finished `simulator` or `home_simulator`.
+first animal is the first frame that shows it; times are relative to the start of the navigation. CPU time per frame
+can be compared on a busy machine too. Reports medians over several loads, each in a new browser. Needs Chromium, and a finished `simulator` or `home_simulator`.
 """
 
+import contextlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +36,8 @@ class PageLoad:
     frames_per_s: float
     pixel_ratio: float
     """rendered pixels per pixel of the window, after adaptation"""
+    cpu_ms: float
+    """CPU milliseconds of all processes of the browser per frame, plans included"""
 
 
 def main() -> None:
@@ -88,6 +91,7 @@ def measure(page: Path, size: tuple[int, int], seconds: float, openings: int) ->
         "first plan, s": medians["plan_s"],
         "frames per second": medians["frames_per_s"],
         "drawn pixels per pixel": medians["pixel_ratio"],
+        "CPU ms per frame": medians["cpu_ms"],
         "page, MB": (page.stat().st_size + assets) / 1e6,
     }
 
@@ -96,11 +100,27 @@ def load_page(file: Path, size: tuple[int, int], seconds: float) -> PageLoad:
     """Load a page in a new browser and count its frames once it plans."""
     with browser.opened(file, query="?mesh", size=size, timeout_s=300, every_frame=True) as (page, errors):
         page.wait_for_timeout(3000)  # the resolution adapts to the machine
+        begin_s = browser_cpu_s()
         frames, elapsed = count_frames(page, seconds)
+        cpu_ms = 1000 * (browser_cpu_s() - begin_s) / frames
         state = page.evaluate("ats.state()")
         assert errors == [], errors
         marks = state["marks_s"]
-        return PageLoad(marks["animal"], marks["plan"], frames / elapsed, state["pixelRatio"])
+        return PageLoad(marks["animal"], marks["plan"], frames / elapsed, state["pixelRatio"], cpu_ms)
+
+
+def browser_cpu_s() -> float:
+    """Return the CPU seconds of all processes that this one has started, and theirs; they all run (Linux)."""
+    ticks, parent = {}, {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # it has ended
+            fields = stat.read_text().rpartition(")")[2].split()
+            pid = int(stat.parent.name)
+            parent[pid], ticks[pid] = int(fields[1]), int(fields[11]) + int(fields[12])
+    own = {os.getpid()}
+    while more := {pid for pid, by in parent.items() if by in own} - own:
+        own |= more
+    return sum(ticks[pid] for pid in own - {os.getpid()}) / os.sysconf("SC_CLK_TCK")
 
 
 def count_frames(page: Page, seconds: float) -> tuple[int, float]:
