@@ -9,7 +9,7 @@ const {{ keys }} = JSON.parse(await new Response(process.stdin).text());
 const contract = {{ controls: {{ interactivity: {{ least: 0, most: 1, default: 1 }},
   samples: {{ choices: [1], default: 1 }}, steps: {{ choices: [4], default: 4 }} }}, scene: {{ bounds_m: [[-2, 0, -1], [2, 3, 1]] }} }};
 const answers = keys.map((key) => {{
-  const {{ state, ignored }} = readState(contract, [], `#${{key}}=1&seed=3`);
+  const {{ state, ignored }} = readState(contract, () => [], `#${{key}}=1&seed=3`);
   return Number(ignored.join() === `${{key}}=1` && state.seed === 3 && !Object.hasOwn(state, key)
     && Object.getPrototypeOf(state) === Object.prototype);
 }});
@@ -18,7 +18,7 @@ console.log(JSON.stringify(answers));
 ASKED = (
     READ.partition("const answers")[0]
     + """
-const asked = (key) => readState(contract, [], `#${key}`).ignored.length;
+const asked = (key) => readState(contract, () => [], `#${key}`).ignored.length;
 console.log(JSON.stringify(keys.map(asked)));
 """
 )
