@@ -4,7 +4,6 @@
 the pose. `pipeline.adapters.mujoco_animal`, `usd_animal` and `ros2_animal` are adapters of it.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,8 +50,8 @@ class LiveAnimal:
         frames = self.before, self.after
         tracks = np.stack([[each.world_from_agent, *each.agent_from_bone] for each in frames], axis=1)
         root, *bones = (rigid.interpolate(np.arange(2.0), track, share)[0] for track in tracks)
-        now = {"world_from_agent": root, "agent_from_bone": np.stack(bones)}
-        return replace(self.after, time_s=self.time_s, **now)
+        now = self.time_s, root, np.stack(bones)
+        return SimulatorState(*now, self.after.goal_world, self.after.blocked)
 
     def advance(self, seconds: float, observer_world: Float[np.ndarray, "3"]) -> SimulatorState:
         """Advance time with the observer's eyes at a position (world, meters) and return the new pose.

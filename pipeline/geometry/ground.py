@@ -56,9 +56,7 @@ def fit_ground(
 
 
 def lowest_level(height_m: Float[np.ndarray, "part"], area: Float[np.ndarray, "part"]) -> float:
-    """Return the height of a floor: of level surface (meters), with its area, the lowest level that has more
-    than a quarter of the area of the largest.
-    """
+    """Return the height of a floor, the lowest level with over a quarter of the largest's area; meters."""
     bins = np.arange(height_m.min() - BIN_M, height_m.max() + 2 * BIN_M, BIN_M)
     share, edges = np.histogram(height_m, bins, weights=area)
     lowest = edges[np.flatnonzero(share > LEVEL_SHARE * share.max())[0]] + BIN_M / 2
