@@ -22,7 +22,7 @@ from pipeline.behavior.model import bones_from_channels
 from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.support import SUPPORTED, floor_level
-from pipeline.behavior.trajectories import RATE_HZ, TRAIN, BehaviorData
+from pipeline.behavior.trajectories import RATE_HZ, BehaviorData
 from pipeline.core.errors import InputError
 from pipeline.data import npz
 from pipeline.environments.config import EnvironmentConfig
@@ -59,12 +59,10 @@ def with_holes(home: Path, holes: str, out: Path) -> Path:
     occupancy, features = volume.occupancy.copy(), volume.features.copy()
     unseen = (occupancy == 1) & hole[:, None] & (np.arange(occupancy.shape[1]) <= level)[:, None]
     occupancy[unseen], features[:, unseen] = 2, 0
-    learned = {data.videos[video] for video in np.unique(data.video[data.split == TRAIN])}
-    tracks = {name: data.trajectories[name] for name in data.videos if name in learned}
     out.mkdir()
     data.save(out)
     seen = replace(volume, occupancy=occupancy, features=features)
-    write_volumes(out, (seen,), tracks, data.videos, RATE_HZ)
+    write_volumes(out, (seen,), data.training, data.videos, RATE_HZ)
     return out
 
 

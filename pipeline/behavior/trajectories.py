@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Integer
+from jaxtyping import Bool, Float, Int
 
 from pipeline.core.errors import InputError
 from pipeline.data import npz
@@ -160,9 +160,11 @@ class BehaviorData:
     """index into ``videos``"""
     start: Int[np.ndarray, "window"]
     """first frame"""
-    split: Integer[np.ndarray, "window"]
-    """0 train, 1 test"""
+    tested: Bool[np.ndarray, "video"]
+    """whether a recording is held out for testing; the others are for training"""
     videos: tuple[str, ...]
+    stride: int = 1
+    """frames between the starts of training windows; test windows start at every frame"""
     future: int = FUTURE
     """predicted frames"""
     past: int = PAST
@@ -173,7 +175,9 @@ class BehaviorData:
     @classmethod
     def load(cls, folder: Path) -> "BehaviorData":
         """Read ``trajectories.npz`` and ``windows.npz``. Raises InputError ART-010 when damaged."""
-        tracks, windows = npz.load(folder / "trajectories.npz"), npz.load(folder / "windows.npz")
+        lists, lengths = ("video", "start", "tested", "videos"), ("stride", "future", "past", "rate_hz")
+        tracks = npz.load(folder / "trajectories.npz")
+        windows = npz.load(folder / "windows.npz", (*lists, *lengths))
         videos = tuple(str(video) for video in windows["videos"])
         names = ("timestamp_s", "world_from_agent", "agent_from_bone", "world_from_camera", "valid")
         trajectories = {
@@ -183,9 +187,9 @@ class BehaviorData:
             )
             for video in videos
         }
-        lists = windows["video"], windows["start"], windows["split"], videos
-        lengths = int(windows["future"]), int(windows["past"]), float(windows["rate_hz"])
-        return cls(trajectories, tracks["agent_from_bone_rest"], *lists, *lengths)
+        listed = windows["video"], windows["start"], windows["tested"], videos
+        counts = (windows[name].item() for name in lengths)
+        return cls(trajectories, tracks["agent_from_bone_rest"], *listed, *counts)
 
     def save(self, folder: Path) -> None:
         """Write ``trajectories.npz`` and ``windows.npz``."""
@@ -200,8 +204,9 @@ class BehaviorData:
             folder / "windows.npz",
             video=self.video,
             start=self.start,
-            split=self.split,
+            tested=self.tested,
             videos=np.array(self.videos, np.str_),
+            stride=np.array(self.stride, np.int64),
             future=np.array(self.future, np.int64),
             past=np.array(self.past, np.int64),
             rate_hz=np.array(self.rate_hz),
@@ -225,27 +230,33 @@ class BehaviorData:
         both = zip(self.video, self.start + current, strict=True)
         return np.array([roots[video][frame, :3, 3] for video, frame in both]).reshape(-1, 3)
 
+    @property
+    def split(self) -> Int[np.ndarray, "window"]:
+        """Split of each window, that of its recording: 0 train, 1 test."""
+        return np.where(self.tested, TEST, TRAIN)[self.video]
+
+    @property
+    def training(self) -> dict[str, Trajectory]:
+        """The recordings for training, also those too short for a window."""
+        names = (name for name, tested in zip(self.videos, self.tested, strict=True) if not tested)
+        return {name: self.trajectories[name] for name in names}
+
     def indices(self, split: int) -> Int[np.ndarray, "window"]:
         """Return the windows of one split."""
         return np.flatnonzero(self.split == split)
 
     def with_horizon(self, future: int) -> "BehaviorData":
-        """Return all valid windows of the same recordings with another horizon, in frames.
+        """Return the windows of the same recordings with another horizon, in frames."""
+        return self if future == self.future else replace(self, future=future).sliced()
 
-        Recordings without any window, whose split is unknown, stay without.
-        """
-        if future == self.future:
-            return self
-        split_of = dict(zip(self.video.tolist(), self.split.tolist(), strict=True))
-        valid = [
-            self.trajectories[name].valid & (number in split_of) for number, name in enumerate(self.videos)
-        ]
-        starts = [window_starts(frames, self.past + future) for frames in valid]
+    def sliced(self) -> "BehaviorData":
+        """Return the data with all valid windows of its lengths: training ones every `stride` frames."""
+        valid = (self.trajectories[name].valid for name in self.videos)
+        strides = np.where(self.tested, 1, self.stride).tolist()
+        both = zip(valid, strides, strict=True)
+        starts = [window_starts(frames, self.past + self.future, stride) for frames, stride in both]
         video = np.repeat(np.arange(len(starts)), [len(mine) for mine in starts]).astype(np.int32)
-        split = np.array([split_of[number] for number in video.tolist()], np.uint8)
-        return replace(
-            self, video=video, start=np.concatenate(starts).astype(np.int32), split=split, future=future
-        )
+        return replace(self, video=video, start=np.concatenate(starts).astype(np.int32))
 
     def windows(self, index: Int[np.ndarray, "window"], *, bones: bool = True) -> tuple[Context, Future]:
         """Return windows by index; without ``bones``, which take most of the memory, these are empty."""

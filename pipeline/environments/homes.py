@@ -83,7 +83,7 @@ def together(habitats: Sequence[Habitat]) -> Habitat:
         videos=tuple(videos),
         video=np.concatenate(windows),
         start=np.concatenate([part.start for part in parts]),
-        split=np.concatenate([part.split for part in parts]),
+        tested=np.concatenate([part.tested for part in parts]),
     )
     every = [habitat.scenes for habitat in habitats]
     joined = Scenes(

@@ -243,7 +243,7 @@ def place_starts(
         what = "has no free floor on which the animal can be set down, or all animals together"
         raise _unusable(what, Path("the other home"))
     number = np.arange(len(splits), dtype=np.int32)
-    windows = {"video": number, "start": np.zeros_like(number), "split": np.array(splits, np.uint8)}
+    windows = {"video": number, "start": np.zeros_like(number), "tested": np.array(splits) == TEST}
     return {
         name: replace(data[name], trajectories=mine, videos=tuple(mine), **windows)
         for name, mine in tracks.items()

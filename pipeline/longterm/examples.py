@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from pipeline.behavior.perception import world_from_ego
-from pipeline.behavior.trajectories import TRAIN, BehaviorData
+from pipeline.behavior.trajectories import BehaviorData
 from pipeline.geometry import rigid, subsampling
 from pipeline.geometry.signed_distance import SignedDistance
 from pipeline.longterm.bodies import PoseSpace, SkinnedBody, load_body
@@ -73,8 +73,7 @@ def reconstructed_split(reconstruction: Path, data: BehaviorData) -> DatasetSpli
     scene = MotionScene.reconstructed(reconstruction, data.trajectories.values())
     parts = tuple(part for _, part in found)
     dataset = MotionDataset(load_body(reconstruction), parts, (0,) * len(found), (scene,))
-    learned = {data.videos[video] for video in np.unique(data.video[data.split == TRAIN])}
-    return DatasetSplit.of(dataset, ["train" if video in learned else "test" for video, _ in found])
+    return DatasetSplit.of(dataset, ["train" if video in data.training else "test" for video, _ in found])
 
 
 STRIDE = 3

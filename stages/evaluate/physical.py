@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.baselines.predictors import Predictor
-from pipeline.behavior.trajectories import RATE_HZ, TEST, TRAIN, BehaviorData
+from pipeline.behavior.trajectories import RATE_HZ, TEST, BehaviorData
 from pipeline.geometry import rigid, subsampling
 from pipeline.longterm.bodies import load_body
 from pipeline.longterm.contacts import find_contact_vertices
@@ -35,8 +35,7 @@ NAMES = (
 def physical_metrics(data: BehaviorData, ours: Predictor, reconstruction: Path, *, seed: int) -> Metrics:
     """Score recorded motion and one plan of ours on some evenly spread test windows."""
     metrics, test = Metrics(), data.indices(TEST)
-    sessions = sorted({data.videos[video] for video in data.video[data.split == TRAIN]})
-    learned = [part for session in sessions for part in stretches(data.trajectories[session])]
+    learned = [part for trajectory in data.training.values() for part in stretches(trajectory)]
     if len(test) == 0 or not learned:
         metrics.skip(NAMES, "no test window, or no session that shows the animal for two seconds")
         return metrics

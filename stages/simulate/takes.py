@@ -11,7 +11,7 @@ from pipeline.baselines.samplers import load_playable
 from pipeline.behavior.config import PlanSamplingConfig, ReplanningConfig
 from pipeline.behavior.scenes import Scenes
 from pipeline.behavior.simulator import Simulator
-from pipeline.behavior.trajectories import TRAIN, BehaviorData, Trajectory
+from pipeline.behavior.trajectories import BehaviorData, Trajectory
 from pipeline.core import progress
 from pipeline.core.errors import InputError, other_versions_refused
 from pipeline.data import glb, ply
@@ -194,8 +194,7 @@ def through_subgoals(inputs: Inputs, written: list[Subgoal] | None, c: Config, d
         drawn = chained_goals(simulator, _observer(simulator, c), c.place_count, c.seed)
         subgoals = move_into_scene(drawn, world.scene, world.model.motion_prior)
     else:
-        videos = np.unique(data.video[data.split == TRAIN])
-        learned = [data.trajectories[data.videos[video]] for video in videos]
+        learned = data.training.values()
         been = np.concatenate([track.world_from_agent[track.valid, :3, 3] for track in learned])
         subgoals = sample_visited_subgoals(been, c.place_count + 1, rng)
     made = journeys.travel(world, subgoals, MotionOptimizationConfig() if c.optimize else None, rng)

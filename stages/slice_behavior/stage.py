@@ -66,8 +66,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, videos: tuple[Video, ...] 
         raise InputError("BEH-001", what, source.where, remedy)
     progress.log(f"{training} training windows, {len(data.start) - training} test windows")
     data.save(out)
-    training_tracks = {id: trajectory for id, trajectory in trajectories.items() if id not in test}
-    write_volumes(out, source.volumes, training_tracks, tuple(source.motions), config.rate_hz)
+    write_volumes(out, source.volumes, data.training, tuple(source.motions), config.rate_hz)
     qa.write(
         out,
         good="hundreds of windows, an animal that covers the room, and an observer at many distances",

@@ -10,16 +10,7 @@ from scipy.ndimage import binary_dilation
 from pipeline.behavior.path_encoding import REST_SPEED_M_S
 from pipeline.behavior.perception import FeatureVolume
 from pipeline.behavior.support import height_ranges, mark_supported, with_headroom
-from pipeline.behavior.trajectories import (
-    FUTURE,
-    PAST,
-    RATE_HZ,
-    TEST,
-    TRAIN,
-    BehaviorData,
-    Trajectory,
-    window_starts,
-)
+from pipeline.behavior.trajectories import FUTURE, PAST, RATE_HZ, BehaviorData, Trajectory
 from pipeline.data import npz
 from stages.slice_behavior.floor import with_filled_floor, with_level_floor
 
@@ -43,15 +34,10 @@ def slice_windows(
     """
     future = 4 * max(round(FUTURE / RATE_HZ * rate_hz / 4), 1)
     videos = tuple(sorted(trajectories))
-    starts = [window_starts(trajectories[v].valid, past + future, 1 if v in test else stride) for v in videos]
-    video = np.repeat(np.arange(len(videos)), [len(s) for s in starts]).astype(np.int32)
-    tested = np.array([v in test for v in videos])
-    split = np.where(tested[video], TEST, TRAIN).astype(np.uint8)
-    start = np.concatenate(starts).astype(np.int32)
+    tested, none = np.array([v in test for v in videos]), np.zeros(0, np.int32)
     tracks = {v: trajectories[v] for v in videos}
-    windows = {"video": video, "start": start, "split": split, "videos": videos}
-    lengths = {"future": future, "past": past, "rate_hz": rate_hz}
-    return BehaviorData(tracks, agent_from_bone_rest, **windows, **lengths)
+    lengths = stride, future, past, rate_hz
+    return BehaviorData(tracks, agent_from_bone_rest, none, none, tested, videos, *lengths).sliced()
 
 
 def allowed_voxels(

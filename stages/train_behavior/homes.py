@@ -54,7 +54,8 @@ def _training_windows(build: Path, own: BehaviorData) -> BehaviorData:
         data,
         trajectories={name: _at_rest(track, own) for name, track in data.trajectories.items()},
         agent_from_bone_rest=own.agent_from_bone_rest,
-        **{name: getattr(data, name)[some] for name in ("video", "start", "split")},
+        video=data.video[some],
+        start=data.start[some],
     )
 
 

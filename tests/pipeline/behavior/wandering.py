@@ -76,8 +76,8 @@ def wandering(seed: int = 0, videos: int = 3) -> BehaviorData:
     per_video = len(trajectories["v000"].timestamp_s) - PAST - FUTURE + 1
     video = np.repeat(np.arange(videos), per_video).astype(np.int32)
     start = np.tile(np.arange(per_video), videos).astype(np.int32)
-    split = (video == videos - 1).astype(np.uint8)
-    return BehaviorData(trajectories, REST.astype(np.float32), video, start, split, tuple(trajectories))
+    tested = np.arange(videos) == videos - 1
+    return BehaviorData(trajectories, REST.astype(np.float32), video, start, tested, tuple(trajectories))
 
 
 def scaling() -> Scaling:

@@ -36,7 +36,7 @@ def test_behavior_is_evaluated_on_another_device(tmp_path):
     Metrics().write(metrics, "metrics.json")
     small_world.write_surfaces(reconstruction)
     tracks = {f"v{2 + k:03d}": small_world.trajectory(70, k) for k in range(2)}
-    one_each = np.arange(2, dtype=np.int32), np.zeros(2, np.int32), np.array([0, 1], np.uint8)
+    one_each = np.arange(2, dtype=np.int32), np.zeros(2, np.int32), np.array([False, True])
     BehaviorData(tracks, small_world.rest(), *one_each, tuple(tracks)).save(data)
     write_volume(data / "volume.npz", wandering.room())
     torch.manual_seed(0)

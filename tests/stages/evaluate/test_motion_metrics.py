@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.baselines.predictors import Samples
-from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, Context, Future
+from pipeline.behavior.trajectories import TEST, BehaviorData, Context, Future
 from pipeline.metrics import bars
 from stages.evaluate import physical
 from tests.stages.export_simulator import small_world
@@ -31,14 +31,7 @@ def test_body_below_the_floor_penetrates(tmp_path: Path) -> None:
     small_world.write_surfaces(tmp_path)
     tracks = {f"v{2 + k:03d}": small_world.trajectory(120, k) for k in range(2)}
     starts, videos = np.array([0, 20, 0, 20], np.int32), np.array([0, 0, 1, 1], np.int32)
-    data = BehaviorData(
-        tracks,
-        small_world.rest(),
-        videos,
-        starts,
-        np.array([TRAIN, TRAIN, TEST, TEST], np.uint8),
-        tuple(tracks),
-    )
+    data = BehaviorData(tracks, small_world.rest(), videos, starts, np.array([False, True]), tuple(tracks))
     sunk = Sunk(data.windows(data.indices(TEST))[1], 0.1)
     values = physical.physical_metrics(data, sunk, tmp_path, seed=0).values
     assert set(values) == set(physical.NAMES) and values["behavior/physical_windows"] == 2
@@ -51,9 +44,7 @@ def test_body_below_the_floor_penetrates(tmp_path: Path) -> None:
         < 0.95
         < values["behavior/recorded/non_collision_share"]
     )
-    nobody = BehaviorData(
-        tracks, small_world.rest(), videos, starts, np.full(4, TRAIN, np.uint8), tuple(tracks)
-    )
+    nobody = BehaviorData(tracks, small_world.rest(), videos, starts, np.zeros(2, bool), tuple(tracks))
     assert set(physical.physical_metrics(nobody, sunk, tmp_path, seed=0).values.values()) == {None}
 
 
@@ -66,8 +57,8 @@ def test_plans_without_a_foot_on_the_ground_fail(tmp_path: Path) -> None:
         for number, walk in enumerate(walks)
     }
     starts, videos = np.array([0, 20, 0, 20], np.int32), np.array([0, 0, 1, 1], np.int32)
-    split = np.array([TRAIN, TRAIN, TEST, TEST], np.uint8)
-    data = BehaviorData(tracks, small_world.rest(), videos, starts, split, tuple(tracks))
+    tested = np.array([False, True])
+    data = BehaviorData(tracks, small_world.rest(), videos, starts, tested, tuple(tracks))
     future = data.windows(data.indices(TEST))[1]
     found = {
         depth_m: physical.physical_metrics(data, Sunk(future, depth_m), tmp_path, seed=0)

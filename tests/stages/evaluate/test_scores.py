@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.baselines.predictors import Samples
-from pipeline.behavior.trajectories import TEST, TRAIN, BehaviorData, Future, Trajectory
+from pipeline.behavior.trajectories import TEST, BehaviorData, Future, Trajectory
 from pipeline.fields.skinning import SkinnedShape
 from pipeline.geometry import rigid
 from pipeline.geometry.meshes import Mesh, RayCaster
@@ -183,13 +183,12 @@ def data():
     trajectories = {"a": wandering(200, 0), "b": wandering(160, 1)}
     starts = {"a": np.arange(0, 136, 4), "b": np.arange(97)}
     video = np.concatenate([np.full(len(start), i) for i, start in enumerate(starts.values())])
-    split = np.where(video == 0, TRAIN, TEST)
     return BehaviorData(
         trajectories,
         np.tile(np.eye(4), (3, 1, 1)),
         video,
         np.concatenate(list(starts.values())),
-        split,
+        np.array([False, True]),
         ("a", "b"),
     )
 
@@ -260,12 +259,7 @@ def test_chunked_evaluation_gives_the_same_scores(data, monkeypatch):
 
 def test_behavior_without_test_video_is_skipped(data):
     alone = BehaviorData(
-        data.trajectories,
-        data.agent_from_bone_rest,
-        data.video,
-        data.start,
-        np.full(len(data.start), TRAIN),
-        data.videos,
+        data.trajectories, data.agent_from_bone_rest, data.video, data.start, np.zeros(2, bool), data.videos
     )
     metrics = behavior.behavior_metrics(alone, Oracle(data), PROTOCOL)
     assert metrics.values["behavior/ats/goal_minde_m"] is None

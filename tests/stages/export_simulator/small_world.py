@@ -222,7 +222,7 @@ def write(build: Path, *, accompanied: bool = False, paper: bool = False) -> Non
     tracks = {f"v{2 + k:03d}": trajectory(120, k) for k in range(2)}
     zeros = np.zeros(2, np.int32)
     BehaviorData(
-        tracks, rest(), np.arange(2, dtype=np.int32), zeros, np.array([0, 1], np.uint8), tuple(tracks)
+        tracks, rest(), np.arange(2, dtype=np.int32), zeros, np.array([False, True]), tuple(tracks)
     ).save(build / "behavior_data")
     rng = np.random.default_rng(0)
     shape = (44, 24, 44)

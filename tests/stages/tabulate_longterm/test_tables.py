@@ -149,9 +149,10 @@ def test_samples_of_training_windows_are_never_measured(source, monkeypatch, tmp
         return np.ones((len(windows), 2, 4))
 
     monkeypatch.setattr(samples, "rows", rows)
-    for split, count in ((data.split, SMALL.samples), (0 * data.split, 0)):
+    for tested, count in ((data.tested, SMALL.samples), (data.tested & False, 0)):
         chosen.clear()
-        recorded = replace(source, data=replace(data, split=split))
+        recorded = replace(source, data=replace(data, tested=tested))
+        split = recorded.data.split
         found = samples.figures(recorded, tmp_path, tmp_path, SMALL, "cpu")
         assert found.get("longterm_samples/windows", 0) == min(count, (split == 1).sum()) == len(chosen)
         assert (split[chosen] == 1).all()

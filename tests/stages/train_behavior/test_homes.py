@@ -62,7 +62,7 @@ def test_training_windows_of_both_homes_and_test_windows_of_its_own(learned):
 def test_homes_are_sampled_with_equal_probability(learned):
     data = learned.data
     few = np.concatenate([data.indices(TRAIN)[:5], data.indices(TRAIN)[len(data.indices(TRAIN)) // 2 :]])
-    some = replace(data, **{name: getattr(data, name)[few] for name in ("video", "start", "split")})
+    some = replace(data, **{name: getattr(data, name)[few] for name in ("video", "start")})
     drawn = windows_of_all(replace(learned, data=some))
     home = learned.home_of_video[some.video[drawn]]
     assert (home == 0).sum() == (home == 1).sum() == len(few) - 5
@@ -74,7 +74,7 @@ def test_windows_of_a_smaller_home_are_repeated_evenly(learned):
     train = data.indices(TRAIN)
     own = train[learned.home_of_window[train] == 0]
     few = np.concatenate([own[: round(0.6 * len(own))], train[learned.home_of_window[train] == 1]])
-    some = replace(data, **{name: getattr(data, name)[few] for name in ("video", "start", "split")})
+    some = replace(data, **{name: getattr(data, name)[few] for name in ("video", "start")})
     count = np.bincount(windows_of_all(replace(learned, data=some)))[: round(0.6 * len(own))]
     halves = [half.mean() for half in np.array_split(count, 2)]
     assert set(count) == {1, 2}
