@@ -132,6 +132,8 @@ def _write_key(plan: Plan, code: sources.Cache, name: str, trial: str | None) ->
             for v in jobs.deciding_videos(plan, node)
         ],
     }
+    if files := sources.named_files(table):
+        key["files"] = files
     if plan.home.animal:
         key["animal"] = plan.home.animal
     _write(plan.home.plan / f"keys/{name}.json", _json(key))
@@ -263,8 +265,9 @@ def _json(value: Any) -> str:
 
 def _input_fingerprint(home: Home, code: sources.Cache) -> str:
     """Hash names, sizes and times of all files that a plan depends on."""
-    recipe = Path("agents", f"{home.agent}.toml")
-    own = [sources.stat_fingerprint(recipe)] if recipe.is_file() else []
+    paths = Path("agents", f"{home.agent}.toml"), Path("agents", "variants", f"{home.variant}.toml")
+    read = [path for path in paths if path.is_file()]
+    own = [[sources.stat_fingerprint(path), sources.named_files(recipes.read(path)[0])] for path in read]
     folders = ("agents/variants", f"captures/{home.agent}")
     return artifact.digest_of([code.fingerprint, own, *map(sources.folder_fingerprint, folders)])
 

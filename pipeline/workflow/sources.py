@@ -87,6 +87,17 @@ def stat_fingerprint(path: Path) -> list[int]:
     return [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns]
 
 
+def named_files(value: Any) -> dict[str, list[int]]:
+    """Return size and modification time of every file that a recipe names, below folders too: checkpoints."""
+    if isinstance(value, (dict, list)):
+        parts = value.values() if isinstance(value, dict) else value
+        return {path: mark for part in parts for path, mark in named_files(part).items()}
+    if not isinstance(value, str) or not os.path.exists(value):
+        return {}
+    files = _files_of(Path(value)) if os.path.isdir(value) else [Path(value)]
+    return {str(file): stat_fingerprint(file)[:2] for file in files}
+
+
 def folder_fingerprint(folder: str, *, follow: bool = True) -> list[list[Any]]:
     """Return path, size and times of all files below `folder`; folder links are followed at the top only."""
     found: list[list[Any]] = []

@@ -44,6 +44,7 @@ from dataclasses import dataclass
 @dataclass(frozen=True)
 class Config:
     seed: int = 0
+    weights: str = ""
     pause_s: float = 0.0
     fail: bool = False
 {settings}'''

@@ -453,6 +453,20 @@ def test_clicks_are_an_input_of_reconstruction_metrics_only(small_checkout):
     assert "extra.clicks.json" in str(jobs["reconstruction_metrics"]["keys"])
 
 
+def test_changed_files_that_the_recipe_names_are_detected(small_checkout):
+    small_checkout.record(*RECORDED)
+    small_checkout.write("models/dinov2/model.safetensors", "weights")
+    small_checkout.write("agents/toy.toml", '[fit_feature_basis]\nweights = "models/dinov2"\n')
+    small_checkout.plan()
+    before = key_files(small_checkout)
+    assert changed_keys(small_checkout, before) == set()
+    small_checkout.write("models/dinov2/model.safetensors", "further weights")
+    assert changed_keys(small_checkout, before) == {"feature_basis.json"}
+    before = key_files(small_checkout)
+    small_checkout.write("models/dinov2/config.json", "{}")
+    assert changed_keys(small_checkout, before) == {"feature_basis.json"}
+
+
 def test_earlier_reconstruction_is_an_input_except_for_variants(small_checkout):
     small_checkout.record(*RECORDED)
     small_checkout.write("captures/toy/former/motion.npz", "unfinished")
