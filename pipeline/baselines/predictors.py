@@ -178,7 +178,7 @@ class Ats:
     @property
     def corrected(self) -> bool:
         """Whether goals and paths are moved to where the animal may be."""
-        return self.sampler.corrections and self.sampling.avoid_solid and self.sampling.scene
+        return self.sampler.avoids_solid(self.sampling)
 
     def goals(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw goals only, at a hundredth of the cost of plans."""

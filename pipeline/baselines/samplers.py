@@ -12,7 +12,7 @@ from typing import assert_never
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.behavior.config import Ego
+from pipeline.behavior.config import Ego, PlanSamplingConfig
 from pipeline.behavior.diffusion import Schedule
 from pipeline.behavior.model import Architecture, Scaling, load
 from pipeline.behavior.path_encoding import PATH_CHANNELS_OF
@@ -130,6 +130,16 @@ class GaussianSampler(Sampler):
 class OneStageSampler(Sampler):
     """Samples path and body together; the goal is the end of the path."""
 
+    def guidance(self, sampling: PlanSamplingConfig) -> tuple[float | Array, ...]:
+        """Return scales per channel: as in our plans, bodies are guided by at most 1."""
+        both = zip(super().guidance(sampling), super().guidance(sampling.for_bodies()), strict=True)
+        return tuple(np.repeat(each, self._channels)[:, None] for each in both)
+
+    @property
+    def _channels(self) -> tuple[int, int]:
+        """Channels of path and body."""
+        return PATH_CHANNELS_OF[self.scaling.encoding], len(self.scaling.body_mean)
+
     def draw_plans(
         self, codes: PlanCondition, rng: np.random.Generator, goal: Array | None, path: Array | None
     ) -> SampledPlan:
@@ -157,7 +167,7 @@ class OneStageSampler(Sampler):
         return codes.constrained(path, self.scaling.rate_hz)
 
     def _sequence(self, codes: PlanCondition, rng: np.random.Generator) -> Array:
-        frames, lead = self.scaling.path_std.shape[1], PATH_CHANNELS_OF[self.scaling.encoding]
+        frames, (lead, body) = self.scaling.path_std.shape[1], self._channels
         control = np.zeros((len(codes.full), 3, frames), np.float32)
 
         def denoise(code: Array):
@@ -169,7 +179,6 @@ class OneStageSampler(Sampler):
             path = self.paths_out_of_solid(codes, x[:, :lead])
             return np.concatenate([path, x[:, lead:]], axis=1)
 
-        body = len(self.scaling.body_mean)
         shape = len(codes.full), lead + body, frames
         denoisers = [denoise(code) for code in (codes.full, *codes.references)]
         solver, steps = self.of_sequences(codes.sampling)

@@ -191,6 +191,20 @@ class Sampler:
     corrections: bool = True
     """whether plans are corrected after the networks; else only the networks are sampled"""
 
+    def avoids_solid(self, sampling: PlanSamplingConfig) -> bool:
+        """Return whether goals and paths are kept out of solids, and on supports."""
+        return self.corrections and sampling.avoid_solid and sampling.scene
+
+    def guidance(self, sampling: PlanSamplingConfig) -> tuple[float | Array, ...]:
+        """Return the scales of `guided`, equal for all channels or one per channel (``[channel 1]``): of the
+        observer, and of all companions or of each, that is without the observer
+        e + sum over companions of (scale - 1) (e - e without that one), in any order.
+        """
+        scales = sampling.companions_guidance
+        if not isinstance(scales, tuple):
+            return sampling.guidance, scales
+        return (sampling.guidance, *(1 + sum(scales[k:]) - len(scales[k:]) for k in range(len(scales))))
+
     def plan(
         self,
         observation: Observation,
@@ -238,7 +252,7 @@ class Sampler:
             references.append(code(observation))
         past = observation.past.reshape(len(observation), -1, POSITION + len(self.scaling.body_mean))
         start = np.repeat(past[:, -1, :3], count, axis=0)
-        constraint = observation.constraint if sampling.avoid_solid and sampling.scene else None
+        constraint = observation.constraint if self.avoids_solid(sampling) else None
         return PlanCondition(full, tuple(references), start, sampling, constraint, count)
 
     def goals(self, codes: PlanCondition, rng: np.random.Generator) -> Float[np.ndarray, "plan 3"]:
@@ -347,20 +361,10 @@ class Sampler:
         def draw() -> Array:
             return (noise_std * rng.standard_normal(shape, dtype=np.float32)).astype(np.float32)
 
-        denoise = guided(denoisers, guidance_of(sampling))
+        denoise = guided(denoisers, self.guidance(sampling))
         method = sampling.method or self.schedule.method
         x = sample(denoise, draw(), self.schedule, method=method, count=count, draw=draw, correct=correct)
         return x.astype(np.float32)
-
-
-def guidance_of(sampling: PlanSamplingConfig) -> tuple[float, ...]:
-    """Return the scales of `guided`: of the observer, and of all companions or of each, that is without the
-    observer e + sum over companions of (scale - 1) (e - e without that one), in any order.
-    """
-    scales = sampling.companions_guidance
-    if not isinstance(scales, tuple):
-        return sampling.guidance, scales
-    return (sampling.guidance, *(1 + sum(scales[k:]) - len(scales[k:]) for k in range(len(scales))))
 
 
 def filled(shape: int | tuple[int, int], value: float) -> Array:

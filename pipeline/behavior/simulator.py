@@ -297,7 +297,7 @@ class AnimalBatch:
         self, path_world: Float[np.ndarray, "some frame 3"], some: Int[np.ndarray, "some"]
     ) -> Float[np.ndarray, "some frame 3"]:
         """Move paths to where the animals may be, if plans are corrected: detours and blends cut corners."""
-        if not (self.sampler.corrections and self.sampling.avoid_solid and self.sampling.scene):
+        if not self.sampler.avoids_solid(self.sampling):
             return path_world
         return self.scenes.out_of_solid(path_world, None if self.video is None else self.video[some])
 

@@ -84,6 +84,8 @@ def test_guidance_is_linear_in_its_scale():
     assert blend(0.0, 0) == 2.0
     assert guided((lambda x, t: 3.0, lambda x, t: 1.0), (1.0,))(0.0, 0) == 3.0
     assert guided((lambda x, t: 3.0, lambda x, t: 1.0), (0.0,))(0.0, 0) == 1.0
+    each = guided((lambda x, t: x + 3, lambda x, t: x + 1), (np.array([0.5, 1.0]),))
+    np.testing.assert_allclose(each(np.zeros(2), 0), [2.0, 3.0])
 
 
 def test_control_affects_every_block_and_can_be_dropped():

@@ -10,6 +10,7 @@ from pipeline.baselines.predictors import Ats
 from pipeline.behavior.config import PlanSamplingConfig
 from pipeline.behavior.diffusion import STANDARD
 from pipeline.behavior.model import BehaviorNets, Scaling, channels_from_bones
+from pipeline.behavior.path_encoding import PATH_CHANNELS
 from pipeline.behavior.perception import world_from_ego
 from pipeline.behavior.planning import Observation, Sampler, TorchNetworks
 from pipeline.behavior.scenes import Scenes
@@ -64,6 +65,17 @@ def test_oracle_has_no_error():
     samples = protocols.fed_with_truth(ats, context, future, 4, np.random.default_rng(0))
     for name in protocols.PLAN_SCORES:
         np.testing.assert_allclose(protocols.SCORES[name](samples, future), 0, atol=2e-3, err_msg=name)
+
+
+def test_bodies_of_one_stage_are_guided_as_ours():
+    sampling = PlanSamplingConfig(guidance=1.75, companions_guidance=(0.5, 1.5))
+    ours, one_stage = (
+        untrained(replace(ARCHITECTURE, family=family)).sampler for family in ("diffusion", "one_stage")
+    )
+    levels = ours.guidance(sampling), ours.guidance(sampling.for_bodies())
+    for whole, path, body in zip(one_stage.guidance(sampling), *levels, strict=True):
+        assert set(whole[:PATH_CHANNELS, 0]) == {path} and set(whole[PATH_CHANNELS:, 0]) == {body}
+        assert len(whole) == PATH_CHANNELS + ARCHITECTURE.body_channels
 
 
 @pytest.mark.parametrize(
