@@ -22,7 +22,7 @@ from pipeline.behavior.trajectories import RATE_HZ, anticipated_frames
 from pipeline.environments.homes import Habitat
 from pipeline.geometry import rigid, rigid_torch
 from stages.train_behavior.config import AugmentationConfig
-from stages.train_behavior.homes import windows_of_all
+from stages.train_behavior.homes import evenly_repeated, windows_of_all
 from stages.train_behavior.scene_sampler import SceneSampler
 
 YAW_JITTER_RAD = 0.3
@@ -178,9 +178,8 @@ def approached(
     bins = (distance[approaching] / BIN_M).astype(int)
     most = np.bincount(bins).max(initial=0)
     parts = [approaching[bins == number] for number in np.unique(bins)]
-    return np.concatenate(
-        [approaching[:0], *(np.resize(part, min(most, MAX_REPEATS * len(part))) for part in parts)]
-    )
+    counts = [min(most, MAX_REPEATS * len(part)) for part in parts]
+    return np.concatenate([approaching[:0], *map(evenly_repeated, parts, counts)])
 
 
 def largest_turn_rad(augmentation: AugmentationConfig) -> float:

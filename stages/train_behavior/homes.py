@@ -22,7 +22,12 @@ def windows_of_all(homes: Habitat) -> Int[np.ndarray, "window"]:
     index = homes.data.indices(TRAIN)
     each = [index[homes.home_of_window[index] == number] for number in range(homes.home_of_video.max() + 1)]
     most = max(len(mine) for mine in each)
-    return np.concatenate([mine[np.arange(most) * len(mine) // most] for mine in each if len(mine)])
+    return np.concatenate([evenly_repeated(mine, most) for mine in each if len(mine)])
+
+
+def evenly_repeated(some: Int[np.ndarray, "some"], count: int) -> Int[np.ndarray, "count"]:
+    """Repeat windows to ``count``: early and late ones alike."""
+    return some[np.arange(count) * len(some) // count]
 
 
 def with_other_homes(

@@ -218,7 +218,7 @@ def test_where_observers_will_be_is_turned_like_the_rest_and_known_in_some_sampl
     for augmentation in (replace(PLAIN, turn=1.0), replace(PLAIN, mirror=1.0)):
         batch, _ = drawn(windows, augmentation)
         distance = batch.others[:, 0, PAST:, :3].norm(dim=-1)
-        assert torch.cdist(distance, recorded).min(dim=1).values.max() < 1e-3
+        assert (distance[:, None] - recorded).norm(dim=-1).min(dim=1).values.max() < 1e-3
         for share, bounds in ((0.0, (0, 0)), (0.5, (1, 15)), (1.0, (16, 16))):
             some = partly_foreseen(nets, batch, share, torch.Generator().manual_seed(0)).others
             known = (some[:, 0, PAST:, 0] < ABSENT_M).all(1)
@@ -275,6 +275,14 @@ def test_approaches_are_balanced_over_distances():
     observer = walk + distance[:, None, None] * [0.0, 0.0, 1.0]
     asked = distance[approached(np.zeros((25, 3)), observer)]
     assert [(asked == near).sum() for near in (0.5, 1.5, 2.1)] == [20, 20, MAX_REPEATS]
+
+
+def test_approaches_are_repeated_evenly():
+    walk = np.linspace(1, 0, 8)[:, None] * [0.0, 0.0, 0.7]
+    distance = np.r_[np.full(15, 0.5), np.full(10, 1.5)]
+    observer = walk + distance[:, None, None] * [0.0, 0.0, 1.0]
+    count = np.bincount(approached(np.zeros((25, 3)), observer))[15:]
+    assert count.sum() == 15 and count[:5].sum() in (7, 8), "early windows are not drawn more often"
 
 
 def test_past_augmentation_changes_only_the_past(windows):
