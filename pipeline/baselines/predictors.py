@@ -4,6 +4,7 @@
 noise fitted to the training windows.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, Self
@@ -16,7 +17,7 @@ from pipeline.behavior import model as behavior
 from pipeline.behavior.config import Ego, PlanSamplingConfig
 from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
 from pipeline.behavior.perception import world_from_ego
-from pipeline.behavior.planning import Observation, Sampler, TorchNetworks, observe
+from pipeline.behavior.planning import Observation, SampledPlan, Sampler, TorchNetworks, observe
 from pipeline.behavior.scenes import SceneConstraint, Scenes
 from pipeline.behavior.trajectories import Context, Future
 from pipeline.geometry import rigid
@@ -159,26 +160,23 @@ class Ats:
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw ``count`` plans for each window."""
-        parts = []
-        for chunk in _chunks(context):
-            plan = self.sampler.plan(self.observe(chunk), self.sampling, rng, count=count)
-            frame = np.repeat(world_from_ego(chunk.world_from_agent[:, -1], self.ego), count, axis=0)
-            root = plan.world_from_agent(frame)
-            bones = bones_from_channels(plan.body[..., ROOT_CHANNELS:], self.agent_from_bone_rest)
-            goal = rigid.apply(frame, plan.goal[:, None])[:, 0]
-            rows = goal, root[..., :3, 3], root[..., :3, :3], bones.astype(np.float32)
-            parts.append([part.reshape(len(chunk), count, *part.shape[1:]) for part in rows])
-        return Samples(*map(np.concatenate, zip(*parts, strict=True)))
+        seen = ((chunk, self.observe(chunk)) for chunk in _chunks(context))
+        plans = ((chunk, self.sampler.plan(each, self.sampling, rng, count=count)) for chunk, each in seen)
+        return joined([self.in_world(plan, chunk) for chunk, plan in plans])
+
+    def in_world(self, plan: SampledPlan, context: Context) -> Samples:
+        """Return plans of these windows, equally many of each, in the world frame."""
+        count = len(plan.goal) // len(context)
+        frame = np.repeat(world_from_ego(context.world_from_agent[:, -1], self.ego), count, axis=0)
+        root, goal = plan.world_from_agent(frame), rigid.apply(frame, plan.goal[:, None])[:, 0]
+        bones = bones_from_channels(plan.body[..., ROOT_CHANNELS:], self.agent_from_bone_rest)
+        rows = goal, root[..., :3, 3], root[..., :3, :3], bones.astype(np.float32)
+        return Samples(*(part.reshape(len(context), count, *part.shape[1:]) for part in rows))
 
     @property
     def future(self) -> int:
         """Number of predicted frames."""
         return self.sampler.scaling.path_std.shape[1]
-
-    @property
-    def corrected(self) -> bool:
-        """Whether goals and paths are moved to where the animal may be."""
-        return self.sampler.avoids_solid(self.sampling)
 
     def goals(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw goals only, at a hundredth of the cost of plans."""
@@ -208,6 +206,11 @@ class Ats:
     def observe(self, context: Context) -> Observation:
         """Return what the model perceives in each window."""
         return observe(context, self.scenes, self.agent_from_bone_rest, self.ego)
+
+
+def joined(parts: Sequence[Samples]) -> Samples:
+    """Join the samples of consecutive windows."""
+    return Samples(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 def _chunks(context: Context, at_once: int = WINDOWS_AT_ONCE) -> list[Context]:

@@ -5,6 +5,7 @@
 are denoised as one sequence without a goal (Tevet et al. 2022). `sampler_of` chooses by the architecture.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import assert_never
@@ -93,32 +94,25 @@ class GaussianSampler(Sampler):
         self, codes: PlanCondition, path: Float[np.ndarray, "plan frame 3"], rng: np.random.Generator
     ) -> Float[np.ndarray, "plan frame channel"]:
         """Draw bodies along paths, meters and radians, ego frame."""
-        control = self.scaling.scaled_path(path)
-        zeros = np.zeros((len(path), len(self.scaling.body_mean), path.shape[1]), np.float32)
-        outputs = [
-            self.networks.body(
-                zeros, filled(len(zeros), t), codes.full, control, filled((len(zeros), 1), 1.0)
-            )
-            for t in (MEAN_STEP, LOG_STD_STEP)
-        ]
+        shape = len(path), len(self.scaling.body_mean), path.shape[1]
+        control = self.scaling.scaled_path(path), filled((len(path), 1), 1.0)
+        outputs = self._outputs(self.networks.body, shape, codes.full, *control)
         scaled = np.swapaxes(self._sample_gaussian(outputs, rng), 1, 2)
         return scaled * self.scaling.body_std + self.scaling.body_mean
 
     def _goal(self, codes: PlanCondition) -> list[Array]:
-        zeros = np.zeros((len(codes.full), 3), np.float32)
-        return [
-            self.networks.goal(zeros, filled(len(zeros), t), codes.full) for t in (MEAN_STEP, LOG_STD_STEP)
-        ]
+        return self._outputs(self.networks.goal, (len(codes.full), 3), codes.full)
 
     def _path(self, codes: PlanCondition, goal: Float[np.ndarray, "plan 3"]) -> list[Array]:
-        control = self.scaling.scaled_goal(goal)
-        channels, frames = PATH_CHANNELS_OF[self.scaling.encoding], self.scaling.path_std.shape[1]
-        zeros = np.zeros((len(goal), channels, frames), np.float32)
-        keep = filled((len(zeros), 1), float(codes.sampling.goal))
-        return [
-            self.networks.path(zeros, filled(len(zeros), t), codes.full, control, keep)
-            for t in (MEAN_STEP, LOG_STD_STEP)
-        ]
+        shape = len(goal), PATH_CHANNELS_OF[self.scaling.encoding], self.scaling.path_std.shape[1]
+        control = self.scaling.scaled_goal(goal), filled((len(goal), 1), float(codes.sampling.goal))
+        return self._outputs(self.networks.path, shape, codes.full, *control)
+
+    def _outputs(
+        self, network: Callable[..., Array], shape: tuple[int, ...], *conditions: Array
+    ) -> list[Array]:
+        zeros = np.zeros(shape, np.float32)
+        return [network(zeros, filled(len(zeros), t), *conditions) for t in (MEAN_STEP, LOG_STD_STEP)]
 
     def _sample_gaussian(self, outputs: list[Array], rng: np.random.Generator) -> Array:
         mean, log_std = outputs
@@ -170,17 +164,13 @@ class OneStageSampler(Sampler):
         frames, (lead, body) = self.scaling.path_std.shape[1], self._channels
         control = np.zeros((len(codes.full), 3, frames), np.float32)
 
-        def denoise(code: Array):
-            return lambda x, t: self.networks.body(
-                x, filled(len(x), t), code, control, filled((len(x), 1), 0.0)
-            )
-
         def correct(x: Array) -> Array:
             path = self.paths_out_of_solid(codes, x[:, :lead])
             return np.concatenate([path, x[:, lead:]], axis=1)
 
         shape = len(codes.full), lead + body, frames
-        denoisers = [denoise(code) for code in (codes.full, *codes.references)]
+        codes_all = codes.full, *codes.references
+        denoisers = [self.denoiser(self.networks.body, code, control, 0.0) for code in codes_all]
         solver, steps = self.of_sequences(codes.sampling)
         stds = solver.path_noise_std, solver.body_noise_std
         noise_std = np.repeat(stds, (lead, body))[:, None]

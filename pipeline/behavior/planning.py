@@ -196,9 +196,8 @@ class Sampler:
         return self.corrections and sampling.avoid_solid and sampling.scene
 
     def guidance(self, sampling: PlanSamplingConfig) -> tuple[float | Array, ...]:
-        """Return the scales of `guided`, equal for all channels or one per channel (``[channel 1]``): of the
-        observer, and of all companions or of each, that is without the observer
-        e + sum over companions of (scale - 1) (e - e without that one), in any order.
+        """Return the scales of `guided`, for all channels or each: of the observer, and of all companions or
+        of each, that is without the observer e + sum over companions of (scale - 1) (e - e without that one).
         """
         scales = sampling.companions_guidance
         if not isinstance(scales, tuple):
@@ -286,13 +285,8 @@ class Sampler:
     ) -> Float[np.ndarray, "plan frame 3"]:
         """Draw a path to each goal (Eq. 9) with guidance; meters, ego frame."""
         control = self.scaling.scaled_goal(goal)
-
-        def denoise(code: Array, keep: float = 0.0) -> Denoise:
-            return lambda x, t: self.networks.path(
-                x, filled(len(x), t), code, control, filled((len(x), 1), keep)
-            )
-
-        denoisers = [denoise(codes.full, float(codes.sampling.goal)), *map(denoise, codes.references)]
+        every = [(codes.full, float(codes.sampling.goal)), *((code, 0.0) for code in codes.references)]
+        denoisers = [self.denoiser(self.networks.path, code, control, keep) for code, keep in every]
         correct = partial(self.paths_out_of_solid, codes)
         shape = (len(goal), PATH_CHANNELS_OF[self.scaling.encoding], self.scaling.path_std.shape[1])
         solver, steps = self.of_sequences(codes.sampling)
@@ -304,14 +298,10 @@ class Sampler:
     ) -> Float[np.ndarray, "plan frame channel"]:
         """Draw bodies along paths; if all conditions are guided, the path is one of them."""
         control = self.scaling.scaled_path(path)
-
-        def denoise(code: Array, keep: float = float(self.guided == "observer")) -> Denoise:
-            return lambda x, t: self.networks.body(
-                x, filled(len(x), t), code, control, filled((len(x), 1), keep)
-            )
-
+        kept = float(self.guided == "observer")
+        every = [(codes.full, 1.0), *((code, kept) for code in codes.references)]
+        denoisers = [self.denoiser(self.networks.body, code, control, keep) for code, keep in every]
         shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
-        denoisers = [denoise(codes.full, 1.0), *map(denoise, codes.references)]
         solver, steps = self.of_sequences(codes.sampling.for_bodies())
         body = self._denoised(denoisers, shape, solver, steps, rng, noise_std=solver.body_noise_std)
         return np.swapaxes(body, 1, 2) * self.scaling.body_std + self.scaling.body_mean
@@ -347,6 +337,11 @@ class Sampler:
         path, sampling = self.scaling.path(scaled, codes.start), codes.sampling
         pull = float(sampling.goal and sampling.snap_to_goal) * min(sampling.guidance, 1.0)
         return codes.constrained(snapped_to_goal(path, codes.start, goal, pull), self.scaling.rate_hz)
+
+    @staticmethod
+    def denoiser(network: Callable[..., Array], code: Array, control: Array, keep: float) -> Denoise:
+        """Return the denoiser of paths or bodies under one condition; ``keep`` 0 drops the control."""
+        return lambda x, t: network(x, filled(len(x), t), code, control, filled((len(x), 1), keep))
 
     def _denoised(
         self,

@@ -238,8 +238,8 @@ class BehaviorData:
     @property
     def training(self) -> dict[str, Trajectory]:
         """The recordings for training, also those too short for a window."""
-        names = (name for name, tested in zip(self.videos, self.tested, strict=True) if not tested)
-        return {name: self.trajectories[name] for name in names}
+        both = zip(self.videos, self.tested, strict=True)
+        return {name: self.trajectories[name] for name, tested in both if not tested}
 
     def indices(self, split: int) -> Int[np.ndarray, "window"]:
         """Return the windows of one split."""

@@ -92,9 +92,7 @@ def named_files(value: Any) -> dict[str, list[int]]:
     if isinstance(value, (dict, list)):
         parts = value.values() if isinstance(value, dict) else value
         return {path: mark for part in parts for path, mark in named_files(part).items()}
-    if not isinstance(value, str) or not os.path.exists(value):
-        return {}
-    files = _files_of(Path(value)) if os.path.isdir(value) else [Path(value)]
+    files = _files_of(Path(value)) if isinstance(value, str) and os.path.exists(value) else []
     return {str(file): stat_fingerprint(file)[:2] for file in files}
 
 
@@ -154,11 +152,11 @@ def recording_digest(path: Path, digest_of: Callable[[Path], str] = artifact.dig
 
 def recording_size(path: Path) -> int:
     """Return the bytes of a recording's files; 0 if there is none."""
-    return sum(file.stat().st_size for file in ([path] if path.is_file() else _files_of(path)))
+    return sum(file.stat().st_size for file in _files_of(path))
 
 
-def _files_of(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.rglob("[!.]*") if file.is_file())
+def _files_of(path: Path) -> list[Path]:
+    return [path] if path.is_file() else sorted(file for file in path.rglob("[!.]*") if file.is_file())
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -37,7 +37,8 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
     ours, on_cpu = (Ats.load(inputs.behavior, scenes, sampling, device=each) for each in (device, "cpu"))
     data = data.with_horizon(ours.future)
     progress.log("evaluate: behavior")
-    metrics.add(behavior.behavior_metrics(data, ours, config, scenes if ours.corrected else None))
+    places = scenes if ours.sampler.avoids_solid(ours.sampling) else None
+    metrics.add(behavior.behavior_metrics(data, ours, config, places))
     progress.log("evaluate: penetration and foot slide")
     metrics.add(physical.physical_metrics(data, ours, inputs.reconstruction, seed=config.seed))
     metrics.add(speed.plan_metrics(data, on_cpu, config.seed, measure=config.time_plans))

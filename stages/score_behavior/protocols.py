@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Int, Shaped
 
-from pipeline.baselines.predictors import WINDOWS_AT_ONCE, Ats, Samples
-from pipeline.behavior.model import ROOT_CHANNELS, bones_from_channels
+from pipeline.baselines.predictors import WINDOWS_AT_ONCE, Ats, Samples, joined
 from pipeline.behavior.perception import world_from_ego
+from pipeline.behavior.planning import SampledPlan
 from pipeline.behavior.trajectories import TEST, BehaviorData, Context, Future
 from pipeline.geometry import rigid
 from pipeline.metrics.scores import GOAL_SCORES, PLAN_SCORES, SCORES
@@ -74,15 +74,10 @@ def fed_with_truth(
         frame = world_from_ego(context[some].world_from_agent[:, -1], ats.ego)
         true = rigid.apply(rigid.inverse(frame), future.path_world[some])
         codes = ats.sampler.codes(ats.observe(context[some]), ats.sampling, count)
-        world = np.repeat(frame, count, axis=0)
-        paths = ats.sampler.paths(codes, np.repeat(true[:, -1], count, axis=0), rng)
-        bodies = ats.sampler.bodies(codes, np.repeat(true, count, axis=0), rng)
-        rotation = world[:, None, :3, :3] @ rigid.rotation_from_6d(bodies[..., :ROOT_CHANNELS])
-        bones = bones_from_channels(bodies[..., ROOT_CHANNELS:], ats.agent_from_bone_rest).astype(np.float32)
-        path = rigid.apply(world, paths)
-        rows = path[:, -1], path, rotation, bones
-        parts.append([each.reshape(len(frame), count, *each.shape[1:]) for each in rows])
-    return Samples(*map(np.concatenate, zip(*parts, strict=True)))
+        path = ats.sampler.paths(codes, np.repeat(true[:, -1], count, axis=0), rng)
+        body = ats.sampler.bodies(codes, np.repeat(true, count, axis=0), rng)
+        parts.append(ats.in_world(SampledPlan(path[:, -1], path, body), context[some]))
+    return joined(parts)
 
 
 def _listed(data: BehaviorData, index: Int[np.ndarray, "window"]) -> Int[np.ndarray, "window 2"]:

@@ -194,8 +194,7 @@ def through_subgoals(inputs: Inputs, written: list[Subgoal] | None, c: Config, d
         drawn = chained_goals(simulator, _observer(simulator, c), c.place_count, c.seed)
         subgoals = move_into_scene(drawn, world.scene, world.model.motion_prior)
     else:
-        learned = data.training.values()
-        been = np.concatenate([track.world_from_agent[track.valid, :3, 3] for track in learned])
+        been = np.concatenate([each.world_from_agent[each.valid, :3, 3] for each in data.training.values()])
         subgoals = sample_visited_subgoals(been, c.place_count + 1, rng)
     made = journeys.travel(world, subgoals, MotionOptimizationConfig() if c.optimize else None, rng)
     asked = np.stack([goal.position_world for goal in subgoals])

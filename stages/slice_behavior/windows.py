@@ -35,9 +35,8 @@ def slice_windows(
     future = 4 * max(round(FUTURE / RATE_HZ * rate_hz / 4), 1)
     videos = tuple(sorted(trajectories))
     tested, none = np.array([v in test for v in videos]), np.zeros(0, np.int32)
-    tracks = {v: trajectories[v] for v in videos}
     lengths = stride, future, past, rate_hz
-    return BehaviorData(tracks, agent_from_bone_rest, none, none, tested, videos, *lengths).sliced()
+    return BehaviorData(trajectories, agent_from_bone_rest, none, none, tested, videos, *lengths).sliced()
 
 
 def allowed_voxels(

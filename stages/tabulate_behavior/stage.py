@@ -40,7 +40,7 @@ def run(inputs: Inputs, config: Config, out: Path, *, device: devices.Device = "
     data = BehaviorData.load(inputs.behavior_data).with_horizon(scores[OURS].future)
     scenes = Scenes.load(inputs.behavior_data, data.videos)
     ats = Ats.load(inputs.behavior_trials[f"{OURS}-0"], scenes, PlanSamplingConfig(), device=device)
-    places = scenes if ats.corrected else None
+    places = scenes if ats.sampler.avoids_solid(ats.sampling) else None
     scores |= untrained.scores(data, places, scores[OURS], trials=config.trials, seed=config.seed)
     figures = tables.figures(scores, OURS, seed=config.seed) | tables.plateaus(curves)
     if config.rollouts:

@@ -22,7 +22,7 @@ from pipeline.behavior.trajectories import RATE_HZ, anticipated_frames
 from pipeline.environments.homes import Habitat
 from pipeline.geometry import rigid, rigid_torch
 from stages.train_behavior.config import AugmentationConfig
-from stages.train_behavior.homes import evenly_repeated, windows_of_all
+from stages.train_behavior.homes import windows_of_all
 from stages.train_behavior.scene_sampler import SceneSampler
 
 YAW_JITTER_RAD = 0.3
@@ -177,9 +177,10 @@ def approached(
     approaching = np.flatnonzero((distance < APPROACH_DISTANCE_M) & approaches)
     bins = (distance[approaching] / BIN_M).astype(int)
     most = np.bincount(bins).max(initial=0)
-    parts = [approaching[bins == number] for number in np.unique(bins)]
-    counts = [min(most, MAX_REPEATS * len(part)) for part in parts]
-    return np.concatenate([approaching[:0], *map(evenly_repeated, parts, counts)])
+    parts = [approaching[:0], *(approaching[bins == number] for number in np.unique(bins))]
+    counts = (np.arange(min(most, MAX_REPEATS * len(part))) for part in parts)
+    both = zip(parts, counts, strict=True)
+    return np.concatenate([part[count * len(part) // max(len(count), 1)] for part, count in both])
 
 
 def largest_turn_rad(augmentation: AugmentationConfig) -> float:

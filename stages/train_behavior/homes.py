@@ -22,12 +22,7 @@ def windows_of_all(homes: Habitat) -> Int[np.ndarray, "window"]:
     index = homes.data.indices(TRAIN)
     each = [index[homes.home_of_window[index] == number] for number in range(homes.home_of_video.max() + 1)]
     most = max(len(mine) for mine in each)
-    return np.concatenate([evenly_repeated(mine, most) for mine in each if len(mine)])
-
-
-def evenly_repeated(some: Int[np.ndarray, "some"], count: int) -> Int[np.ndarray, "count"]:
-    """Repeat windows to ``count``: early and late ones alike."""
-    return some[np.arange(count) * len(some) // count]
+    return np.concatenate([mine[np.arange(most) * len(mine) // most] for mine in each if len(mine)])
 
 
 def with_other_homes(
@@ -59,8 +54,7 @@ def _training_windows(build: Path, own: BehaviorData) -> BehaviorData:
         data,
         trajectories={name: _at_rest(track, own) for name, track in data.trajectories.items()},
         agent_from_bone_rest=own.agent_from_bone_rest,
-        video=data.video[some],
-        start=data.start[some],
+        **{name: getattr(data, name)[some] for name in ("video", "start")},
     )
 
 

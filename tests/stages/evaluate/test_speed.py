@@ -31,7 +31,7 @@ class Watched:
 
     device: str = "cpu"
     future: int = 40
-    corrected: bool = False
+    sampler: SimpleNamespace = field(default_factory=SimpleNamespace)
     sampling: PlanSamplingConfig = PlanSamplingConfig()
     threads: list[int] = field(default_factory=list)
 
@@ -58,7 +58,7 @@ def test_devices_horizon_and_corrections_are_those_of_the_model(
         return Metrics()
 
     def loaded(*given: object, device: str) -> Watched:
-        return Watched(device, corrected=corrected)
+        return Watched(device, sampler=SimpleNamespace(avoids_solid=lambda sampling: corrected))
 
     def remembers(room: str):
         def metrics(data: SimpleNamespace, ours: Watched, *given: object, **named: object) -> Metrics:
