@@ -8,7 +8,7 @@ are denoised as one sequence without a goal (Tevet et al. 2022). `sampler_of` ch
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import assert_never
+from typing import Any, assert_never
 
 import numpy as np
 from jaxtyping import Float
@@ -124,7 +124,7 @@ class GaussianSampler(Sampler):
 class OneStageSampler(Sampler):
     """Samples path and body together; the goal is the end of the path."""
 
-    def guidance(self, sampling: PlanSamplingConfig) -> tuple[float | Array, ...]:
+    def guidance(self, sampling: PlanSamplingConfig) -> tuple[Any, ...]:
         """Return scales per channel: as in our plans, bodies are guided by at most 1."""
         both = zip(super().guidance(sampling), super().guidance(sampling.for_bodies()), strict=True)
         return tuple(np.repeat(each, self._channels)[:, None] for each in both)

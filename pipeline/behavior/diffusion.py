@@ -7,7 +7,7 @@ torch module, an ONNX session, or a guided combination of calls.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TypeVar, assert_never
+from typing import Any, TypeVar, assert_never
 
 import numpy as np
 from jaxtyping import Float
@@ -87,13 +87,13 @@ def noised(clean: Array, noise: Array, alpha_bar: Array) -> Array:
 
 
 def guided(
-    denoisers: Sequence[Callable[[Array, float], Array]], scales: Sequence[float | np.ndarray]
+    denoisers: Sequence[Callable[[Array, float], Array]], scales: Sequence[Any]
 ) -> Callable[[Array, float], Array]:
     """Return the guided noise e_n + sum over i of scale_i (e_i - e_i+1); each denoiser has one condition less
     than the one before it. Scales may be arrays that broadcast. Denoisers of weight 0 are not called.
     """
     cumulative = (0.0, *scales[: len(denoisers) - 1], 1.0)
-    weights = [scale - before for before, scale in pairwise(cumulative)]
+    weights: list[Any] = [scale - before for before, scale in pairwise(cumulative)]
     called = [(w, each) for w, each in zip(weights, denoisers, strict=True) if np.any(w)]
 
     def mixed(x: Array, t: float) -> Array:

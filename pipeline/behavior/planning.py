@@ -7,6 +7,7 @@ transforms them to the world.
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -195,7 +196,7 @@ class Sampler:
         """Return whether goals and paths are kept out of solids, and on supports."""
         return self.corrections and sampling.avoid_solid and sampling.scene
 
-    def guidance(self, sampling: PlanSamplingConfig) -> tuple[float | Array, ...]:
+    def guidance(self, sampling: PlanSamplingConfig) -> tuple[Any, ...]:
         """Return the scales of `guided`, for all channels or each: of the observer, and of all companions or
         of each, that is without the observer e + sum over companions of (scale - 1) (e - e without that one).
         """
@@ -298,8 +299,7 @@ class Sampler:
     ) -> Float[np.ndarray, "plan frame channel"]:
         """Draw bodies along paths; if all conditions are guided, the path is one of them."""
         control = self.scaling.scaled_path(path)
-        kept = float(self.guided == "observer")
-        every = [(codes.full, 1.0), *((code, kept) for code in codes.references)]
+        every = [(codes.full, 1.0), *((code, float(self.guided == "observer")) for code in codes.references)]
         denoisers = [self.denoiser(self.networks.body, code, control, keep) for code, keep in every]
         shape = (len(path), len(self.scaling.body_mean), self.scaling.path_std.shape[1])
         solver, steps = self.of_sequences(codes.sampling.for_bodies())
