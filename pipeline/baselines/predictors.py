@@ -160,9 +160,9 @@ class Ats:
 
     def sample(self, context: Context, count: int, rng: np.random.Generator) -> Samples:
         """Draw ``count`` plans for each window."""
-        seen = ((chunk, self.observe(chunk)) for chunk in _chunks(context))
-        plans = ((chunk, self.sampler.plan(each, self.sampling, rng, count=count)) for chunk, each in seen)
-        return joined([self.in_world(plan, chunk) for chunk, plan in plans])
+        plan, parts = self.sampler.plan, _chunks(context)
+        plans = (plan(self.observe(part), self.sampling, rng, count=count) for part in parts)
+        return joined([*map(self.in_world, plans, parts)])
 
     def in_world(self, plan: SampledPlan, context: Context) -> Samples:
         """Return plans of these windows, equally many of each, in the world frame."""

@@ -238,8 +238,7 @@ class BehaviorData:
     @property
     def training(self) -> dict[str, Trajectory]:
         """The recordings for training, also those too short for a window."""
-        both = zip(self.videos, self.tested, strict=True)
-        return {name: self.trajectories[name] for name, tested in both if not tested}
+        return {str(name): self.trajectories[name] for name in np.array(self.videos)[~self.tested]}
 
     def indices(self, split: int) -> Int[np.ndarray, "window"]:
         """Return the windows of one split."""

@@ -32,10 +32,9 @@ def slice_windows(
     They have ``past`` known frames; the future is as long as `FUTURE` at `RATE_HZ`, in multiples of four
     frames.
     """
-    future = 4 * max(round(FUTURE / RATE_HZ * rate_hz / 4), 1)
     videos = tuple(sorted(trajectories))
     tested, none = np.array([v in test for v in videos]), np.zeros(0, np.int32)
-    lengths = stride, future, past, rate_hz
+    lengths = stride, 4 * max(round(FUTURE / RATE_HZ * rate_hz / 4), 1), past, rate_hz
     return BehaviorData(trajectories, agent_from_bone_rest, none, none, tested, videos, *lengths).sliced()
 
 
