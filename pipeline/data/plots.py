@@ -154,9 +154,9 @@ def grid(images: Sequence[UInt8[np.ndarray, "_ _ 3"]], columns: int) -> UInt8[np
 def outlined(
     image: UInt8[np.ndarray, "height width 3"],
     mask: Bool[np.ndarray, "height width"],
-    color: tuple[int, int, int],
+    color: tuple[int, int, int] = (60, 255, 90),
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Return a picture with a one pixel outline around a mask."""
+    """Return a picture with a one pixel outline around a mask, green by default."""
     inside = mask.astype(np.uint8)
     drawn = image.copy()
     drawn[cv2.dilate(inside, np.ones((3, 3), np.uint8)) > inside] = color

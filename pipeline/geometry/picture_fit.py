@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from pipeline.data import images
 from pipeline.geometry import cameras, rigid
 from pipeline.geometry.meshes import Mesh, RayCaster
 
@@ -60,7 +61,7 @@ class BodyPicture:
 def colored_body(mesh: Mesh) -> ColoredBody:
     """Return a mesh to be compared with pictures; ``mesh`` must have colors."""
     assert mesh.color is not None, "templates have colors"
-    return ColoredBody(RayCaster(mesh), _lab(mesh.color[None])[0], np.zeros(3), np.array(ROUGH))
+    return ColoredBody(RayCaster(mesh), images.lab(mesh.color[None])[0], np.zeros(3), np.array(ROUGH))
 
 
 def body_picture(
@@ -88,7 +89,7 @@ def body_picture(
         for each in (mask, depth)
     )
     rays = cameras.ray_directions(lens, height, width).reshape(-1, 3)
-    lab = _lab(small).reshape(-1, 3)
+    lab = images.lab(small).reshape(-1, 3)
     return BodyPicture(rays, lab, labels == 255, labels != 128, depth, world_from_camera)
 
 
@@ -156,7 +157,3 @@ def _rendered(picture, body, world_from_body):
     vertex = body.caster.mesh.faces[np.maximum(hits.face, 0), hits.barycentric.argmax(-1)]
     hidden = ~picture.inside & (picture.depth > 0) & (picture.depth < hits.distance)
     return (hits.face >= 0) & ~hidden, body.lab[vertex]
-
-
-def _lab(color):
-    return cv2.cvtColor(np.ascontiguousarray(color[..., :3]), cv2.COLOR_RGB2LAB).astype(np.float32)

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from pipeline.data import images
 from pipeline.geometry import cameras
 from pipeline.segmentation.appearance import Appearance, strongest
 from pipeline.segmentation.grabcut import Region, dilated, outlined
@@ -48,7 +49,7 @@ class ColorView:
 def color_view(color: UInt8[np.ndarray, "height width 3"], view: View) -> ColorView:
     """Add colors to a view."""
     small = cv2.resize(color, view.gray.shape[::-1], interpolation=cv2.INTER_AREA)
-    lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32)
+    lab = images.lab(small)
     return ColorView(view, small, cv2.GaussianBlur(lab, (3, 3), SOFTNESS_PX))
 
 

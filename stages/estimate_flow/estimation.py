@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipeline.data.flow import STRIDE_PX
+from pipeline.geometry import cameras
 
 MATCH_WINDOW_PX = 5
 """side of the window over which two candidates are compared, pixels at half the reduced size"""
@@ -59,7 +60,7 @@ class Estimator:
         # A search that was given a guess remembers it in later ones: so one of its own for those.
         self._coarse, self._fine, self._guided = (_search(fine_only=fine) for fine in (False, True, True))
         self._guided.setGradientDescentIterations(GUIDED_STEPS)
-        self._pixel = _index_grid(*self.dense_size)
+        self._pixel = (cameras.pixel_grid(*self.dense_size) - 0.5).astype(np.float32)
 
     def reduce(self, color: UInt8[np.ndarray, "height width 3"]) -> Gray:
         """Turn a color picture into the gray one that is searched."""
@@ -141,17 +142,14 @@ def flows(
 
 def chain(first_to_middle: Dense, middle_to_last: Dense) -> Dense:
     """Follow one flow, then the other."""
-    middle = _index_grid(*first_to_middle.shape[:2]) + first_to_middle
+    middle = cameras.pixel_grid(*first_to_middle.shape[:2]) - 0.5 + first_to_middle
     return first_to_middle + _sampled(middle_to_last, middle)
 
 
 def grid_centers(color_size: tuple[int, int]) -> Float[np.ndarray, "height width 2"]:
     """Return the pixel positions (x, y) of the stored vectors for pictures of (height, width)."""
-    return (_index_grid(*(side // STRIDE_PX for side in color_size)) + 0.5) * STRIDE_PX
-
-
-def _index_grid(height: int, width: int) -> Float[np.ndarray, "height width 2"]:
-    return np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
+    cells = cameras.pixel_grid(*(side // STRIDE_PX for side in color_size))
+    return (cells * STRIDE_PX).astype(np.float32)
 
 
 def _sampled(image: np.ndarray, index: Float[np.ndarray, "height width 2"]) -> np.ndarray:

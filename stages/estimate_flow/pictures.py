@@ -26,8 +26,6 @@ class Review:
     gap: int
     agreement: float
     """share of vectors on which both directions agree"""
-    speed_px: float
-    """mean length of the certain vectors, color pixels"""
     strip: UInt8[np.ndarray, "height width 3"] | None
 
 
@@ -35,17 +33,12 @@ def review(folder: Path, gap: int, color: Callable[[int], UInt8[np.ndarray, "hei
     """Summarize the forward flow of one gap as it was written; ``color(i)`` gives frame i."""
     flows, confidences = open_flow(folder, gap), open_confidence(folder, gap)
     if len(flows) == 0:
-        return Review(gap, float("nan"), float("nan"), None)
-    agreement, speed_px = [], []
-    for flow, confidence in zip(flows, confidences, strict=True):
-        certain = confidence >= CERTAIN
-        agreement.append(float(certain.mean()))
-        if certain.any():
-            speed_px.append(float(np.linalg.norm(flow[certain].astype(np.float32), axis=-1).mean()))
+        return Review(gap, float("nan"), None)
+    agreement = [(confidence >= CERTAIN).mean() for confidence in confidences]
     shown = subsampling.evenly(len(flows), SHOWN_FRAMES)
     columns = [_column(color(int(i)), flows[i], confidences[i]) for i in shown]
     strip = np.concatenate([*columns, _key(len(columns[0]))], axis=1)
-    return Review(gap, float(np.mean(agreement)), float(np.mean(speed_px)) if speed_px else 0.0, strip)
+    return Review(gap, float(np.mean(agreement)), strip)
 
 
 def report_quality(folder: Path, reviews: Sequence[Review]) -> None:
@@ -54,12 +47,9 @@ def report_quality(folder: Path, reviews: Sequence[Review]) -> None:
     for each in reviews:
         name, least = f"both directions agree, {each.gap} apart", 100 * MIN_AGREEMENT[each.gap]
         checks.append(qa.Check(name, 100 * each.agreement, "%", warn=least, better="higher"))
-    checks += [qa.Check(f"mean motion, {each.gap} apart", each.speed_px, "px") for each in reviews]
-    pictures, key = [], "(hue = direction, as the disc shows), dark where uncertain"
-    for each in reviews:
-        caption = f"frames, flow to {each.gap} later {key}"
-        if each.strip is not None:
-            pictures.append(qa.Picture(f"gap_{each.gap}", each.strip, caption))
+    caption = "frames, flow to {} later (hue = direction, as the disc shows), dark where uncertain"
+    shown = [(each.gap, each.strip) for each in reviews if each.strip is not None]
+    pictures = [qa.Picture(f"gap_{gap}", strip, caption.format(gap)) for gap, strip in shown]
     qa.write(
         folder,
         good="one smooth color for the moving camera, another inside the animal, dark only at edges",

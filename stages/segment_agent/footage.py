@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 
 from pipeline.data.clips import Clip
 from pipeline.data.flow import GAPS, open_confidence, open_flow
+from pipeline.geometry import cameras
 from pipeline.segmentation.grabcut import Region, dilated
 from stages.segment_agent.windows import working_picture, working_size
 
@@ -63,7 +64,7 @@ class Footage:
 
         The background moves by a homography fitted to most of the picture. Mean over both time directions.
         """
-        pixel, parts = pixel_indices(self.size), []
+        pixel, parts = (cameras.pixel_grid(*self.size) - 0.5).astype(np.float32), []
         for other in (frame + sign * gap for gap in gaps for sign in (-1, 1)):
             moved = self.flow_between(frame, other)
             if moved is None:
@@ -109,8 +110,3 @@ class Footage:
 
     def _resized(self, image: np.ndarray) -> np.ndarray:
         return cv2.resize(image, self.size[::-1], interpolation=cv2.INTER_LINEAR)
-
-
-def pixel_indices(size: tuple[int, int]) -> Float[np.ndarray, "height width 2"]:
-    """Return the index (x, y) of each pixel of a picture of (height, width)."""
-    return np.stack(np.meshgrid(*(np.arange(side, dtype=np.float32) for side in size[::-1])), -1)

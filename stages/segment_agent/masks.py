@@ -97,7 +97,7 @@ def segment(
     placed = None if prompt is None else prompts.place(prompt, clip, poses)
     match role:
         case "turnaround":
-            masks = _standing_segmenter(clip, poses, placed, config).masks(range(len(clip)))
+            masks = standing_segmenter(clip, poses, placed, config).masks(range(len(clip)))
             references = free_space.gather(clip, poses, config.references)
             return Segmentation(masks, path, references=references, shown="resting")
         case "session":
@@ -113,15 +113,10 @@ def segment(
             assert_never(role)
 
 
-def turnaround_segmenter(clip: Clip, flow: Path, config: Config, rng: np.random.Generator) -> Segmenter:
-    """Prepare the masks of a turnaround without a prompt. Raises InputError MSK-003 as `segment` does."""
-    return _standing_segmenter(clip, estimate_trajectory(clip, flow, rng).world_from_camera, None, config)
-
-
-def _standing_segmenter(
+def standing_segmenter(
     clip: Clip, poses: Float[np.ndarray, "frame 4 4"], placed: PlacedPrompt | None, config: Config
 ) -> Segmenter:
-    """Prepare the masks of a turnaround: what stands on the ground where the optical axes meet."""
+    """Prepare the masks of what stands where a turnaround's axes meet. Raises MSK-003 as `segment` does."""
     focus = axes_focus(poses) if placed is None else placed.center_world
     spheres, evidence_of = find_standing(clip, poses, focus)
     if clip.has_foreground:

@@ -55,19 +55,10 @@ def parse(path: Path, clip: Clip) -> Prompt:
 
 
 def place(prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]) -> PlacedPrompt:
-    """Lift a prompt to the world; a box gives the animal's reach. Raises InputError MSK-002."""
-    center = position(prompt, clip, world_from_camera)
-    x0, y0, x1, y1 = prompt.box_px
-    distance = rigid.apply(rigid.inverse(world_from_camera[prompt.frame]), center[None])[0, 2]
-    half_m = max(x1 - x0, y1 - y0) / 2 * distance / clip.intrinsics[prompt.frame, 0, 0]
-    placed = PlacedPrompt(prompt.frame, center)
-    return replace(placed, reach_m=FORESHORTENED * half_m) if half_m > MIN_BOX_M else placed
+    """Lift a prompt to the world: a near surface point in its middle third; a box gives the animal's reach.
 
-
-def position(
-    prompt: Prompt, clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"]
-) -> Float[np.ndarray, "3"]:
-    """Return a near surface point in the box's middle third, in the world. Raises InputError MSK-002."""
+    Raises InputError MSK-002 without depth there.
+    """
     x0, y0, x1, y1 = prompt.box_px
     scale = np.divide(clip.depth_size, clip.color_size)[::-1]
     center = np.array([x0 + x1, y0 + y1]) / 2 * scale
@@ -79,6 +70,8 @@ def position(
         what = "the prompt lies where depth is unknown"
         remedy = "point at another part of the animal or another frame"
         raise InputError("MSK-002", what, f"frame {prompt.frame}", remedy)
-    z = float(np.quantile(depth[depth > 0], 0.3))
-    point_camera = cameras.unproject(center / scale, clip.intrinsics[prompt.frame]) * z
-    return rigid.apply(world_from_camera[prompt.frame], point_camera[None])[0]
+    z, pinhole = float(np.quantile(depth[depth > 0], 0.3)), clip.intrinsics[prompt.frame]
+    point_camera = cameras.unproject(center / scale, pinhole) * z
+    placed = PlacedPrompt(prompt.frame, rigid.apply(world_from_camera[prompt.frame], point_camera[None])[0])
+    half_m = max(x1 - x0, y1 - y0) / 2 * z / pinhole[0, 0]
+    return replace(placed, reach_m=FORESHORTENED * half_m) if half_m > MIN_BOX_M else placed

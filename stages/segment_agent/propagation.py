@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from pipeline.data.flow import GAPS
-from pipeline.geometry import subsampling
+from pipeline.geometry import cameras, subsampling
 from pipeline.segmentation.appearance import Example, learn
 from pipeline.segmentation.config import LearningConfig
 from pipeline.segmentation.grabcut import Region, dilated
-from stages.segment_agent.footage import SEARCH_PX, Footage, pixel_indices
+from stages.segment_agent.footage import SEARCH_PX, Footage
 
 MAX_LOG_ODDS, MIN_LOG_ODDS = 4.0, 0.5
 """largest and smallest magnitude of a pixel's log-odds"""
@@ -108,7 +108,7 @@ def message(footage: Footage, frame: int, found: Beliefs) -> LogOdds:
         if labels is None or moved is None:
             continue
         confidence, labels = footage.confidence(frame, other), labels.astype(np.float32)
-        x, y = np.moveaxis(pixel_indices(size) + moved, -1, 0)
+        x, y = np.moveaxis((cameras.pixel_grid(*size) - 0.5 + moved).astype(np.float32), -1, 0)
         warped = cv2.remap(labels, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         total += confidence * warped
         weight += confidence

@@ -12,6 +12,8 @@ import numpy as np
 import scipy.ndimage
 from jaxtyping import Bool, Float, Int, UInt8
 
+from pipeline.data import images
+
 
 @dataclass(frozen=True)
 class Edges:
@@ -114,7 +116,7 @@ def _components(
 
 def _bin(color: UInt8[np.ndarray, "pixel 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Lab bins; lightness is coarser than color to tolerate shading."""
-    lab = cv2.cvtColor(np.ascontiguousarray(color.reshape(1, -1, 3)), cv2.COLOR_RGB2LAB)[0].astype(np.int32)
+    lab = images.lab(color.reshape(1, -1, 3))[0].astype(np.int32)
     light = lab[:, 0] * (BINS - 1) // 255
     tone = np.clip((lab[:, 1:] - 128) * BINS // AB_RANGE + BINS // 2, 0, BINS - 1)
     return light, tone[:, 0], tone[:, 1]

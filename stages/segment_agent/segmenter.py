@@ -28,13 +28,9 @@ SMALL_PX, MIN_SUPPORT = 250, 0.7
 """masks smaller than this many pixels need this share that looks like the animal or clearly moves"""
 MIN_PRESUMED_PX = 25
 """sure pixels required where the sphere is presumed"""
-PRESENCE_PRESUMED = -2.5
-PRESENCE_TRACKED = 2.0
-PRESENCE_APPEARANCE = 1.0
-PRESENCE_MOVED = 3.0
-PRESENCE_LIMIT = 4.0
-"""log-odds that a mask shows the animal: base value; added if tracked rather than presumed; per unit of its
-mean appearance, which is limited; and if all of it clearly moves"""
+PRESENCE_PRESUMED, PRESENCE_TRACKED, PRESENCE_MOVED, PRESENCE_LIMIT = -2.5, 2.0, 3.0, 4.0
+"""log-odds that a mask shows the animal: base value; added if tracked rather than presumed, and if all of it
+clearly moves; limit of its mean appearance, which is added too"""
 ABSENT_PRESUMED, ABSENT_TRACKED, ABSENT_UNTRACKED = 0.88, 0.04, 0.99
 """probability that the animal covers less than 0.1 % of the view if no mask is found: at a presumed sphere,
 on the track, and without a sphere; counted in two semi-real kitchens and six sessions of the built-in cat
@@ -133,7 +129,7 @@ class Segmenter:
         similarity = float(np.clip(log_ratio[inside], -PRESENCE_LIMIT, PRESENCE_LIMIT).mean())
         moved = float(evidence.moving[inside].mean())
         on_track = PRESENCE_PRESUMED + PRESENCE_TRACKED * (not presumed)
-        return on_track + PRESENCE_APPEARANCE * similarity + PRESENCE_MOVED * moved
+        return on_track + similarity + PRESENCE_MOVED * moved
 
     def _by_appearance(
         self, window: Window, evidence: Evidence, log_ratio: Float[np.ndarray, "height width"]

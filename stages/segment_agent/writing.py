@@ -22,8 +22,8 @@ LOW_CONFIDENCE, CIRCLED = 0.75, 80
 RIGHT_IOU, WRONG_IOU = 0.75, 0.6
 """mean IoU that `evaluate` requires, and an estimate below that of all good masks: on nine sessions their
 estimates are at most 0.07 off, those of bad masks up to 0.14 too high and 0.22 too low"""
-GREEN, BLUE, DIM, TINT = (60, 255, 90), (60, 90, 255), 0.6, 0.6
-"""colors of the animal's outline and of unknown pixels; brightness of the room, share of blue"""
+BLUE, DIM, TINT = (60, 90, 255), 0.6, 0.6
+"""color of unknown pixels; brightness of the room, share of blue"""
 SHOWN, COLUMNS, WIDTH_PX = 12, 6, 200
 """masks on the contact sheet, its columns, and the width of each"""
 CAPTIONS = {
@@ -90,7 +90,7 @@ def overlay(
     """Draw the agent's outline in green and unknown pixels in blue."""
     picture = color.astype(np.float32) * np.where(labels == 0, DIM, 1.0)[..., None]
     picture[labels == 128] = (1 - TINT) * picture[labels == 128] + TINT * np.array(BLUE)
-    return plots.outlined(picture.astype(np.uint8), labels == 255, GREEN)
+    return plots.outlined(picture.astype(np.uint8), labels == 255)
 
 
 def checks_of(

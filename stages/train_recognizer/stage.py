@@ -24,8 +24,6 @@ TEST_CROPS, TEST_ROOMS, SHOWN, COLUMNS = 60, 20, 12, 6
 """Composited crops and pictures of the room for testing; crops on the quality page, and its columns."""
 RIGHT_IOU, WRONG_IOU = 0.75, 0.5
 """IoU below which the check warns and fails."""
-GREEN = (60, 255, 90)
-"""Color of the recognized outline."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +83,7 @@ def _report_quality(out: Path, network: Appearance, crops: list[Crop], rooms: li
     """Write the quality page: composites and rooms that were not used in training."""
     overlaps, mistaken = training.overlaps(network, crops), training.mistaken_share(network, rooms)
     log(f"recognized: IoU {overlaps.mean():.2f}; {100 * mistaken:.2f} % of the empty room")
-    tiles = [plots.outlined(color, network.log_odds(color) > 0, GREEN) for color, _ in crops[:SHOWN]]
+    tiles = [plots.outlined(color, network.log_odds(color) > 0) for color, _ in crops[:SHOWN]]
     qa.write(
         out,
         good="the outline hugs the animal, small and large, and leaves its shadow out",

@@ -18,6 +18,7 @@ from stages.segment_agent import identity, masks
 from stages.segment_agent.config import Config as MaskConfig
 from stages.segment_agent.identities.config import Config
 from stages.segment_agent.identity import Identities, Portrait
+from stages.segment_agent.trajectory import estimate_trajectory
 
 MIN_RECOGNIZED = 0.8
 """minimum recall of each animal's pixels in test portraits"""
@@ -82,7 +83,8 @@ def portraits(
 ) -> list[Portrait]:
     """Segment frames spread evenly over a turnaround, at working resolution."""
     clip = Clip.open(frames)
-    segmenter = masks.turnaround_segmenter(clip, flow, MaskConfig(height_px=config.height_px), rng)
+    poses = estimate_trajectory(clip, flow, rng).world_from_camera
+    segmenter = masks.standing_segmenter(clip, poses, None, MaskConfig(height_px=config.height_px))
     found = [
         Portrait(segmenter.working_picture(frame), segmenter.working_mask(frame).labels, animal)
         for frame in subsampling.evenly(len(clip), config.portraits).tolist()

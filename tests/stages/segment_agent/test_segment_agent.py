@@ -272,7 +272,7 @@ def test_click_is_placed_on_the_surface(tmp_path):
     scenery.record(tmp_path / "frames", poses, agent, poses)
     clip = Clip.open(tmp_path / "frames")
     (tmp_path / "prompt.toml").write_text("frame = 1\nclick = [45, 60]")
-    place = prompts.position(prompts.parse(tmp_path / "prompt.toml", clip), clip, poses)
+    place = prompts.place(prompts.parse(tmp_path / "prompt.toml", clip), clip, poses).center_world
     assert np.linalg.norm(place - agent[0, :3, 3]) < 0.2, (
         "the middle of the picture shows the body, 14 cm thick"
     )
