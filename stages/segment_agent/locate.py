@@ -1,6 +1,7 @@
 """Localization of a session's animal: a sphere per frame, from motion and, once learned, appearance."""
 
 from collections.abc import Callable
+from functools import partial
 
 import cv2
 import numpy as np
@@ -40,23 +41,19 @@ def find_mover(
     Without known appearance, only the part of the track connected to a prompt is certain; the rest may have
     switched to another mover and is presumed. ``margin_of`` gives log-odds against a home's other animals.
     """
-    for share in movers.SURE_SHARES if appearance is None else (0.0,):
-        found = [
-            _candidates(clip, frame, pose, references, animal, (appearance, margin_of), share)
-            for frame, pose in enumerate(world_from_camera)
-        ]
-        chosen = movers.track(found, clip.timestamp_s, animal, prompt)
-        seen = np.array([candidate is not None for candidate in chosen])
-        if appearance is not None:
-            reliable = movers.plausible(chosen, clip.timestamp_s, animal)
-        elif prompt is None:
-            reliable = movers.self_moving(chosen, clip.timestamp_s, animal)
-        else:
-            reliable = movers.connected_to_prompt(chosen, clip.timestamp_s, animal, prompt)
-        if reliable.any():
-            break
+    found = [
+        _candidates(clip, frame, pose, references, animal, (appearance, margin_of))
+        for frame, pose in enumerate(world_from_camera)
+    ]
+    chosen = movers.track(found, clip.timestamp_s, animal, prompt)
+    if appearance is not None:
+        reliable = movers.plausible(chosen, clip.timestamp_s, animal)
+    elif prompt is None:
+        reliable = movers.self_moving(chosen, clip.timestamp_s, animal)
+    else:
+        reliable = movers.connected_to_prompt(chosen, clip.timestamp_s, animal, prompt)
     if prompt is None and not reliable.any():
-        reliable = seen
+        reliable = np.array([candidate is not None for candidate in chosen])
     radii = [each.radius_m for each, sure in zip(chosen, reliable, strict=True) if each and sure]
     radius = float(np.clip(SCALE * np.quantile(radii, 0.9), MIN_RADIUS_M, animal.largest_m)) if radii else 0.0
     spheres = [
@@ -89,7 +86,6 @@ def _candidates(
     references: References,
     animal: AnimalConfig,
     known: tuple[AppearanceOf | None, AppearanceOf | None],
-    share: float,
 ) -> list[Candidate]:
     """Group the points of one frame that move or, if the appearance is known, are likely the animal.
 
@@ -108,13 +104,13 @@ def _candidates(
         area = np.where(log_ratio > -movers.CLEAR_MOTION, area, 0)
         points[area == 0] = np.nan
     votes = free_space.vote(references, points, frame)
+    through = partial(free_space.seen_through, references, frame=frame)
     if appearance is None:
-        moving = opened_motion(votes, share)
-        if margin_of is None:
-            return movers.candidates(moving, np.ones(area.shape), points, area, animal)
-        margins = resample_nearest(margin_of(frame), clip.depth_size, chosen)
-        own, probability = identity.select_animal(moving, margins)
-        return movers.candidates(own, probability, points, area, animal)
+        own, probability = opened_motion(votes), np.ones(area.shape)
+        if margin_of is not None:
+            margins = resample_nearest(margin_of(frame), clip.depth_size, chosen)
+            own, probability = identity.select_animal(own, margins)
+        return movers.candidates(own, probability, points, area, animal, through)
     motion = movers.motion_log_odds(votes)
     static = (votes.occupied > 0) & (motion == 0)
     limited = np.clip(log_ratio, -movers.APPEARANCE_LIMIT, movers.APPEARANCE_LIMIT)
@@ -122,12 +118,12 @@ def _candidates(
     if margin_of is not None:
         both += np.minimum(resample_nearest(margin_of(frame), clip.depth_size, chosen), 0)
     both[area == 0] = -movers.APPEARANCE_LIMIT
-    return movers.candidates(both > 0, 1 / (1 + np.exp(-both)), points, area, animal, motion > 0)
+    return movers.candidates(both > 0, 1 / (1 + np.exp(-both)), points, area, animal, through, motion > 0)
 
 
-def opened_motion(votes: Votes, share: float) -> Bool[np.ndarray, "row column"]:
+def opened_motion(votes: Votes) -> Bool[np.ndarray, "row column"]:
     """Return the samples in space that is free at a good share of other times, morphologically opened."""
-    reliable = (votes.free > movers.MIN_VOTES) & (votes.free >= share * votes.occupied)
+    reliable = (votes.free > movers.MIN_VOTES) & (votes.free >= movers.SURE_SHARE * votes.occupied)
     opened = cv2.dilate(cv2.erode(reliable.astype(np.uint8), OPENING), OPENING[::-1, ::-1], anchor=(0, 0))
     return reliable & (opened > 0)
 

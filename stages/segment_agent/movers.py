@@ -4,7 +4,7 @@
 Viterbi algorithm over size, evidence and speed, globally over the recording.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -19,9 +19,8 @@ from stages.segment_agent.free_space import Votes
 
 PROMPT_REWARD, PROMPT_SLACK_M = 1000.0, 0.2
 """score of a candidate at the prompt, above all else; tolerated distance of the prompt from it"""
-SURE_SHARES = (1.0, 0.3)
-"""references that must have seen through a point for training, as a share of those that saw a surface there;
-the second is used if nothing travels by the first"""
+SURE_SHARE = 0.3
+"""references that must have seen through a mover's points, as a share of those that saw a surface there"""
 TRAVEL_M = 0.2
 """distance that a mover must travel to be certainly an animal: things moved by people stay in place"""
 JUMP_M = 0.1
@@ -111,11 +110,12 @@ def candidates(
     points_world: Float[np.ndarray, "height width 3"],
     area_m2: Float[np.ndarray, "height width"],
     animal: AnimalConfig,
+    seen_through: Callable[[Float[np.ndarray, "point 3"]], bool],
     moving: Bool[np.ndarray, "height width"] | None = None,
 ) -> list[Candidate]:
     """Group pixels, largest area first; ``area_m2`` is the area of each pixel at its distance.
 
-    ``moving`` marks those that move; by default all do.
+    ``moving`` marks those that seem to move, all by default. A group that is not ``seen_through`` does not.
     """
     found = []
     for own in components(chosen):
@@ -126,8 +126,10 @@ def candidates(
         center = np.median(points, axis=0)
         radius = float(np.quantile(np.linalg.norm(points - center, axis=1), 0.95))
         if radius < animal.largest_m:
-            share = 1.0 if moving is None else float(moving[own].mean())
-            found.append(Candidate(center, area, radius, float(probability[own].mean()), share))
+            through = own if moving is None else own & moving
+            share = float(through[own].mean()) * seen_through(points_world[through])
+            if moving is not None or share:
+                found.append(Candidate(center, area, radius, float(probability[own].mean()), share))
     return sorted(found, key=lambda candidate: -candidate.area_m2)[:CANDIDATES]
 
 

@@ -4,6 +4,7 @@ The room is what references saw outside of all masks. In a mask, points that oth
 positives; static surfaces and unseen space are false positives. What moves by itself outside is missed.
 """
 
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -39,13 +40,16 @@ def estimate(
         points, area_m2, chosen = free_space.sample(clip, frame, pose, inner, locate.COARSE_PX)
         labels = locate.resample_nearest(masks[frame], clip.depth_size, chosen)
         votes = free_space.vote(room, points, frame)
-        right = movers.moving(votes) | ((shown == "resting") & (votes.occupied == 0))
+        through = partial(free_space.seen_through, room, frame=frame)
+        moves = movers.moving(votes)
+        moves &= (labels != 255) | through(points[moves & (labels == 255)])
+        right = moves | ((shown == "resting") & (votes.occupied == 0))
         seen = (shown != "one of several") | (votes.free + votes.occupied > 0)
         inside = (labels == 255) & (right | seen)
         intersection_m2.append(area_m2[inside & right].sum())
         union_m2.append(area_m2[inside].sum())
-        outside = locate.opened_motion(votes, movers.SURE_SHARES[0]) & (labels == 0) & (shown == "moving")
-        missing.append(movers.candidates(outside, right, points, area_m2, animal))
+        outside = locate.opened_motion(votes) & (labels == 0) & (shown == "moving")
+        missing.append(movers.candidates(outside, right, points, area_m2, animal, through))
     time_s = clip.timestamp_s[::EVERY]
     chosen = movers.track(missing, time_s, animal)
     self_moving = movers.self_moving(chosen, time_s, animal)
