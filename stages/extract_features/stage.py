@@ -46,8 +46,7 @@ def report_quality(folder: Path, clip: Clip, described: Float[np.ndarray, "frame
     images = [*(clip.color(int(i)) for i in shown), *colors]
     sheet = plots.grid([plots.resized(image, size) for image in images], len(shown))
     pairs = (described[i : i + 2].astype(np.float32) for i in range(len(described) - 1))
-    steady = [np.einsum("hwc,hwc->hw", *pair) for pair in pairs]
-    similarity = float(np.median(steady))
+    similarity = float(np.median([np.einsum("hwc,hwc->hw", *pair) for pair in pairs]))
     qa.write(
         folder,
         good="the same thing has the same color in all pictures and in all recordings",

@@ -13,6 +13,7 @@ from pipeline.core.errors import InputError
 from pipeline.data.clips import Clip, usable_depth
 from pipeline.geometry import subsampling
 from pipeline.segmentation.appearance import Appearance, Example, learn
+from pipeline.segmentation.recognizer import SHORTER_PX
 from stages.segment_agent import free_space, movers, people, prompts
 from stages.segment_agent.config import Config
 from stages.segment_agent.evidence import motion_evidence, prefer_first, room_evidence
@@ -36,8 +37,7 @@ POSITIVES_PER_NEGATIVE = 3
 MIN_RECALL = 0.6
 """minimum recall on training pictures: an undertrained network would suppress the animal"""
 GROWTH = 2.0
-"""factor on the search radius of presumed spheres, once the appearance is known, and of what stands in
-front of the map, whose thin parts have no depth"""
+"""factor on the search radius of presumed spheres once the appearance is known, and of a mapped foreground"""
 STATIC_STRIDE = 3
 """stride of depth samples that test a frame without a track for motion, pixels"""
 PROBES = 12
@@ -161,10 +161,11 @@ def _recognized_segmenter(
 ) -> Segmenter:
     """Prepare the masks of a session whose depth comes from the map: tracked by motion, then recognized.
 
-    Its depth was inferred from the same recognition, so it is no evidence of its own.
+    Its depth was inferred from the same recognition, at the same scale, so it is no evidence of its own.
     """
     spheres = find_mover(clip, poses, references, config.animal, None)
-    segmenter = Segmenter(clip, poses, spheres, room_evidence, config.height_px, recognizer, OUTLINE, rng)
+    height_px = round(clip.color_size[0] * min(1.0, SHORTER_PX / min(clip.color_size)))
+    segmenter = Segmenter(clip, poses, spheres, room_evidence, height_px, recognizer, OUTLINE, rng)
     room = free_space.masked(references, lambda frame: occlusion_mask(segmenter, frame, recognizer))
     found = find_mover(clip, poses, room, config.animal, None, appearance_of(segmenter, recognizer))
     return replace(segmenter, spheres=with_motion_radius(found, spheres) if tracked(spheres).any() else found)

@@ -1,13 +1,17 @@
 """Masks of a session whose depth comes from the map: by the recognizer, since its depth proves nothing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pipeline.data import images
 from pipeline.data.clips import Clip
 from pipeline.segmentation.appearance import Appearance, strongest
+from pipeline.segmentation.recognizer import small
 from stages.segment_agent import masks
 from stages.segment_agent.config import Config, LearningConfig
+from stages.segment_agent.windows import working_size
 from tests.stages import room_with_animal as scenery
 
 SHORT = Config(learning=LearningConfig(examples=30, steps=60, batch=4, crop_px=96))
@@ -71,3 +75,13 @@ def test_only_the_strongest_component_is_the_animal():
     found = strongest(inside, log_odds)
     assert found[2:12, 2:10].all() and found.sum() == 80
     assert not strongest(np.zeros_like(inside), log_odds).any()
+
+
+@pytest.mark.parametrize("size", [(480, 640), (640, 360), (120, 90)], ids=["landscape", "portrait", "tiny"])
+def test_animals_are_recognized_at_the_scale_of_training(session, size, monkeypatch):
+    """Whichever way the phone is held, the shorter side is that of `small`."""
+    clip = replace(session[0], color_size=size)
+    monkeypatch.setattr(masks, "find_mover", lambda *_: [None] * len(clip))
+    monkeypatch.setattr(masks.free_space, "masked", lambda *_: None)
+    found = masks._recognized_segmenter(clip, None, None, Config(), KnownColor(), np.random.default_rng(0))
+    assert working_size(clip, found.height_px) == small(np.zeros((*size, 3), np.uint8)).shape[:2]
