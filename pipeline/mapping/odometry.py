@@ -101,7 +101,7 @@ def correct_drift(
     for first, second in _keyframe_pairs(odometry_from_camera, loops):
         guess = rigid.inverse(odometry_from_camera[first]) @ odometry_from_camera[second]
         result = align_views(view(first), view(second), guess, reach_m=REACH_M, iterations=ICP_ITERATIONS)
-        if _is_reliable(result):
+        if is_reliable(result):
             edges.append(RelativePose(first, second, result.target_from_source, result.information))
             residuals.append(result.residual_m)
     poses = optimize_pose_graph(odometry_from_camera, edges, iterations=GRAPH_ITERATIONS)
@@ -122,12 +122,13 @@ def chain_alignments(
     for index in range(count - 1):
         start = guess(index, last)
         result = align_views(view(index), view(index + 1), start, reach_m=REACH_M, iterations=ICP_ITERATIONS)
-        last = result.target_from_source if _is_reliable(result) else start
+        last = result.target_from_source if is_reliable(result) else start
         steps.append(last)
     return rigid.accumulate(np.array(steps).reshape(-1, 4, 4))
 
 
-def _is_reliable(result: IcpResult) -> bool:
+def is_reliable(result: IcpResult) -> bool:
+    """Return whether enough of two views overlaps, and agrees."""
     return result.overlap > MIN_OVERLAP and result.residual_m < MAX_RESIDUAL * REACH_M
 
 

@@ -16,6 +16,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.data.clips import Clip, usable_depth
 from pipeline.geometry import cameras, rigid, subsampling
+from pipeline.mapping import odometry
+from pipeline.mapping.icp import align_views, depth_image
 
 MARGIN_M = 0.03
 """a surface this far plus four standard deviations of depth noise behind a point proves free space"""
@@ -28,14 +30,18 @@ SIGMAS = 4.0
 """standard deviations of depth noise that are significant"""
 NEAREST_M = 0.1
 """minimum depth of a projected point"""
-DRIFT_M, STEPS = 0.08, np.linspace(-1, 1, 9)
-"""pose error across the line of sight that is never excluded (0.06 m within 17 s of a Kinect's odometry), and
-the shares of it at which a thing is sought"""
-SHIFTS_M = DRIFT_M * np.array([(x, y, 0) for x in STEPS for y in STEPS if x**2 + y**2 <= 1])
+STEPS = np.linspace(-1, 1, 9)
+SHIFTS = np.array([(x, y, 0) for x in STEPS for y in STEPS if x**2 + y**2 <= 1])
+"""shares of the drift, across the line of sight, at which a thing is sought"""
 MIN_WITNESSES, MIN_THROUGH = 3, 0.3
 """references that must have seen through a thing wherever drift may put it, and through this share of it"""
 MAX_NOISE_M = 0.15
 """larger depth differences are other surfaces, not noise"""
+DRIFT_M, DRIFT_QUANTILE, DRIFT_PX = 0.08, 0.9, 100
+"""drift of a Kinect's odometry within 17 s, assumed where none is measured; quantile of the pairs of pictures
+that are measured, and pixels along their longer side"""
+DRIFT_GAPS, MIN_FACING, MIN_DRIFTS = (8, 4, 2), 0.6, 10
+"""shares of a recording between both pictures, cosine of the angle between their axes, and least pairs"""
 MIN_PAIRS, MAD_TO_SIGMA, MIN_NOISE_M = 200, 1.48, 0.002
 """differences required per range bin, MAD to sigma, and the least deviation of any sensor"""
 BLUR_PX = 1.2
@@ -73,6 +79,8 @@ class References:
     color: UInt8[np.ndarray, "reference height width 3"]
     frame: Int[np.ndarray, "reference"]
     noise: DepthNoise
+    drift_m: float = DRIFT_M
+    """pose error across the line of sight"""
     ignored: Callable[[int, Float[np.ndarray, "*shape 3"]], Bool[np.ndarray, "*shape"]] | None = None
     """which points (world, meters) of a frame belong to people and never count as moving"""
 
@@ -137,7 +145,9 @@ def gather(clip: Clip, world_from_camera: Float[np.ndarray, "frame 4 4"], count:
     color = np.stack([cv2.GaussianBlur(each, (5, 5), BLUR_PX) for each in small])
     camera_from_world, pinhole = rigid.inverse(world_from_camera[frames]), clip.depth_intrinsics[frames]
     noise = measure_noise(depth, camera_from_world, pinhole)
-    return References(camera_from_world, pinhole, depth, _min_filter(depth, pinhole), color, frames, noise)
+    drift_m = measure_drift(depth, camera_from_world, pinhole)
+    nearest = _min_filter(depth, pinhole)
+    return References(camera_from_world, pinhole, depth, nearest, color, frames, noise, drift_m)
 
 
 def measure_noise(
@@ -176,6 +186,31 @@ def measure_noise(
     return DepthNoise(max(float(constant), MIN_NOISE_M), float(quadratic))
 
 
+def measure_drift(
+    depth: Float[np.ndarray, "reference height width"],
+    camera_from_world: Float[np.ndarray, "reference 4 4"],
+    intrinsics: Float[np.ndarray, "reference 3 3"],
+) -> float:
+    """Return the poses' error across the line of sight, meters, by ICP; `DRIFT_M` if few pictures overlap."""
+    stride, count, found = max(1, max(depth.shape[1:]) // DRIFT_PX), len(depth), []
+    views = [depth_image(each, k, each > 0, stride) for each, k in zip(depth, intrinsics, strict=True)]
+    steps = [(first, count // gap) for first in range(0, count, 2) for gap in DRIFT_GAPS]
+    for first, second in [(first, first + step) for first, step in steps if 0 < step < count - first]:
+        guess = camera_from_world[first] @ rigid.inverse(camera_from_world[second])
+        if guess[2, 2] < MIN_FACING:
+            continue
+        how = {"reach_m": odometry.REACH_M, "iterations": odometry.ICP_ITERATIONS}
+        result = align_views(views[first], views[second], guess, **how)
+        if odometry.is_reliable(result):
+            points = views[second].points[views[second].points[..., 2] > 0]
+            before = rigid.apply(guess, subsampling.some(points, NOISE_PROBES).astype(float))
+            off = before - rigid.apply(result.target_from_source @ rigid.inverse(guess), before)
+            across_m = np.linalg.norm(np.cross(off, before), axis=1) / np.linalg.norm(before, axis=1)
+            found.append(float(np.median(across_m)))
+    enough = len(found) >= MIN_DRIFTS
+    return LATERAL_ERROR_M + float(np.quantile(found, DRIFT_QUANTILE)) if enough else DRIFT_M
+
+
 def masked(references: References, hidden: Callable[[int], Bool[np.ndarray, "height width"]]) -> References:
     """Remove the references' depth where ``hidden`` of a frame (at any resolution) is set."""
     depth, size = references.depth.copy(), references.depth.shape[1:][::-1]
@@ -209,18 +244,18 @@ def seen_through(references: References, points_world: Float[np.ndarray, "point 
     """Return whether other references saw through a thing even where drift may have put it.
 
     Poses drift, so that votes see past things that stay. A reference is a witness if no shift of the points
-    (world, meters) across its line of sight, up to `DRIFT_M`, makes them a surface or hidden.
+    (world, meters) across its line of sight, up to the drift, makes them a surface or hidden.
     """
     points, witnesses = points_world[:: max(1, len(points_world) // VIEW_PROBES)], 0
     for reference in np.flatnonzero((references.frame != frame) & _in_view(references, points)):
         pose, pinhole = references.camera_from_world[reference], references.intrinsics[reference]
-        shifted = rigid.apply(pose, points) + SHIFTS_M[:, None]
+        shifted = rigid.apply(pose, points) + references.drift_m * SHIFTS[:, None]
         z = shifted[..., 2]
         measured = cameras.lookup_depth(references.depth[reference], pinhole, shifted, NEAREST_M)
         known = (measured > 0).sum(1)
         through = (measured - z > MARGIN_M + SIGMAS * references.noise.sigma_m(z)).sum(1)
         placed, past = known > len(points) / 2, through > MIN_THROUGH * known
-        witnesses += bool(placed[len(SHIFTS_M) // 2] and past[placed].all())
+        witnesses += bool(placed[len(SHIFTS) // 2] and past[placed].all())
         if witnesses == MIN_WITNESSES:
             return True
     return False

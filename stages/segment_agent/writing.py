@@ -17,8 +17,9 @@ from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.masks import Segmentation
 from stages.segment_agent.segmenter import Mask
 
-LOW_CONFIDENCE, CIRCLED = 0.75, 80
-"""probability below which presence is uncertain; least percent of a turnaround's frames with its animal"""
+LOW_CONFIDENCE, CIRCLED, MAX_DRIFT_CM = 0.75, 80, 10
+"""probability below which presence is uncertain; least percent of a turnaround's frames with its animal; the
+drift from which an animal as low is not known from furniture that seems to move"""
 RIGHT_IOU, WRONG_IOU = 0.75, 0.6
 """mean IoU that `evaluate` requires, and an estimate below that of all good masks: on nine sessions their
 estimates are at most 0.07 off, those of bad masks up to 0.14 too high and 0.22 too low"""
@@ -137,6 +138,7 @@ def report_quality(
         poses, masks = found.path.world_from_camera, Masks.open(folder)
         by_space = overlap.estimate(clip, poses, found.references, masks, animal, found.shown)
         checks = checks_of(summary, found.path.residual_m, by_space, circled=found.people is None)
+        checks.append(Check("drift of poses", 100 * found.references.drift_m, "cm", warn=MAX_DRIFT_CM))
     if found.unknown_animals is not None:
         checks = checks if any(summary.visible) else []
         checks.append(Check("frames with a stranger", 100 * found.unknown_animals, "%", warn=5))

@@ -76,3 +76,20 @@ def test_nothing_is_tracked_in_an_empty_room_with_poor_poses(tmp_path):
     clip = Clip.open(tmp_path)
     references = free_space.gather(clip, wrong, 40)
     assert not any(locate.find_mover(clip, wrong, references, AnimalConfig(), None))
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.05])
+def test_drift_is_measured(tmp_path, off_m):
+    """Poses of the second half are off, more than what is tolerated anyway."""
+    poses, agent = scenery.session()
+    scenery.record(tmp_path, poses, np.full_like(agent, np.nan), poses)
+    wrong = poses.copy()
+    wrong[20:] = scenery.rigid.exp(np.array([0, 0, 0, off_m, 0, 0])) @ poses[20:]
+    drift_m = free_space.gather(Clip.open(tmp_path), wrong, 40).drift_m
+    assert abs(drift_m - free_space.LATERAL_ERROR_M - off_m) < 0.02
+
+
+def test_drift_is_assumed_where_nothing_overlaps(tmp_path):
+    poses, agent = scenery.session()
+    scenery.record(tmp_path, poses[:4], np.full_like(agent[:4], np.nan), poses[:4])
+    assert free_space.gather(Clip.open(tmp_path), poses[:4], 4).drift_m == free_space.DRIFT_M
