@@ -65,7 +65,7 @@ def find_bodies(
         points, area, chosen = free_space.sample(clip, frame, pose, depth, COARSE_PX)
         votes = free_space.vote(references, points, frame)
         label, whole = np.where(movers.moving(votes), np.uint8(MOVES), np.uint8(0)), []
-        for body in split_bodies(opened_motion(votes), depth[chosen]):
+        for body in split_bodies(opened_motion(votes, movers.SURE_SHARES[-1]), depth[chosen]):
             extent_m = np.ptp(np.quantile(points[body], INNER, axis=0), axis=0).max()
             if area[body].sum() >= MIN_BODY_M2 and extent_m < animal.largest_m and len(whole) < MOVES - 1:
                 whole.append(body[RIM:-RIM, RIM:-RIM].sum() == body.sum())

@@ -41,19 +41,23 @@ def find_mover(
     Without known appearance, only the part of the track connected to a prompt is certain; the rest may have
     switched to another mover and is presumed. ``margin_of`` gives log-odds against a home's other animals.
     """
-    found = [
-        _candidates(clip, frame, pose, references, animal, (appearance, margin_of))
-        for frame, pose in enumerate(world_from_camera)
-    ]
-    chosen = movers.track(found, clip.timestamp_s, animal, prompt)
-    if appearance is not None:
-        reliable = movers.plausible(chosen, clip.timestamp_s, animal)
-    elif prompt is None:
-        reliable = movers.self_moving(chosen, clip.timestamp_s, animal)
-    else:
-        reliable = movers.connected_to_prompt(chosen, clip.timestamp_s, animal, prompt)
+    for share in movers.SURE_SHARES if appearance is None else (0.0,):
+        found = [
+            _candidates(clip, frame, pose, references, animal, (appearance, margin_of), share)
+            for frame, pose in enumerate(world_from_camera)
+        ]
+        chosen = movers.track(found, clip.timestamp_s, animal, prompt)
+        seen = np.array([candidate is not None for candidate in chosen])
+        if appearance is not None:
+            reliable = movers.plausible(chosen, clip.timestamp_s, animal)
+        elif prompt is None:
+            reliable = movers.self_moving(chosen, clip.timestamp_s, animal)
+        else:
+            reliable = movers.connected_to_prompt(chosen, clip.timestamp_s, animal, prompt)
+        if reliable.any():
+            break
     if prompt is None and not reliable.any():
-        reliable = np.array([candidate is not None for candidate in chosen])
+        reliable = seen
     radii = [each.radius_m for each, sure in zip(chosen, reliable, strict=True) if each and sure]
     radius = float(np.clip(SCALE * np.quantile(radii, 0.9), MIN_RADIUS_M, animal.largest_m)) if radii else 0.0
     spheres = [
@@ -86,6 +90,7 @@ def _candidates(
     references: References,
     animal: AnimalConfig,
     known: tuple[AppearanceOf | None, AppearanceOf | None],
+    share: float,
 ) -> list[Candidate]:
     """Group the points of one frame that move or, if the appearance is known, are likely the animal.
 
@@ -106,7 +111,7 @@ def _candidates(
     votes = free_space.vote(references, points, frame)
     through = partial(free_space.seen_through, references, frame=frame)
     if appearance is None:
-        own, probability = opened_motion(votes), np.ones(area.shape)
+        own, probability = opened_motion(votes, share), np.ones(area.shape)
         if margin_of is not None:
             margins = resample_nearest(margin_of(frame), clip.depth_size, chosen)
             own, probability = identity.select_animal(own, margins)
@@ -121,9 +126,9 @@ def _candidates(
     return movers.candidates(both > 0, 1 / (1 + np.exp(-both)), points, area, animal, through, motion > 0)
 
 
-def opened_motion(votes: Votes) -> Bool[np.ndarray, "row column"]:
+def opened_motion(votes: Votes, share: float) -> Bool[np.ndarray, "row column"]:
     """Return the samples in space that is free at a good share of other times, morphologically opened."""
-    reliable = (votes.free > movers.MIN_VOTES) & (votes.free >= movers.SURE_SHARE * votes.occupied)
+    reliable = (votes.free > movers.MIN_VOTES) & (votes.free >= share * votes.occupied)
     opened = cv2.dilate(cv2.erode(reliable.astype(np.uint8), OPENING), OPENING[::-1, ::-1], anchor=(0, 0))
     return reliable & (opened > 0)
 

@@ -19,8 +19,9 @@ from stages.segment_agent.free_space import Votes
 
 PROMPT_REWARD, PROMPT_SLACK_M = 1000.0, 0.2
 """score of a candidate at the prompt, above all else; tolerated distance of the prompt from it"""
-SURE_SHARE = 0.3
-"""references that must have seen through a mover's points, as a share of those that saw a surface there"""
+SURE_SHARES = (1.0, 0.3)
+"""references that must have seen through a point for training, as a share of those that saw a surface there;
+the second is used if nothing travels by the first"""
 TRAVEL_M = 0.2
 """distance that a mover must travel to be certainly an animal: things moved by people stay in place"""
 JUMP_M = 0.1

@@ -48,7 +48,7 @@ def estimate(
         inside = (labels == 255) & (right | seen)
         intersection_m2.append(area_m2[inside & right].sum())
         union_m2.append(area_m2[inside].sum())
-        outside = locate.opened_motion(votes) & (labels == 0) & (shown == "moving")
+        outside = locate.opened_motion(votes, movers.SURE_SHARES[0]) & (labels == 0) & (shown == "moving")
         missing.append(movers.candidates(outside, right, points, area_m2, animal, through))
     time_s = clip.timestamp_s[::EVERY]
     chosen = movers.track(missing, time_s, animal)
