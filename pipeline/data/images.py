@@ -146,11 +146,6 @@ def _check_exr_size(path: Path) -> None:
         raise InputError("CAP-022", "not an EXR picture of a sensible size", str(path), EXPORT_AGAIN)
 
 
-def lab(color: UInt8[np.ndarray, "height width channel"]) -> Float[np.ndarray, "height width 3"]:
-    """Convert RGB, or RGBA without its alpha, to CIE Lab of 8 bits: 0..255 each, a and b around 128."""
-    return cv2.cvtColor(np.ascontiguousarray(color[..., :3]), cv2.COLOR_RGB2LAB).astype(np.float32)
-
-
 def linear_from_srgb(srgb: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
     """Return linear intensities of sRGB values, both 0..1 (IEC 61966-2-1)."""
     low = srgb / SRGB_SLOPE

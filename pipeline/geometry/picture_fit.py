@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.data import images
 from pipeline.geometry import cameras, rigid
 from pipeline.geometry.meshes import Mesh, RayCaster
 
@@ -61,7 +60,7 @@ class BodyPicture:
 def colored_body(mesh: Mesh) -> ColoredBody:
     """Return a mesh to be compared with pictures; ``mesh`` must have colors."""
     assert mesh.color is not None, "templates have colors"
-    return ColoredBody(RayCaster(mesh), images.lab(mesh.color[None])[0], np.zeros(3), np.array(ROUGH))
+    return ColoredBody(RayCaster(mesh), lab(mesh.color[None])[0], np.zeros(3), np.array(ROUGH))
 
 
 def body_picture(
@@ -89,8 +88,8 @@ def body_picture(
         for each in (mask, depth)
     )
     rays = cameras.ray_directions(lens, height, width).reshape(-1, 3)
-    lab = images.lab(small).reshape(-1, 3)
-    return BodyPicture(rays, lab, labels == 255, labels != 128, depth, world_from_camera)
+    colors = lab(small).reshape(-1, 3)
+    return BodyPicture(rays, colors, labels == 255, labels != 128, depth, world_from_camera)
 
 
 def residuals(
@@ -157,3 +156,8 @@ def _rendered(picture, body, world_from_body):
     vertex = body.caster.mesh.faces[np.maximum(hits.face, 0), hits.barycentric.argmax(-1)]
     hidden = ~picture.inside & (picture.depth > 0) & (picture.depth < hits.distance)
     return (hits.face >= 0) & ~hidden, body.lab[vertex]
+
+
+def lab(color: UInt8[np.ndarray, "height width channel"]) -> Float[np.ndarray, "height width 3"]:
+    """Convert RGB, or RGBA without its alpha, to CIE Lab of 8 bits: 0..255 each, a and b around 128."""
+    return cv2.cvtColor(np.ascontiguousarray(color[..., :3]), cv2.COLOR_RGB2LAB).astype(np.float32)

@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.data import images
-from pipeline.geometry import cameras
+from pipeline.geometry import cameras, picture_fit
 from pipeline.segmentation.appearance import Appearance, strongest
 from pipeline.segmentation.grabcut import Region, dilated, outlined
 from stages.estimate_depth import views
@@ -49,7 +48,7 @@ class ColorView:
 def color_view(color: UInt8[np.ndarray, "height width 3"], view: View) -> ColorView:
     """Add colors to a view."""
     small = cv2.resize(color, view.gray.shape[::-1], interpolation=cv2.INTER_AREA)
-    lab = images.lab(small)
+    lab = picture_fit.lab(small)
     return ColorView(view, small, cv2.GaussianBlur(lab, (3, 3), SOFTNESS_PX))
 
 

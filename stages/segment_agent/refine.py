@@ -12,7 +12,7 @@ import numpy as np
 import scipy.ndimage
 from jaxtyping import Bool, Float, Int, UInt8
 
-from pipeline.data import images
+from pipeline.geometry import picture_fit
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def _components(
 
 def _bin(color: UInt8[np.ndarray, "pixel 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Lab bins; lightness is coarser than color to tolerate shading."""
-    lab = images.lab(color.reshape(1, -1, 3))[0].astype(np.int32)
+    lab = picture_fit.lab(color.reshape(1, -1, 3))[0].astype(np.int32)
     light = lab[:, 0] * (BINS - 1) // 255
     tone = np.clip((lab[:, 1:] - 128) * BINS // AB_RANGE + BINS // 2, 0, BINS - 1)
     return light, tone[:, 0], tone[:, 1]
