@@ -99,13 +99,11 @@ def place(
     ``matches`` are the landmarks of each frame, ``bounds`` the map's least and largest coordinates, meters.
     Without a ``lens``, its focal length is estimated.
     """
-    start = lens or nominal(pictures.color_size)
-    found = reconstruct(pictures, start, seed, calibrate=lens is None)
+    found = reconstruct(pictures, lens or nominal(pictures.color_size), seed, calibrate=lens is None)
     if found is None:
         return None
     model, lens = found
-    pairs = match_points(model, matches)
-    model_from_world = align(model, pairs, lens, bounds, seed)
+    model_from_world = align(model, match_points(model, matches), lens, bounds, seed)
     if model_from_world is None:
         return None
     poses = np.full((len(pictures), 4, 4), np.nan)

@@ -102,7 +102,9 @@ class Segmenter:
                 labels = refine.label(log_odds, sure, self.edges)
             case Appearance() as network:
                 log_ratio = network.log_odds_within(color, window.rows, window.columns)
-                labels, sure = self._by_appearance(window, evidence, log_ratio)
+                # A small animal looks less like itself; where it is tracked, what looks like it is it.
+                sure_at = SURE if self.outline_rng is None or sphere.presumed else 0.0
+                labels, sure = self._by_appearance(window, evidence, log_ratio, sure_at)
         if self.outline_rng is not None:
             part = strongest(labels == 255, log_ratio)
             sharp = outlined(window.color, part, log_ratio, self.outline_rng)
@@ -132,9 +134,9 @@ class Segmenter:
         return on_track + similarity + PRESENCE_MOVED * moved
 
     def _by_appearance(
-        self, window: Window, evidence: Evidence, log_ratio: Float[np.ndarray, "height width"]
+        self, window: Window, evidence: Evidence, log_ratio: Float[np.ndarray, "height width"], sure_at: float
     ) -> tuple[UInt8[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
-        """Return labels and sure pixels, by evidence and the learned appearance.
+        """Return labels and sure pixels, above ``sure_at``, by evidence and the learned appearance.
 
         Color change counts as far as it looks like the animal. Small masks need support, since noise makes
         them too. If none is found, clearly moving pixels are sure: small views are all depth steps.
@@ -145,7 +147,7 @@ class Segmenter:
         weight = np.where(blind, APPEARANCE_WEIGHT_BLIND, APPEARANCE_WEIGHT)
         most = np.where(blind, APPEARANCE_ALONE, 0.0)
         log_odds = known + np.clip(weight * log_ratio, -APPEARANCE_AGAINST, most) - DOUBT
-        strict = (log_odds > SURE) & (evidence.animal | (log_ratio > 0))
+        strict = (log_odds > sure_at) & (evidence.animal | (log_ratio > 0))
         relaxed = strict | ((log_odds > SURE) & evidence.moving)
         for sure, enough_px in ((strict, SMALL_PX), (relaxed, np.inf)):
             labels = refine.remove_strays(refine.label(log_odds, sure, self.edges), log_ratio)

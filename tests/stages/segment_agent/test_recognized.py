@@ -22,10 +22,14 @@ POSTER = np.s_[2:14, 70:88]
 class KnownColor(Appearance):
     """Recognizes the animal by its color."""
 
+    def __init__(self, most=4.0):
+        super().__init__()
+        self.most = most
+
     def log_odds(self, color):
-        """Return 4 where the color is the animal's, -4 elsewhere."""
+        """Return the most where the color is the animal's, -4 elsewhere."""
         away = np.linalg.norm(color.astype(np.float32) - scenery.ANIMAL_COLOR, axis=-1)
-        return np.where(away < 40, 4, -4).astype(np.float32)
+        return np.where(away < 40, self.most, -4).astype(np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +70,7 @@ def test_what_is_recognized_is_segmented_where_depth_is_wrong(session):
     recognized, relearned = overlaps(session, KnownColor()), overlaps(session, None)
     assert recognized.mean() > 0.78, "share of known pixels; the pictures are 90 pixels wide"
     assert recognized.mean() > relearned.mean() + 0.1
+    assert overlaps(session, KnownColor(1.5)).mean() > 0.6, "hardly recognized, but tracked"
 
 
 def test_only_the_strongest_component_is_the_animal():
