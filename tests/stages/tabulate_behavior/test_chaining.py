@@ -19,6 +19,9 @@ class Breathing:
 
     corrections, scaling = True, scaling()
 
+    def avoids_solid(self, sampling):
+        return True
+
     def codes(self, observation, sampling, count=1):
         rows = count * len(observation)
         return PlanCondition(np.zeros((rows, 1)), (), np.zeros((rows, 3)), sampling, None, count)
