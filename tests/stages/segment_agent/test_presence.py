@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.geometry import rigid
+from pipeline.segmentation.grabcut import SURE
 from stages.segment_agent import free_space, movers, segmenter, writing
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.evidence import Evidence
@@ -136,11 +137,11 @@ def test_appearance_decides_without_geometry():
     evidence = Evidence(np.zeros(shape), np.full(shape, 0.05), unknown, unknown, unknown)
     window = cast(Window, SimpleNamespace(color=np.full((*shape, 3), 128, np.uint8)))
     instance = cast(Segmenter, SimpleNamespace(edges=Edges()))
-    labels, _ = Segmenter._by_appearance(instance, window, evidence, like)
+    labels, _ = Segmenter._by_appearance(instance, window, evidence, like, SURE)
     assert ((labels == 255) & animal).sum() > 0.9 * animal.sum()
     assert not (labels == 255)[~animal].any()
     static = Evidence(np.full(shape, -3.0), np.ones(shape), unknown, unknown, ~unknown)
-    labels, _ = Segmenter._by_appearance(instance, window, static, like)
+    labels, _ = Segmenter._by_appearance(instance, window, static, like, SURE)
     assert not (labels == 255).any()
 
 
@@ -154,7 +155,7 @@ def test_specular_surfaces_are_labeled_by_appearance():
     evidence = Evidence(color_change - 2.0, np.ones(shape), animal, no, no, color_change)
     window = cast(Window, SimpleNamespace(color=np.full((*shape, 3), 128, np.uint8)))
     labels, _ = Segmenter._by_appearance(
-        cast(Segmenter, SimpleNamespace(edges=Edges())), window, evidence, like
+        cast(Segmenter, SimpleNamespace(edges=Edges())), window, evidence, like, SURE
     )
     assert ((labels == 255) & animal).sum() > 0.8 * animal.sum()
     assert (labels == 255)[gloss].mean() < 0.1
