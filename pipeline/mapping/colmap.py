@@ -3,7 +3,7 @@
 `extract`, `match` and `mapping_options` make a model; `read_sparse_model` reads it.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -77,6 +77,11 @@ def mapping_options(seed: int, *, calibrate: bool = False) -> pycolmap.Increment
     mapping.mapper.init_min_tri_angle = FIRST_PAIR_DEG
     mapping.mapper.abs_pose_min_num_inliers = MIN_POSE_INLIERS
     return mapping
+
+
+def largest(models: Mapping[int, pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:
+    """Return the model with most registered pictures, then points; None without any."""
+    return max(models.values(), key=lambda each: (each.num_reg_images(), each.num_points3D()), default=None)
 
 
 @dataclass(frozen=True)

@@ -93,10 +93,8 @@ def reconstruct(clip: Clip, config: SfmConfig, workspace: Path, seed: int) -> Sp
     verified, pairs = verify_matches(clip, database, np.random.default_rng(seed))
     log(f"depth confirms {verified} of {pairs} matched pairs of {len(keyframes)} keyframes")
     models = pycolmap.incremental_mapping(database, pictures, workspace, colmap.mapping_options(seed))
-    if not models:
-        return None
-    largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    return read_sparse_model(largest) if largest.num_reg_images() >= MIN_KEYFRAMES else None
+    model = colmap.largest(models)
+    return read_sparse_model(model) if model and model.num_reg_images() >= MIN_KEYFRAMES else None
 
 
 def back_project(

@@ -59,6 +59,12 @@ class Lens:
         corner = np.hypot(*self.size) / 2 / self.focal_px
         return abs(self.radial) * corner**3 * self.focal_px > MIN_DISTORTION_PX
 
+    def project(self, points_camera: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point 2"]:
+        """Project points in front of the camera to pixels."""
+        flat = points_camera[:, :2] / np.maximum(points_camera[:, 2:], 1e-3)
+        distorted = flat * (1 + self.radial * (flat**2).sum(1, keepdims=True))
+        return self.focal_px * distorted + np.array(self.size[::-1]) / 2
+
     def undistorted(self, color: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
         """Undistort a picture."""
         if not self.is_distorted:
@@ -147,16 +153,13 @@ def bundle_adjust(lens: Lens, located: Sequence[PnPResult], *, distortion: bool 
     frame = np.repeat(np.arange(len(located)), count)
     pixel = np.concatenate([each.matches.pixel for each in located])
     points = np.concatenate([each.matches.points_world for each in located])
-    center = np.array(lens.size[::-1]) / 2
 
     def residuals(values):
         (scale, radial), twist = values[:2], values[2:].reshape(-1, 6)
         rotation = Rotation.from_rotvec(twist[:, :3]).as_matrix() @ camera_from_world[:, :3, :3]
         moved = np.einsum("mij,mj->mi", rotation[frame], points)
         moved += (camera_from_world[:, :3, 3] + twist[:, 3:])[frame]
-        flat = moved[:, :2] / np.maximum(moved[:, 2:], 1e-3)
-        distorted = flat * (1 + radial * (flat**2).sum(1, keepdims=True))
-        off_px = (scale * lens.focal_px * distorted + center - pixel).ravel()
+        off_px = (Lens(scale * lens.focal_px, radial, lens.size).project(moved) - pixel).ravel()
         sigma = RADIAL_SIGMA if distortion else 1e-6
         return np.append(off_px, (radial - lens.radial) * np.sqrt(len(pixel)) / sigma)
 

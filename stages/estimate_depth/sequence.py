@@ -76,10 +76,7 @@ class PointMatches:
         """Return the reprojection errors of the landmarks; infinite behind the camera."""
         camera_from_world = self.camera_from_model @ model_from_world
         points = rigid.apply(camera_from_world, self.points_world[:, None])[:, 0]
-        flat = points[:, :2] / np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
-        flat *= 1 + lens.radial * (flat**2).sum(1, keepdims=True)
-        off = lens.focal_px * flat + np.array(lens.size[::-1]) / 2 - self.pixel
-        return np.where(np.isfinite(off), off, np.inf)
+        return np.where(points[:, 2:] > 0, lens.project(points) - self.pixel, np.inf)
 
     def inliers(self, model_from_world: Float[np.ndarray, "4 4"], lens: Lens) -> "PointMatches":
         """Return the pairs that agree with a similarity transform."""
@@ -128,12 +125,12 @@ def reconstruct(
         options = colmap.mapping_options(seed, calibrate=calibrate)
         options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = False
         models = pycolmap.incremental_mapping(database, folder, Path(workspace), options)
-    if not models:
+    model = colmap.largest(models)
+    if model is None:
         return None
-    largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    focal_px = float(next(iter(largest.cameras.values())).params[0])
-    log(f"structure from motion: {largest.num_reg_images()} of {len(names)} frames, focal {focal_px:.1f} px")
-    return colmap.read_sparse_model(largest), Lens(focal_px, start.radial, start.size)
+    focal_px = float(next(iter(model.cameras.values())).params[0])
+    log(f"structure from motion: {model.num_reg_images()} of {len(names)} frames, focal {focal_px:.1f} px")
+    return colmap.read_sparse_model(model), Lens(focal_px, start.radial, start.size)
 
 
 def match_points(model: SparseModel, matches: Sequence[Matches]) -> PointMatches:
@@ -195,10 +192,8 @@ def cameras_of(
 
 def _similarities(points_model, points_world) -> Float[np.ndarray, "good 4 4"]:
     """Return ``model_from_world`` of the triplets whose shapes agree."""
-    extent, extent_m = (
-        np.linalg.norm(points - points.mean(1, keepdims=True), axis=(1, 2))
-        for points in (points_model, points_world)
-    )
+    both = points_model, points_world
+    extent, extent_m = (np.linalg.norm(each - each.mean(1, keepdims=True), axis=(1, 2)) for each in both)
     scale = extent / np.maximum(extent_m, MIN_SIDE_M)
     scaled = points_world * scale[:, None, None]
     found = alignment.kabsch(scaled, points_model)

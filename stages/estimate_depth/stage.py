@@ -55,15 +55,13 @@ def run(
     """
     pictures, walk = Pictures.open(inputs.pictures), Clip.open(next(iter(inputs.frames.values())))
     walk_cameras = SceneCameras.open(inputs.scene_template)
-    mesh = ply.read_ply(inputs.scene_template / "mesh.ply")
-    caster = RayCaster(mesh)
+    caster = RayCaster(ply.read_ply(inputs.scene_template / "mesh.ply"))
     network = None if config.backend == "contact" else MonocularDepth(config.backend, config.weights, device)
     known = landmarks.build(walk, walk_cameras, caster)
     keyframes = landmarks.keyframe_numbers(walk_cameras).tolist()
     walk_views = [_walk_view(walk, walk_cameras, frame, caster) for frame in keyframes]
     room = MapViews(caster, [each.view for each in walk_views])
-    bounds = np.stack([mesh.vertices.min(0), mesh.vertices.max(0)])
-    found, tracked = _placed(pictures, known, room, bounds, config)
+    found, tracked = _placed(pictures, known, room, config)
     placed = np.flatnonzero(tracked.placed)
     if len(placed) < max(MIN_FRAMES, MIN_PLACED * len(pictures)):
         raise _unrecognized(pictures, f"{len(placed)} of {len(pictures)} frames find a place in the map")
@@ -103,7 +101,7 @@ def _walk_view(walk: Clip, walk_cameras: SceneCameras, frame: int, caster: RayCa
 
 
 def _placed(
-    pictures: Pictures, known: landmarks.Landmarks, room: MapViews, bounds: np.ndarray, config: Config
+    pictures: Pictures, known: landmarks.Landmarks, room: MapViews, config: Config
 ) -> tuple[Lens, Tracked]:
     """Calibrate the lens and estimate the camera poses: by frames, then, if many have none, as a whole."""
     frames = range(len(pictures))
@@ -123,6 +121,7 @@ def _placed(
     if by_frames is not None and by_frames[1].placed.mean() >= ENOUGH_PLACED:
         return by_frames
     log("many frames alone find no place in the map; placing the video as a whole")
+    bounds = np.quantile(room.caster.mesh.vertices, [0, 1], axis=0)
     whole = sequence.place(pictures, matches, found, bounds, config.seed)
     as_whole = None if whole is None else tracked(*whole)
     results = [each for each in (by_frames, as_whole) if each is not None]

@@ -105,12 +105,12 @@ def solve(
     models = pycolmap.incremental_mapping(database, pictures, workspace, mapping)
     sizes = sorted((model.num_reg_images() for model in models.values()), reverse=True)
     log(f"COLMAP: {len(pairs)} pairs of {len(names)} keyframes; models of {sizes or 'no'} pictures")
-    if not sizes or sizes[0] < MIN_KEYFRAMES:
+    model = colmap.largest(models)
+    if model is None or model.num_reg_images() < MIN_KEYFRAMES:
         return None
-    largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    camera = next(iter(largest.cameras.values()))
+    camera = next(iter(model.cameras.values()))
     radial = float(camera.params[3]) if intrinsics is None else 0.0
-    return Structure(read_sparse_model(largest), camera.calibration_matrix(), radial, len(sizes))
+    return Structure(read_sparse_model(model), camera.calibration_matrix(), radial, len(sizes))
 
 
 def _parallax_share(database: Path) -> float:
