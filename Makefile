@@ -38,6 +38,8 @@ rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)
 $(foreach name,AGENT NAME ABSENT REPLAYED OTHER VARIANT FORMAT PLACES PROCESSES LOCK BODY,$(if $(call rest,$(PLAIN),$(value $(name))),$(error REC-004 \
   $(name) is no plain name: use a-z, 0-9, _ and -)))
 $(if $(call rest,$(PLAIN) = .,$(subst $() $(),,$(value GUIDANCE))),$(error REC-004 GUIDANCE is no list of NAME=SCALE: person=1.5 dog=2))
+$(if $(NESTED),,$(if $(and $(NAME),$(WANTED)),$(error REC-004 NAME is for export, serve, simulate and verify: a build makes all \
+  animals of a home)))
 # Folder of an agent, of its variant, or of one animal of a home (NAME=); `INPUTS` takes what a variant does not change from
 # its agent.
 ANIMAL := $(or $(AGENT),cat)

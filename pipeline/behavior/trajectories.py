@@ -271,14 +271,15 @@ class BehaviorData:
 
         agent, camera = gather("world_from_agent"), gather("world_from_camera")
         bone = gather("agent_from_bone", slice(None) if bones else slice(0, 0))
-        observer, companions = camera[:, : self.past], self._companions(index, frames[:, : self.past])
+        observer, companions = camera[:, : self.past], self.companions(index, frames[:, : self.past])
         past, others = (agent[:, : self.past], bone[:, : self.past]), (observer[..., :3, :3], companions)
         context = Context(*past, observer[..., :3, 3], self.video[index], *others)
         return context, Future(agent[:, self.past :], bone[:, self.past :])
 
-    def _companions(
+    def companions(
         self, index: Int[np.ndarray, "window"], frames: Int[np.ndarray, "window past_frame"]
     ) -> Float[np.ndarray, "window companion past_frame 4"] | None:
+        """Return companions of the windows' recordings in these frames; NaN if absent, None without any."""
         tracks = [self.trajectories[name].companions for name in self.videos]
         most = max((track.shape[1] for track in tracks if track is not None), default=0)
         if not most:
@@ -297,7 +298,7 @@ class BehaviorData:
         parts = []
         for begin in range(0, len(index), WINDOWS_AT_ONCE):
             some = slice(begin, begin + WINDOWS_AT_ONCE)
-            there = self._companions(index[some], self.start[index[some]][:, None] + np.arange(self.past))
+            there = self.companions(index[some], self.start[index[some]][:, None] + np.arange(self.past))
             if there is not None:
                 parts.append(nearest(there, agent[some])[0])
         most = max((part.shape[1] for part in parts), default=0)

@@ -57,6 +57,12 @@ class Home:
         """Return the folder of its plan."""
         return Path("build", str(self), "plan")
 
+    @property
+    def command(self) -> str:
+        """Return the command that plans and builds it."""
+        command = f"make behavior-tables AGENT={self.agent}" if self.tables else f"make {self.agent}"
+        return command + (f" VARIANT={self.variant}" if self.variant else "")
+
     @functools.cached_property
     def base(self) -> "Home":
         """Return the agent's own home."""
@@ -231,7 +237,7 @@ def read_jobs(home: Home) -> list[dict[str, Any]]:
     try:
         return json.loads(jobs_file(home).read_text())
     except FileNotFoundError:
-        raise InputError("RUN-001", "is not planned yet", str(home), f"run `make {home}`") from None
+        raise InputError("RUN-001", "is not planned yet", str(home), f"run `{home.command}`") from None
 
 
 def read_job(home: Home, job_id: str) -> dict[str, Any]:
@@ -243,9 +249,9 @@ def read_job(home: Home, job_id: str) -> dict[str, Any]:
             if start:
                 return json.loads(text[start : text.find(b"\n", start)].rstrip(b","))
     except FileNotFoundError:
-        raise InputError("RUN-001", "is not planned yet", str(home), f"run `make {home}`") from None
+        raise InputError("RUN-001", "is not planned yet", str(home), f"run `{home.command}`") from None
     except (ValueError, RecursionError) as error:
-        remedy = f"delete {path}, and run `make {home}`"
+        remedy = f"delete {path}, and run `{home.command}`"
         raise InputError("RUN-001", "holds no planned jobs", str(path), remedy) from error
     raise InputError("RUN-001", f"has no job {job_id!r}", str(home), f"see {path}")
 

@@ -68,21 +68,20 @@ def rollouts(
     seconds: float,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "life frame 4 4"]:
-    """Roll out the model from some windows in their homes; recorded observers walk in a loop."""
+    """Roll out the model from some windows in their homes; recorded others move in a loop."""
     rest, chaining = data.agent_from_bone_rest, ReplanningConfig()
     animals = AnimalBatch(ats.sampler, scenes, rest, ats.ego, sampling=ats.sampling, chaining=chaining)
     context, _ = data.windows(window)
     walks = [
         data.trajectories[data.videos[video]].world_from_camera[:, :3, 3] for video in data.video[window]
     ]
-    animals.begin(context, rng)
+    length = np.array([len(walk) for walk in walks])[:, None]
+    animals.begin(context, rng, companions=context.companions)
     root = [context.world_from_agent[:, -1]]
-    for step in range(round(seconds * data.rate_hz)):
-        seen = [
-            walk[(start + data.past + step) % len(walk)]
-            for walk, start in zip(walks, data.start[window], strict=True)
-        ]
-        root.append(animals.step(np.array(seen)).root[:, 0])
+    for step in range(1, round(seconds * data.rate_hz) + 1):
+        frames = (data.start[window][:, None] + step + np.arange(data.past)) % length
+        seen = [walk[frame] for walk, frame in zip(walks, frames[:, -1], strict=True)]
+        root.append(animals.step(np.array(seen), data.companions(window, frames)).root[:, 0])
     return np.stack(root, axis=1)
 
 

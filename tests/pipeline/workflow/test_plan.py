@@ -205,6 +205,8 @@ def test_an_unknown_animal_is_refused_before_anything_is_built(small_checkout):
     (small_checkout.folder / "captures/toy/turnaround_dog.r3d").unlink()
     shutil.rmtree(small_checkout.folder / "build")
     assert "leave out NAME=" in small_checkout.make("serve", "AGENT=toy", "NAME=cat").stderr
+    built = small_checkout.make("toy.frames", "NAME=dog")
+    assert built.returncode == 2 and "a build makes all animals of a home" in built.stderr
 
 
 def test_misspelled_variables_are_refused(small_checkout):
@@ -354,6 +356,8 @@ def test_variant_shares_unaffected_artifacts(small_checkout):
     assert refused.returncode == 2 and refused.stderr.startswith("error: REC-007 ")
     unplanned = small_checkout.python("pipeline.workflow.plan", "redo", "nosuch", "masks")
     assert unplanned.returncode == 2 and unplanned.stderr.startswith("error: RUN-001 ")
+    variant = small_checkout.python("pipeline.workflow.run", "toy/variants/paper", "masks")
+    assert "run `make toy VARIANT=paper`" in variant.stderr
     listed = small_checkout.python("pipeline.workflow.plan", "redo", "toy", "pictures").stderr
     assert "REC-007" in listed and " frames," in listed and " pictures" not in listed.split("->")[1]
 
