@@ -81,7 +81,7 @@ class Clip:
 
     @property
     def has_foreground(self) -> bool:
-        """Return whether what stands in front of the map was segmented: in a mapped turnaround."""
+        """Return whether the animal in front of the map was segmented: where depth comes from the map."""
         return (self.folder / "foreground").exists()
 
     @classmethod
@@ -112,7 +112,7 @@ class Clip:
         return images.read_gray(self.folder / "confidence" / f"{frame:06d}.png")
 
     def foreground(self, frame: int) -> UInt8[np.ndarray, "height width"]:
-        """Read what stands in front of the map, 255, else 0, of a recording that `has_foreground`."""
+        """Read where the animal stands in front of the map, 255, else 0; only if `has_foreground`."""
         return images.read_gray(self.folder / "foreground" / f"{frame:06d}.png")
 
 

@@ -5,7 +5,6 @@ Standard library only, without side effects: `plan` writes the jobs, `run` runs 
 
 import functools
 import json
-import mmap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -234,26 +233,27 @@ def jobs_file(home: Home) -> Path:
 
 def read_jobs(home: Home) -> list[dict[str, Any]]:
     """Read all planned jobs. Raises RUN-001."""
-    try:
-        return json.loads(jobs_file(home).read_text())
-    except FileNotFoundError:
-        raise InputError("RUN-001", "is not planned yet", str(home), f"run `{home.command}`") from None
+    return json.loads(_planned(home))
 
 
 def read_job(home: Home, job_id: str) -> dict[str, Any]:
     """Read a planned job, parsing only its line of thousands. Raises RUN-001."""
-    path = jobs_file(home)
+    text = _planned(home)
+    start = text.find(f'\n{{"id": {json.dumps(job_id)},'.encode()) + 1
+    if not start:
+        raise InputError("RUN-001", f"has no job {job_id!r}", str(home), f"see {jobs_file(home)}")
     try:
-        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
-            start = text.find(f'\n{{"id": {json.dumps(job_id)},'.encode()) + 1
-            if start:
-                return json.loads(text[start : text.find(b"\n", start)].rstrip(b","))
+        return json.loads(text[start : text.find(b"\n", start)].rstrip(b","))
+    except (ValueError, RecursionError) as error:
+        remedy = f"delete {jobs_file(home)}, and run `{home.command}`"
+        raise InputError("RUN-001", "holds no planned jobs", str(jobs_file(home)), remedy) from error
+
+
+def _planned(home: Home) -> bytes:
+    try:
+        return jobs_file(home).read_bytes()
     except FileNotFoundError:
         raise InputError("RUN-001", "is not planned yet", str(home), f"run `{home.command}`") from None
-    except (ValueError, RecursionError) as error:
-        remedy = f"delete {path}, and run `{home.command}`"
-        raise InputError("RUN-001", "holds no planned jobs", str(path), remedy) from error
-    raise InputError("RUN-001", f"has no job {job_id!r}", str(home), f"see {path}")
 
 
 def redo_mark(home: str, job_id: str) -> Path:

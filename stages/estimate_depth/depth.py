@@ -56,7 +56,7 @@ class FrameDepth:
     inferred: bool
     """Whether part of it is an animal's, by contact or by a network."""
     foreground: UInt8[np.ndarray, "height width"] | None = None
-    """255 where something stands in front of the map, else 0; only of turnarounds."""
+    """255 where the animal stands in front of the map, else 0."""
 
 
 def of_map(target: ColorView) -> FrameDepth:
@@ -114,9 +114,8 @@ def _with_animal(frame, target: ColorView, blobs, touched, carried, length_m, de
     """Insert the foreground's depth into the map's; around the foreground it is unknown."""
     room, view = of_map(target), target.view
     depth, confidence, inferred = room.depth.copy(), room.confidence.copy(), False
-    union = np.zeros(depth.shape, bool)
-    for blob in blobs:
-        union |= cv2.dilate(blob.astype(np.uint8), DILATION) > 0
+    shown = np.any([np.zeros(depth.shape, bool), *blobs], axis=0).astype(np.uint8)
+    union = cv2.dilate(shown, DILATION) > 0
     depth[union], confidence[union] = 0, 0
     by_network = None if depth_net is None or not blobs else depth_net(frame, room.depth, ~union)
     for blob, each in zip(blobs, touched, strict=True):
@@ -135,7 +134,7 @@ def _with_animal(frame, target: ColorView, blobs, touched, carried, length_m, de
         extent_m = max(np.ptp(rows), np.ptp(columns)) * np.median(own[own > 0]) / view.intrinsics[0, 0]
         if extent_m < LARGEST_SHARE * length_m:
             depth[own > 0], confidence[own > 0], inferred = own[own > 0], 1, True
-    return FrameDepth(depth, confidence, inferred)
+    return FrameDepth(depth, confidence, inferred, shown * np.uint8(255))
 
 
 def of_turnaround(shown: Sequence[ColorView], room: MapViews, walk: Sequence[ColorView]) -> list[FrameDepth]:

@@ -117,6 +117,9 @@ def _candidates(
             own, probability = identity.select_animal(own, margins)
         return movers.candidates(own, probability, points, area, animal, through)
     motion = movers.motion_log_odds(votes)
+    if clip.has_foreground:  # where depth comes from the map, pictures that differ show an animal at rest too
+        in_front = resample_nearest(clip.foreground(frame), clip.depth_size, chosen)
+        motion = np.where(in_front > 0, np.maximum(motion, movers.MOTION), motion)
     static = (votes.occupied > 0) & (motion == 0)
     limited = np.clip(log_ratio, -movers.APPEARANCE_LIMIT, movers.APPEARANCE_LIMIT)
     both = limited + motion - movers.STATIC_PENALTY * static

@@ -46,17 +46,19 @@ def test_session_is_registered_and_its_animal_is_on_the_floor(mapped, tmp_path):
     clip, kept, depth, masks = estimate(mapped, tmp_path, path, agent, "session")
     assert clip.mapped and clip.gravity_known and len(clip) >= 20
     check_cameras(clip, path[kept])
-    off_room, off_animal, covered = [], [], []
+    off_room, off_animal, covered, overlap = [], [], [], []
     for frame in range(len(clip)):
         found, confidence = clip.depth(frame), clip.confidence(frame)
         room = (confidence == 2) & ~masks[frame]
         off_room.append(np.median(np.abs(found - depth[frame])[room]))
         animal = masks[frame] & (confidence == 1)
         covered.append(animal.sum() / masks[frame].sum())
+        in_front = clip.foreground(frame) > 0
+        overlap.append((in_front & masks[frame]).sum() / (in_front | masks[frame]).sum())
         if animal.sum() > 20:
             off_animal.append(np.median(np.abs(found - depth[frame])[animal]))
     assert np.median(off_room) < 0.03
-    assert np.median(covered) > 0.5, "the animal stands before the room"
+    assert np.median(covered) > 0.5 and np.median(overlap) > 0.5, "the animal stands before the room"
     assert len(off_animal) > 0.7 * len(clip) and np.median(off_animal) < 0.1
 
 

@@ -9,7 +9,7 @@ from pipeline.data import images
 from pipeline.data.clips import Clip
 from pipeline.segmentation.appearance import Appearance, strongest
 from pipeline.segmentation.recognizer import small
-from stages.segment_agent import masks
+from stages.segment_agent import free_space, locate, masks
 from stages.segment_agent.config import Config, LearningConfig
 from stages.segment_agent.windows import working_size
 from tests.stages import room_with_animal as scenery
@@ -71,6 +71,27 @@ def test_what_is_recognized_is_segmented_where_depth_is_wrong(session):
     assert recognized.mean() > 0.78, "share of known pixels; the pictures are 90 pixels wide"
     assert recognized.mean() > relearned.mean() + 0.1
     assert overlaps(session, KnownColor(1.5)).mean() > 0.6, "hardly recognized, but tracked"
+
+
+def test_hardly_recognized_animals_at_rest_are_found_where_the_picture_differs_from_the_map(tmp_path):
+    """Nobody sees through an animal that rests all the time: only its picture differs."""
+    poses, agent = scenery.session()
+    truth = scenery.record(tmp_path, poses, np.repeat(agent[len(agent) // 3][None], len(agent), 0), poses)
+    clip, recognizer = Clip.open(tmp_path), KnownColor(0.3)
+    references = free_space.gather(clip, poses, SHORT.references)
+    in_view = np.array([mask.sum() > 40 for mask in truth.masks])
+
+    def found():
+        spheres = locate.find_mover(
+            clip, poses, references, SHORT.animal, None, lambda frame: recognizer.log_odds(clip.color(frame))
+        )
+        return np.array([each is not None and not each.presumed for each in spheres])
+
+    assert in_view.sum() > 10 and not found().any()
+    (tmp_path / "foreground").mkdir()
+    for frame, mask in enumerate(truth.masks):
+        images.write_gray(tmp_path / "foreground" / f"{frame:06d}.png", mask * np.uint8(255))
+    assert found()[in_view].mean() > 0.8 and not found()[~in_view].any()
 
 
 def test_only_the_strongest_component_is_the_animal():
