@@ -79,11 +79,6 @@ class Clip:
         """Return whether cameras and depth come from the map instead of its own measurements."""
         return self.scale == MAPPED
 
-    @property
-    def has_foreground(self) -> bool:
-        """Return whether the animal in front of the map was segmented: where depth comes from the map."""
-        return (self.folder / "foreground").exists()
-
     @classmethod
     def open(cls, folder: Path) -> "Clip":
         """Open a finished ``frames/<id>`` artifact."""
@@ -112,7 +107,7 @@ class Clip:
         return images.read_gray(self.folder / "confidence" / f"{frame:06d}.png")
 
     def foreground(self, frame: int) -> UInt8[np.ndarray, "height width"]:
-        """Read where the animal stands in front of the map, 255, else 0; only if `has_foreground`."""
+        """Read where the animal stands in front of the map, 255, else 0; only if `mapped`."""
         return images.read_gray(self.folder / "foreground" / f"{frame:06d}.png")
 
 

@@ -239,8 +239,7 @@ def read_jobs(home: Home) -> list[dict[str, Any]]:
 def read_job(home: Home, job_id: str) -> dict[str, Any]:
     """Read a planned job, parsing only its line of thousands. Raises RUN-001."""
     text = _planned(home)
-    start = text.find(f'\n{{"id": {json.dumps(job_id)},'.encode()) + 1
-    if not start:
+    if not (start := text.find(f'\n{{"id": {json.dumps(job_id)},'.encode()) + 1):
         raise InputError("RUN-001", f"has no job {job_id!r}", str(home), f"see {jobs_file(home)}")
     try:
         return json.loads(text[start : text.find(b"\n", start)].rstrip(b","))

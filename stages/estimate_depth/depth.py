@@ -55,7 +55,7 @@ class FrameDepth:
     """2 from the map, or confirmed by several frames; 1 at edges, or inferred; 0 unknown."""
     inferred: bool
     """Whether part of it is an animal's, by contact or by a network."""
-    foreground: UInt8[np.ndarray, "height width"] | None = None
+    foreground: UInt8[np.ndarray, "height width"]
     """255 where the animal stands in front of the map, else 0."""
 
 
@@ -65,7 +65,8 @@ def of_map(target: ColorView) -> FrameDepth:
     around = np.ones((3, 3), np.uint8)
     low = cv2.erode(np.where(depth > 0, depth, 0), around)
     steady = (low > 0) & (cv2.dilate(depth, around) - low < EDGE_SHARE * depth)
-    return FrameDepth(depth, np.where(steady, 2, depth > 0).astype(np.uint8), False)
+    confidence = np.where(steady, 2, depth > 0).astype(np.uint8)
+    return FrameDepth(depth, confidence, False, np.zeros_like(confidence))
 
 
 def of_session(

@@ -33,8 +33,7 @@ class Estimated:
 
 def write(folder: Path, pictures: Pictures, estimated: Estimated, jpeg_quality: int) -> None:
     """Write pictures, depth, confidence and the table of the chosen frames."""
-    segmented = ("foreground",) if estimated.depths[0].foreground is not None else ()
-    for name in ("color", "depth", "confidence", *segmented):
+    for name in ("color", "depth", "confidence", "foreground"):
         (folder / name).mkdir()
     chosen, lens = estimated.placed, estimated.lens
     for number, (frame, found) in enumerate(zip(chosen.tolist(), estimated.depths, strict=True)):
@@ -45,8 +44,7 @@ def write(folder: Path, pictures: Pictures, estimated: Estimated, jpeg_quality: 
             color.write_bytes(pictures.file(frame).read_bytes())
         images.write_depth(folder / "depth" / f"{number:06d}.exr", found.depth)
         images.write_gray(folder / "confidence" / f"{number:06d}.png", found.confidence)
-        if found.foreground is not None:
-            images.write_gray(folder / "foreground" / f"{number:06d}.png", found.foreground)
+        images.write_gray(folder / "foreground" / f"{number:06d}.png", found.foreground)
     valid = np.array([(each.depth > 0).mean() for each in estimated.depths])
     pictured = quality_of(pictures.sharpness, pictures.brightness, np.ones(len(pictures.sharpness)))
     small = cameras.scale_intrinsics(lens.intrinsics, lens.size, estimated.depths[0].depth.shape)

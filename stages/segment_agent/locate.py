@@ -117,7 +117,7 @@ def _candidates(
             own, probability = identity.select_animal(own, margins)
         return movers.candidates(own, probability, points, area, animal, through)
     motion = movers.motion_log_odds(votes)
-    if clip.has_foreground:  # where depth comes from the map, pictures that differ show an animal at rest too
+    if clip.mapped and margin_of is None:  # pictures that differ from the map show resting animals too
         in_front = resample_nearest(clip.foreground(frame), clip.depth_size, chosen)
         motion = np.where(in_front > 0, np.maximum(motion, movers.MOTION), motion)
     static = (votes.occupied > 0) & (motion == 0)

@@ -119,7 +119,7 @@ def standing_segmenter(
     """Prepare the masks of what stands where a turnaround's axes meet. Raises MSK-003 as `segment` does."""
     focus = axes_focus(poses) if placed is None else placed.center_world
     spheres, evidence_of = find_standing(clip, poses, focus)
-    if clip.has_foreground:
+    if clip.mapped:
         spheres = [each and replace(each, radius_m=GROWTH * each.radius_m) for each in spheres]
         evidence_of = foreground_evidence(clip, evidence_of, working_size(clip, config.height_px))
     return with_color_histogram(Segmenter(clip, poses, spheres, evidence_of, config.height_px, edges=EDGES))

@@ -72,16 +72,15 @@ def rollouts(
     rest, chaining = data.agent_from_bone_rest, ReplanningConfig()
     animals = AnimalBatch(ats.sampler, scenes, rest, ats.ego, sampling=ats.sampling, chaining=chaining)
     context, _ = data.windows(window)
-    walks = [
-        data.trajectories[data.videos[video]].world_from_camera[:, :3, 3] for video in data.video[window]
-    ]
-    length = np.array([len(walk) for walk in walks])[:, None]
+    tracks = [data.trajectories[data.videos[video]] for video in data.video[window]]
+    length = np.array([len(track.timestamp_s) for track in tracks])[:, None]
     animals.begin(context, rng, companions=context.companions)
     root = [context.world_from_agent[:, -1]]
     for step in range(1, round(seconds * data.rate_hz) + 1):
         frames = (data.start[window][:, None] + step + np.arange(data.past)) % length
-        seen = [walk[frame] for walk, frame in zip(walks, frames[:, -1], strict=True)]
-        root.append(animals.step(np.array(seen), data.companions(window, frames)).root[:, 0])
+        both = zip(tracks, frames[:, -1], strict=True)
+        seen = np.array([track.world_from_camera[frame, :3, 3] for track, frame in both])
+        root.append(animals.step(seen, data.companions(window, frames)).root[:, 0])
     return np.stack(root, axis=1)
 
 

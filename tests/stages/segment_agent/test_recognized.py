@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.data import images
-from pipeline.data.clips import Clip
+from pipeline.data.clips import MAPPED, Clip
 from pipeline.segmentation.appearance import Appearance, strongest
 from pipeline.segmentation.recognizer import small
 from stages.segment_agent import free_space, locate, masks
@@ -88,6 +88,7 @@ def test_hardly_recognized_animals_at_rest_are_found_where_the_picture_differs_f
         return np.array([each is not None and not each.presumed for each in spheres])
 
     assert in_view.sum() > 10 and not found().any()
+    clip = replace(clip, scale=MAPPED)
     (tmp_path / "foreground").mkdir()
     for frame, mask in enumerate(truth.masks):
         images.write_gray(tmp_path / "foreground" / f"{frame:06d}.png", mask * np.uint8(255))

@@ -1,6 +1,7 @@
 """Masks of small rendered recordings: walking, resting and absent animals, and prompts."""
 
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 
 from pipeline.core.errors import InputError
 from pipeline.data import images, npz
-from pipeline.data.clips import Clip
+from pipeline.data.clips import MAPPED, Clip
 from pipeline.segmentation import appearance
 from pipeline.segmentation.appearance import Example, learn
 from stages.segment_agent import masks, movers, prompts
@@ -88,6 +89,7 @@ def test_foreground_completes_what_has_no_depth(tmp_path):
         images.write_gray(tmp_path / "foreground" / f"{frame:06d}.png", shown * np.uint8(255))
         depth = np.where(unknown, np.float32(0), clip.depth(frame))
         images.write_depth(tmp_path / "depth" / f"{frame:06d}.exr", depth)
+    clip = replace(clip, scale=MAPPED)
     segmented = masks.segment(clip, tmp_path, "turnaround", None, OPTIONS, np.random.default_rng(0))
     found = [each.labels == 255 for each in segmented.masks]
     assert np.mean([iou(own, true) for own, true in zip(found, truth.masks, strict=True)]) > 0.94
