@@ -118,8 +118,7 @@ def _candidates(
         return movers.candidates(own, probability, points, area, animal, through)
     motion = movers.motion_log_odds(votes)
     if clip.mapped and margin_of is None:  # pictures that differ from the map show resting animals too
-        in_front = resample_nearest(clip.foreground(frame), clip.depth_size, chosen)
-        motion = np.where(in_front > 0, np.maximum(motion, movers.MOTION), motion)
+        motion = np.maximum(motion, movers.MOTION * (clip.foreground(frame)[chosen] > 0))
     static = (votes.occupied > 0) & (motion == 0)
     limited = np.clip(log_ratio, -movers.APPEARANCE_LIMIT, movers.APPEARANCE_LIMIT)
     both = limited + motion - movers.STATIC_PENALTY * static
