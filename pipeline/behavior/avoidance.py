@@ -74,13 +74,14 @@ def _along_circle(
     person: Float[np.ndarray, "plan 2"],
     reach: Float[np.ndarray, "plan"],
 ) -> Points:
-    """Return the points one step along the circle around the person, towards the target."""
+    """Return the points a tangential step around the person (one on the circle would cut it)."""
     offset, to_target = position[:, [0, 2]] - person, target[:, [0, 2]] - person
     angle = np.arctan2(offset[:, 1], offset[:, 0])
     turn = np.arctan2(to_target[:, 1], to_target[:, 0]) - angle
-    turn = np.arctan2(np.sin(turn), np.cos(turn))
-    radius = np.maximum(reach, np.linalg.norm(offset, axis=1))
-    angle = angle + np.sign(turn) * np.minimum(np.abs(turn), step / np.maximum(radius, 1e-6))
+    away = np.linalg.norm(offset, axis=1)
+    furthest = np.arctan(step / np.maximum(np.maximum(reach, away), 1e-6))
+    turn = np.clip(np.arctan2(np.sin(turn), np.cos(turn)), -furthest, furthest)
+    radius, angle = np.maximum(reach / np.cos(turn), away), angle + turn
     return np.stack(
         [person[:, 0] + radius * np.cos(angle), target[:, 1], person[:, 1] + radius * np.sin(angle)], axis=-1
     )

@@ -62,6 +62,20 @@ def test_animal_within_the_clearance_does_not_come_closer(paths):
     assert np.linalg.norm(led[..., [0, 2]], axis=-1).min() > 0.19, "meters"
 
 
+@pytest.mark.parametrize("start_m", [CLEARANCE_M, CLEARANCE_M + 1e-4, 0.2])
+def test_animal_beside_a_person_walks_around_them(paths, start_m):
+    """From the circle that it may not enter, on which a straight step along it would not stay outside."""
+    along = paths[:, -1] - paths[:, 0]
+    along[:, 1] = 0.0
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    start = -start_m * along + [0.0, 0.2, 0.0]
+    beyond = start[:, None] + along[:, None] * 0.05 * np.arange(1, 57)[:, None]
+    led = around_person(beyond, start, np.zeros((len(paths), 3)), CLEARANCE_M)
+    reach_m = min(start_m, CLEARANCE_M)
+    assert nearest_m(np.concatenate([start[:, None], led], axis=1)).min() > reach_m - 1e-6, "meters"
+    assert np.linalg.norm((led - beyond)[:, -1], axis=1).max() < 0.01, "meters: they arrive"
+
+
 def test_distant_persons_do_not_change_paths(paths):
     led = around_person(paths[:, 1:], paths[:, 0], np.full((len(paths), 3), 9.0), CLEARANCE_M)
     np.testing.assert_allclose(led, paths[:, 1:], atol=1e-12)

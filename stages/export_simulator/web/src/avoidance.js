@@ -42,12 +42,15 @@ function crosses(from, to, person, reach) {
   return Math.hypot(px - share * dx, pz - share * dz) < reach - 1e-9;
 }
 
-// The next point along the circle around the person, on the side of the target, a step further.
+// The next point around the person, a tangential step further towards the target: on the circle itself, a step
+// would cut it.
 function alongCircle(here, target, step, person, reach) {
   const angle = Math.atan2(here[2] - person[1], here[0] - person[0]);
   const goalAngle = Math.atan2(target[2] - person[1], target[0] - person[0]);
-  const turn = Math.atan2(Math.sin(goalAngle - angle), Math.cos(goalAngle - angle));
-  const radius = Math.max(reach, Math.hypot(here[0] - person[0], here[2] - person[1]));
-  const next = angle + Math.sign(turn) * Math.min(Math.abs(turn), step / Math.max(radius, 1e-6));
+  const away = Math.hypot(here[0] - person[0], here[2] - person[1]);
+  const furthest = Math.atan(step / Math.max(reach, away, 1e-6));
+  const whole = Math.atan2(Math.sin(goalAngle - angle), Math.cos(goalAngle - angle));
+  const turn = Math.max(-furthest, Math.min(furthest, whole));
+  const [radius, next] = [Math.max(reach / Math.cos(turn), away), angle + turn];
   return [person[0] + radius * Math.cos(next), target[1], person[1] + radius * Math.sin(next)];
 }

@@ -6,6 +6,7 @@ import { guidanceWeights, guided, sample } from './diffusion.js';
 import { normals } from './noise.js';
 import { apply, inverse } from './rigid.js';
 import { withoutSome } from './senses.js';
+import { ARRIVED_M } from './stops.js';
 import {
   velocityChannelsAlong,
   distance,
@@ -290,7 +291,8 @@ export class Sampler {
 
   // A whole plan. question: {past, observer, companions, keep, interactivity, company, samples, steps, seed, aim,
   // raised, path}, of which `company` holds the scales of guidance of the companions.
-  // `cleared` is where a plan ends that goes all the way to the aim: as near to it as the animal may be.
+  // `cleared` is where a plan ends that goes all the way to the aim: as near to it as the animal may be, not
+  // where somebody in its way holds it up.
   async plan(question) {
     const observation = this.senses.observe(question.past, question.observer, question.companions);
     const { frame } = observation;
@@ -328,10 +330,14 @@ export class Sampler {
     const paths = await towards(first);
     if (rest.length && this.outside(frame, paths[0])) paths.push(...(await towards(rest)));
     const best = this.bestInside(frame, paths, question.intent ?? []);
-    const path = this.constrained(frame, codes.start, this.positions(paths[best]), options);
+    const places = this.positions(paths[best]);
+    const path = this.constrained(frame, codes.start, places, options);
     const lived = await this.withBody(frame, codes, path, options);
+    const alone = this.positions(this.constrained(frame, codes.start, places, { ...options, bodies: [] }));
     const arrives =
-      leg.last && !options.detour?.unfinished(apply(frame, codes.start), lived.path.at(-1), question.aim);
+      leg.last &&
+      distance(lived.path.at(-1), apply(frame, alone.at(-1))) < this.clearance + ARRIVED_M &&
+      !options.detour?.unfinished(apply(frame, codes.start), lived.path.at(-1), question.aim);
     return { goals, chosen: tried[best], ...lived, cleared: arrives ? lived.path.at(-1) : null };
   }
 

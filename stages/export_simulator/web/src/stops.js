@@ -3,7 +3,7 @@
 
 import { rotate } from './rigid.js';
 
-const ARRIVED_M = 0.25;
+export const ARRIVED_M = 0.25;
 
 export class Stops {
   // points: [[x, z], ...] on the floor, or [x, z, up] above it, meters; from: the root's row where the
