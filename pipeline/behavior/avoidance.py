@@ -82,6 +82,5 @@ def _along_circle(
     furthest = np.arctan(step / np.maximum(np.maximum(reach, away), 1e-6))
     turn = np.clip(np.arctan2(np.sin(turn), np.cos(turn)), -furthest, furthest)
     radius, angle = np.maximum(reach / np.cos(turn), away), angle + turn
-    return np.stack(
-        [person[:, 0] + radius * np.cos(angle), target[:, 1], person[:, 1] + radius * np.sin(angle)], axis=-1
-    )
+    x, z = person.T + radius * np.stack([np.cos(angle), np.sin(angle)])
+    return np.stack([x, target[:, 1], z], axis=-1)

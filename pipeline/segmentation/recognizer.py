@@ -3,22 +3,22 @@
 from pathlib import Path
 
 import cv2
-import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 from safetensors.torch import load_file, save_file
+from scipy.special import expit, logit
 
 from pipeline.segmentation.appearance import Appearance, fold_batch_norms
 
 FILE = "recognizer.safetensors"
 SHORTER_PX = 240
 """Shorter side of the pictures that it sees at scale 1, pixels."""
-SCALES = (1.0, 2.0)
-"""Scales at which it recognizes: the network halves pictures, and a session's animal is small."""
+SCALES = (1.0, 2.0, 3.0)
+"""Scales at which it recognizes: the coarsest has most context, and a session's animal is small."""
 
 
 class Recognizer(Appearance):
-    """A network that recognizes an animal by its mean log-odds over several scales of a picture."""
+    """A network that recognizes an animal by its mean probability over several scales of a picture."""
 
     def log_odds(self, color: UInt8[ndarray, "height width channel"]) -> Float[ndarray, "height width"]:
         """Return the log-odds of every pixel of a picture from `small`, within +-8."""
@@ -26,7 +26,7 @@ class Recognizer(Appearance):
         for scale in SCALES:
             scaled = cv2.resize(color, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
             found.append(cv2.resize(super().log_odds(scaled), size, interpolation=cv2.INTER_AREA))
-        return np.mean(found, axis=0)
+        return logit(expit(found).mean(0))
 
 
 def small(picture: UInt8[ndarray, "height width *channel"]) -> UInt8[ndarray, "row column *channel"]:

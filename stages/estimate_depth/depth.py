@@ -53,8 +53,6 @@ class FrameDepth:
     """Meters, 0 = unknown."""
     confidence: UInt8[np.ndarray, "height width"]
     """2 from the map, or confirmed by several frames; 1 at edges, or inferred; 0 unknown."""
-    inferred: bool
-    """Whether part of it is an animal's, by contact or by a network."""
     foreground: UInt8[np.ndarray, "height width"]
     """255 where the animal stands in front of the map, else 0."""
 
@@ -66,7 +64,7 @@ def of_map(target: ColorView) -> FrameDepth:
     low = cv2.erode(np.where(depth > 0, depth, 0), around)
     steady = (low > 0) & (cv2.dilate(depth, around) - low < EDGE_SHARE * depth)
     confidence = np.where(steady, 2, depth > 0).astype(np.uint8)
-    return FrameDepth(depth, confidence, False, np.zeros_like(confidence))
+    return FrameDepth(depth, confidence, np.zeros_like(confidence))
 
 
 def of_session(
@@ -99,7 +97,7 @@ def of_session(
     largest = [touched[0] if touched else None for touched in contacts]
     carried, found = contact.between(timestamp_s, largest, MAX_CONTACT_GAP_S), []
     for frame, seen in enumerate(zip(shown, masks, contacts, carried, strict=True)):
-        found.append(None if masks[frame] is None else _with_animal(frame, *seen, length_m, depth_net))
+        found.append(None if seen[1] is None else _with_animal(frame, *seen, length_m, depth_net))
     return found
 
 
@@ -114,7 +112,7 @@ def _blobs(mask: Bool[np.ndarray, "height width"]) -> list[Bool[np.ndarray, "hei
 def _with_animal(frame, target: ColorView, blobs, touched, carried, length_m, depth_net) -> FrameDepth:
     """Insert the foreground's depth into the map's; around the foreground it is unknown."""
     room, view = of_map(target), target.view
-    depth, confidence, inferred = room.depth.copy(), room.confidence.copy(), False
+    depth, confidence = room.depth.copy(), room.confidence.copy()
     shown = np.any([np.zeros(depth.shape, bool), *blobs], axis=0).astype(np.uint8)
     union = cv2.dilate(shown, DILATION) > 0
     depth[union], confidence[union] = 0, 0
@@ -134,8 +132,8 @@ def _with_animal(frame, target: ColorView, blobs, touched, carried, length_m, de
             continue
         extent_m = max(np.ptp(rows), np.ptp(columns)) * np.median(own[own > 0]) / view.intrinsics[0, 0]
         if extent_m < LARGEST_SHARE * length_m:
-            depth[own > 0], confidence[own > 0], inferred = own[own > 0], 1, True
-    return FrameDepth(depth, confidence, inferred, shown * np.uint8(255))
+            depth[own > 0], confidence[own > 0] = own[own > 0], 1
+    return FrameDepth(depth, confidence, shown * np.uint8(255))
 
 
 def of_turnaround(shown: Sequence[ColorView], room: MapViews, walk: Sequence[ColorView]) -> list[FrameDepth]:
@@ -156,8 +154,7 @@ def of_turnaround(shown: Sequence[ColorView], room: MapViews, walk: Sequence[Col
         depth = np.where(mask, np.where(known, several, 0), mapped.depth)
         sure = np.where(known, np.clip(agree.astype(int) - MIN_AGREEING + 1, 0, 2), 0)
         confidence = np.where(mask, sure, mapped.confidence)
-        parts = depth.astype(np.float32), confidence.astype(np.uint8), False, mask * np.uint8(255)
-        found.append(FrameDepth(*parts))
+        found.append(FrameDepth(depth.astype(np.float32), confidence.astype(np.uint8), mask * np.uint8(255)))
     return found
 
 

@@ -81,12 +81,17 @@ def motion_evidence(references: References) -> EvidenceOf:
     return evidence_of
 
 
-def room_evidence(frame: int, window: Window, sphere: Sphere) -> Evidence:
-    """Evidence of geometry that is not the animal's own: only against what is outside its sphere."""
-    away_m = np.linalg.norm(window.points_world - sphere.center_world, axis=-1)
-    outside, none = away_m >= sphere.radius_m, np.zeros(away_m.shape, bool)
-    log_odds, certainty = np.where(outside, -ROOM, 0.0), np.where(outside, 1.0, UNKNOWN)
-    return Evidence(log_odds, certainty, none, none, outside)
+def view_evidence(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> EvidenceOf:
+    """Evidence where depth was inferred from the same pictures: only against what a sphere does not cover."""
+
+    def evidence_of(frame: int, window: Window, sphere: Sphere) -> Evidence:
+        eye, none = world_from_camera[frame, :3, 3], np.zeros(window.trusted.shape, bool)
+        ray = window.points_world - eye
+        off_m = np.linalg.norm(np.cross(sphere.center_world - eye, ray), axis=-1)
+        outside = off_m >= sphere.radius_m * np.linalg.norm(ray, axis=-1)
+        return Evidence(np.where(outside, -ROOM, 0.0), np.where(outside, 1.0, UNKNOWN), none, none, outside)
+
+    return evidence_of
 
 
 def prefer_first(first: EvidenceOf, second: EvidenceOf) -> EvidenceOf:

@@ -16,7 +16,7 @@ from pipeline.segmentation.appearance import Appearance, Example, learn
 from pipeline.segmentation.recognizer import SHORTER_PX
 from stages.segment_agent import free_space, movers, people, prompts
 from stages.segment_agent.config import Config
-from stages.segment_agent.evidence import motion_evidence, prefer_first, room_evidence
+from stages.segment_agent.evidence import motion_evidence, prefer_first, view_evidence
 from stages.segment_agent.follow import follow
 from stages.segment_agent.footage import Footage
 from stages.segment_agent.free_space import References
@@ -165,7 +165,7 @@ def _recognized_segmenter(
     """
     spheres = find_mover(clip, poses, references, config.animal, None)
     height_px = round(clip.color_size[0] * min(1.0, SHORTER_PX / min(clip.color_size)))
-    segmenter = Segmenter(clip, poses, spheres, room_evidence, height_px, recognizer, OUTLINE, rng)
+    segmenter = Segmenter(clip, poses, spheres, view_evidence(poses), height_px, recognizer, OUTLINE, rng)
     room = free_space.masked(references, lambda frame: occlusion_mask(segmenter, frame, recognizer))
     found = find_mover(clip, poses, room, config.animal, None, appearance_of(segmenter, recognizer))
     return replace(segmenter, spheres=with_motion_radius(found, spheres) if tracked(spheres).any() else found)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.data.clips import Clip
 from pipeline.segmentation.appearance import Appearance, strongest
-from pipeline.segmentation.grabcut import SURE, outlined
+from pipeline.segmentation.grabcut import SURE, LogOdds, outlined
 from stages.segment_agent import refine
 from stages.segment_agent.evidence import Evidence, EvidenceOf
 from stages.segment_agent.refine import ColorHistogram, Edges
@@ -23,7 +23,7 @@ APPEARANCE_ALONE, APPEARANCE_AGAINST = 3.0, 4.0
 """limit of the appearance's log-odds for the animal where geometry is unknown (0 elsewhere, since geometric
 edges are sharper), and against it anywhere"""
 DOUBT = 0.2
-"""prior log-odds of background with the learned appearance"""
+"""prior log-odds of background with an appearance that was learned from first masks, which leak"""
 SMALL_PX, MIN_SUPPORT = 250, 0.7
 """masks smaller than this many pixels need this share that looks like the animal or clearly moves"""
 MIN_PRESUMED_PX = 25
@@ -32,9 +32,8 @@ PRESENCE_PRESUMED, PRESENCE_TRACKED, PRESENCE_MOVED, PRESENCE_LIMIT = -2.5, 2.0,
 """log-odds that a mask shows the animal: base value; added if tracked rather than presumed, and if all of it
 clearly moves; limit of its mean appearance, which is added too"""
 ABSENT_PRESUMED, ABSENT_TRACKED, ABSENT_UNTRACKED = 0.88, 0.04, 0.99
-"""probability that the animal covers less than 0.1 % of the view if no mask is found: at a presumed sphere,
-on the track, and without a sphere; counted in two semi-real kitchens and six sessions of the built-in cat
-(456 of 518, 0 of 22, 183 of 183), with add-one smoothing"""
+"""probability that less than 0.1 % of the view is animal if no mask is found: at a presumed sphere, on the
+track, and without one; of two semi-real kitchens and six sessions of a cat, with add-one smoothing"""
 LOG_ODDS_LIMIT = 5.0
 """limit of the log-odds of confidence"""
 FOUND_CALIBRATION, MISSED_CALIBRATION = (0.5, 2.5), (-1.0, 0.7)
@@ -92,7 +91,7 @@ class Segmenter:
         window = crop_window(self.clip, frame, self.world_from_camera[frame], sphere, color)
         if window is None:
             return Mask(empty, False, ABSENT_PRESUMED if sphere.presumed else 1.0)
-        evidence = self.evidence_of(frame, window, sphere)
+        evidence, recognized = self.evidence_of(frame, window, sphere), self.outline_rng is not None
         match self.appearance:
             case ColorHistogram() as histogram:
                 log_ratio = histogram.log_likelihood_ratio(window.color, evidence.room)
@@ -103,8 +102,8 @@ class Segmenter:
             case Appearance() as network:
                 log_ratio = network.log_odds_within(color, window.rows, window.columns)
                 # A small animal looks less like itself; where it is tracked, what looks like it is it.
-                sure_at = SURE if self.outline_rng is None or sphere.presumed else 0.0
-                labels, sure = self._by_appearance(window, evidence, log_ratio, sure_at)
+                doubts = (SURE if sphere.presumed else DOUBT, 0.0) if recognized else (SURE, DOUBT)
+                labels, sure = self._by_appearance(window, evidence, log_ratio, *doubts)
         if self.outline_rng is not None:
             part = strongest(labels == 255, log_ratio)
             sharp = outlined(window.color, part, log_ratio, self.outline_rng)
@@ -112,7 +111,8 @@ class Segmenter:
         inside = labels == 255
         if sure[inside].sum() < (MIN_PRESUMED_PX if sphere.presumed else 1):
             return Mask(empty, False, ABSENT_PRESUMED if sphere.presumed else ABSENT_TRACKED)
-        present = self._presence(evidence, log_ratio, inside, sphere.presumed)
+        core = inside & (log_ratio > DOUBT / APPEARANCE_WEIGHT_BLIND) if recognized else inside  # no outline
+        present = self._presence(evidence, log_ratio, core, sphere.presumed)
         if present < 0:  # unknown rather than animal
             labels = np.where(labels == 255, 128, labels)
         empty[window.rows, window.columns] = labels
@@ -130,13 +130,12 @@ class Segmenter:
         """Return the log-odds that a mask shows the animal: by appearance, motion and track."""
         similarity = float(np.clip(log_ratio[inside], -PRESENCE_LIMIT, PRESENCE_LIMIT).mean())
         moved = float(evidence.moving[inside].mean())
-        on_track = PRESENCE_PRESUMED + PRESENCE_TRACKED * (not presumed)
-        return on_track + similarity + PRESENCE_MOVED * moved
+        return PRESENCE_PRESUMED + PRESENCE_TRACKED * (not presumed) + similarity + PRESENCE_MOVED * moved
 
     def _by_appearance(
-        self, window: Window, evidence: Evidence, log_ratio: Float[np.ndarray, "height width"], sure_at: float
+        self, window: Window, evidence: Evidence, log_ratio: LogOdds, sure_at: float, doubt: float = DOUBT
     ) -> tuple[UInt8[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
-        """Return labels and sure pixels, above ``sure_at``, by evidence and the learned appearance.
+        """Return labels and sure pixels, above ``sure_at``, by evidence and appearance, less ``doubt``.
 
         Color change counts as far as it looks like the animal. Small masks need support, since noise makes
         them too. If none is found, clearly moving pixels are sure: small views are all depth steps.
@@ -146,7 +145,7 @@ class Segmenter:
         blind = evidence.certainty < UNKNOWN
         weight = np.where(blind, APPEARANCE_WEIGHT_BLIND, APPEARANCE_WEIGHT)
         most = np.where(blind, APPEARANCE_ALONE, 0.0)
-        log_odds = known + np.clip(weight * log_ratio, -APPEARANCE_AGAINST, most) - DOUBT
+        log_odds = known + np.clip(weight * log_ratio, -APPEARANCE_AGAINST, most) - doubt
         strict = (log_odds > sure_at) & (evidence.animal | (log_ratio > 0))
         relaxed = strict | ((log_odds > SURE) & evidence.moving)
         for sure, enough_px in ((strict, SMALL_PX), (relaxed, np.inf)):

@@ -104,7 +104,7 @@ def checks_of(
     visible, confidence = np.array(summary.visible), np.array(summary.confidence)
     unsure = confidence[np.isfinite(confidence)] < LOW_CONFIDENCE
     checks = [
-        Check("agent visible", _percent(visible), "%", CIRCLED if circled else None, 2, better="higher"),
+        Check("agent visible", _percent(visible), "%", *((CIRCLED, 2) if circled else (2, None)), "higher"),
         Check("frames of low confidence", _percent(unsure), "%", warn=12, fail=30),
     ]
     if estimated is None:
