@@ -333,12 +333,18 @@ export class Sampler {
     const places = this.positions(paths[best]);
     const path = this.constrained(frame, codes.start, places, options);
     const lived = await this.withBody(frame, codes, path, options);
-    const alone = this.positions(this.constrained(frame, codes.start, places, { ...options, bodies: [] }));
+    const end = lived.path.at(-1);
     const arrives =
       leg.last &&
-      distance(lived.path.at(-1), apply(frame, alone.at(-1))) < this.clearance + ARRIVED_M &&
-      !options.detour?.unfinished(apply(frame, codes.start), lived.path.at(-1), question.aim);
-    return { goals, chosen: tried[best], ...lived, cleared: arrives ? lived.path.at(-1) : null };
+      distance(end, this.endAlone(frame, codes.start, places, options)) < this.clearance + ARRIVED_M &&
+      !options.detour?.unfinished(apply(frame, codes.start), end, question.aim);
+    return { goals, chosen: tried[best], ...lived, cleared: arrives ? end : null };
+  }
+
+  // Where a path of places of the ego frame would end with nobody in its way, world.
+  endAlone(frame, start, places, options) {
+    const path = this.constrained(frame, start, places, { ...options, bodies: [] });
+    return apply(frame, this.positions(path).at(-1));
   }
 
   // The numbers of goals, those that lie in the allowed space first, otherwise as sampled.
