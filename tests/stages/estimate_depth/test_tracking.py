@@ -5,6 +5,7 @@ import pytest
 
 from pipeline.geometry.meshes import RayCaster
 from stages.estimate_depth import foreground, landmarks, tracking, views
+from stages.estimate_depth import lens as lenses
 from stages.estimate_depth.landmarks import Matches
 from stages.estimate_depth.lens import Lens
 from tests.stages.estimate_depth import filmed_room
@@ -59,6 +60,27 @@ def test_cameras_are_tracked_over_short_gaps_only(filmed, covered, monkeypatch):
         assert off_m.max() < 0.05
     else:
         assert not placed[beyond].any()
+
+
+def test_wrong_focal_length_is_corrected(filmed):
+    room, path, pictures = filmed
+    true_px = float(filmed_room.INTRINSICS[0, 0])
+    wrong = Lens(0.88 * true_px, 0.0, filmed_room.SIZE)
+    footage = tracking.TrackingInput(
+        0.1 * np.arange(COUNT),
+        [views.small_gray(each) for each in pictures],
+        [landmarks.describe(each) for each in pictures],
+        wrong,
+    )
+    pixel = np.stack(np.meshgrid(np.arange(5, 180, 25.0), np.arange(5, 240, 25.0)), axis=-1).reshape(-1, 2)
+    surface = [landmarks.on_surface(pixel, filmed_room.INTRINSICS, pose, room.caster) for pose in path]
+    seen = [np.isfinite(each[:, 0]) for each in surface]
+    matches = [Matches(pixel[hit], points[hit]) for hit, points in zip(seen, surface, strict=True)]
+    localized = lenses.locate_all(matches, wrong, seed=0)
+    assert np.nanmedian(np.linalg.norm(localized[:, :3, 3] - path[:, :3, 3], axis=1)) > 0.1
+    found = tracking.place(footage, localized, room, seed=0)
+    assert found.lens.focal_px == pytest.approx(true_px, rel=0.01)
+    assert np.linalg.norm(found.world_from_camera[:, :3, 3] - path[:, :3, 3], axis=1).max() < 0.03
 
 
 def test_nothing_is_in_front_where_no_picture_shows_the_same(filmed):
