@@ -38,9 +38,8 @@ MAX_M_S, MAX_RAD_S = 3.0, 4.0
 SIGMA_PX, INLIER_PX = 8.0, 2.5
 """Standard deviation of flow, whose errors are correlated over hundreds of pixels, and RANSAC threshold, in
 pixels of the small pictures."""
-PASSES, CONVERGED, REACH_M = (2, 8), 0.005, (0.1, 0.05, 0.05)
-"""Least and most passes of matching, each of poses, then focal length; its relative change at which they end;
-scales of the robust weight within each, meters."""
+MAX_PASSES, CONVERGED, REACH_M = 8, 0.005, (0.1, 0.05, 0.05)
+"""Most passes of matching, change of the focal length that ends them, robust scales within each, meters."""
 
 
 @dataclass(frozen=True)
@@ -95,12 +94,12 @@ def place(
     discard_stray_segments(footage.timestamp_s, poses, sure)
     placed = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
     log(f"{int(sure.sum())} frames placed by landmarks, {len(placed)} of {len(poses)} in all")
-    for number in range(PASSES[1] if len(placed) else 0):
-        poses[placed], lens = _optimize(placed, footage, poses[placed], room, seed)
-        converged = abs(lens.focal_px / footage.lens.focal_px - 1) < CONVERGED
-        if number + 1 >= PASSES[0 if converged else 1]:
-            break
+    lens = footage.lens
+    for number in range(MAX_PASSES if len(placed) else 0):
         footage = replace(footage, lens=lens)
+        poses[placed], lens = _optimize(placed, footage, poses[placed], room, seed)
+        if number and abs(lens.focal_px / footage.lens.focal_px - 1) < CONVERGED:
+            break
     return Tracked(poses, sure, footage.lens)
 
 

@@ -70,16 +70,14 @@ def report_quality(folder: Path, pictures: Pictures, estimated: Estimated) -> No
     chosen, depths = estimated.placed, estimated.depths
     placed = 100 * len(chosen) / len(pictures)
     alone = 100 * float(estimated.tracked.by_landmarks[chosen].mean())
-    known, certain = np.mean([[(each.depth > 0).mean(), (each.confidence == 2).mean()] for each in depths], 0)
-    animal = np.mean([each.depth[each.foreground > 0].any() for each in depths])
+    known = 100 * float(np.mean([(each.depth > 0).mean() for each in depths]))
+    animal = 100 * float(np.mean([each.depth[each.foreground > 0].any() for each in depths]))
     checks = [
         qa.Check("frames placed in the map", placed, "%", warn=80.0, better="higher"),
         qa.Check("placed by landmarks, the others tracked", alone, "%", warn=30.0, better="higher"),
         qa.Check("focal length, calibrated", estimated.lens.focal_px, "px"),
-        qa.Check("radial distortion, calibrated", estimated.lens.radial),
-        qa.Check("known depth", 100 * float(known), "%", warn=50.0, better="higher"),
-        qa.Check("depth of the map, or confirmed by several views", 100 * float(certain), "%"),
-        qa.Check("frames with depth of the animal", 100 * float(animal), "%"),
+        qa.Check("known depth", known, "%", warn=50.0, better="higher"),
+        qa.Check("frames with depth of the animal", animal, "%"),
     ]
     shown, size = subsampling.evenly(len(chosen), SHOWN), depths[0].depth.shape
     colors = [plots.resized(pictures.color(int(chosen[number])), size) for number in shown]
