@@ -176,13 +176,22 @@ def balanced(
     return counted * torch.where(animal, gain, 1.0)
 
 
+def components(
+    inside: Bool[np.ndarray, "height width"], log_odds: Float[np.ndarray, "height width"]
+) -> list[tuple[Bool[np.ndarray, "height width"], float]]:
+    """Return the connected components of a mask with their evidence, the sum of log-odds; most first."""
+    count, part = cv2.connectedComponents(inside.astype(np.uint8), connectivity=8)
+    evidence = np.bincount(part.ravel(), np.maximum(log_odds, 0).ravel(), count)
+    order = 1 + np.argsort(-evidence[1:], kind="stable")
+    return [(part == number, float(evidence[number])) for number in order]
+
+
 def strongest(
     inside: Bool[np.ndarray, "height width"], log_odds: Float[np.ndarray, "height width"]
 ) -> Bool[np.ndarray, "height width"]:
-    """Return the connected component of a mask with the most evidence, the sum of its positive log-odds."""
-    count, part = cv2.connectedComponents(inside.astype(np.uint8), connectivity=8)
-    evidence = np.bincount(part.ravel(), np.maximum(log_odds, 0).ravel(), count)
-    return inside & (part == 1 + np.argmax(evidence[1:])) if count > 1 else inside
+    """Return the connected component of a mask with the most evidence."""
+    found = components(inside, log_odds)
+    return found[0][0] if found else inside
 
 
 def fold_batch_norms(network: Appearance) -> Appearance:

@@ -9,12 +9,15 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.core.progress import track
 from pipeline.geometry import contact, subsampling
+from pipeline.geometry.meshes import RayCaster
 from pipeline.mapping import plane_sweep
 from pipeline.mapping.plane_sweep import SweepView
 from pipeline.segmentation.appearance import Appearance
 from stages.estimate_depth import foreground, standing, tracking
+from stages.estimate_depth.animal_parts import Part, follow
 from stages.estimate_depth.foreground import ColorView
 from stages.estimate_depth.tracking import MapViews
+from stages.estimate_depth.views import View
 
 EDGE_SHARE = 0.06
 """Depth range within 3 pixels, as a share of depth, above which a map pixel is an edge and less certain."""
@@ -82,23 +85,31 @@ def of_session(
     too much from the map.
     """
     times = subsampling.evenly(len(shown), foreground.OTHER_TIMES)
-    masks, contacts = [], []
+    parts: list[list[Part] | None] = []
     for frame, target in enumerate(track(shown, "segmenting the foreground")):
         distant = times[np.abs(timestamp_s[times] - timestamp_s[frame]) > foreground.MIN_GAP_S]
         seen = [walk[number] for number in tracking.walk_views(target.view, room)]
         in_front = foreground.foreground(target, seen, [shown[other] for other in distant])
-        blobs = None
-        if in_front.mean() <= MAX_FOREGROUND:
-            animal = in_front if recognizer is None else foreground.recognize(recognizer, target, in_front)
-            blobs = _blobs(animal)
-        camera = target.view.intrinsics, target.view.world_from_camera
-        masks.append(blobs)
-        contacts.append([contact.find(blob, *camera, room.caster) for blob in blobs or ()])
-    largest = [touched[0] if touched else None for touched in contacts]
+        if in_front.mean() > MAX_FOREGROUND:
+            parts.append(None)
+            continue
+        found = (
+            [(in_front, 1.0)] if recognizer is None else foreground.recognize(recognizer, target, in_front)
+        )
+        parts.append([_part(mask, evidence, target.view, room.caster) for mask, evidence in found])
+    animal = follow([each or [] for each in parts], [each.view for each in shown], timestamp_s)
+    largest = [each.contacts[0] if each and each.contacts else None for each in animal]
     carried, found = contact.between(timestamp_s, largest, MAX_CONTACT_GAP_S), []
-    for frame, seen in enumerate(zip(shown, masks, contacts, carried, strict=True)):
-        found.append(None if seen[1] is None else _with_animal(frame, *seen, length_m, depth_net))
+    for frame, target in enumerate(shown):
+        own = animal[frame] or Part((), (), 0.0)
+        depth = _with_animal(frame, target, own, carried[frame], length_m, depth_net)
+        found.append(None if parts[frame] is None else depth)
     return found
+
+
+def _part(mask: Bool[np.ndarray, "height width"], evidence: float, view: View, caster: RayCaster) -> Part:
+    blobs, camera = _blobs(mask), (view.intrinsics, view.world_from_camera)
+    return Part(blobs, [contact.find(blob, *camera, caster) for blob in blobs], evidence)
 
 
 def _blobs(mask: Bool[np.ndarray, "height width"]) -> list[Bool[np.ndarray, "height width"]]:
@@ -109,15 +120,15 @@ def _blobs(mask: Bool[np.ndarray, "height width"]) -> list[Bool[np.ndarray, "hei
     return [label == blob for blob in order if sizes[blob - 1] >= contact.MIN_AREA_PX]
 
 
-def _with_animal(frame, target: ColorView, blobs, touched, carried, length_m, depth_net) -> FrameDepth:
-    """Insert the foreground's depth into the map's; around the foreground it is unknown."""
-    room, view = of_map(target), target.view
+def _with_animal(frame, target: ColorView, animal: Part, carried, length_m, depth_net) -> FrameDepth:
+    """Insert the animal's depth into the map's; around the animal it is unknown."""
+    room, view, blobs = of_map(target), target.view, animal.blobs
     depth, confidence = room.depth.copy(), room.confidence.copy()
     shown = np.any([np.zeros(depth.shape, bool), *blobs], axis=0).astype(np.uint8)
     union = cv2.dilate(shown, DILATION) > 0
     depth[union], confidence[union] = 0, 0
     by_network = None if depth_net is None or not blobs else depth_net(frame, room.depth, ~union)
-    for blob, each in zip(blobs, touched, strict=True):
+    for blob, each in zip(blobs, animal.contacts, strict=True):
         point = each.point_world if each is not None and each.certain else carried
         if by_network is not None:
             own = np.where(blob, by_network, 0)

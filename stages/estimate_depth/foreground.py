@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipeline.geometry import cameras, picture_fit
-from pipeline.segmentation.appearance import Appearance, strongest
+from pipeline.segmentation.appearance import Appearance, components
 from pipeline.segmentation.grabcut import Region, dilated, outlined
 from stages.estimate_depth import views
 from stages.estimate_depth.views import View
@@ -33,6 +33,8 @@ OPENING, CLOSING = np.ones((3, 3), np.uint8), np.ones((7, 7), np.uint8)
 """Kernels against specks, and against gaps in the animal, whose stripes may look like the floor."""
 REACH_PX = 12
 """The animal is at most this far from foreground, pixels of small pictures: parts of it resemble the room."""
+MOST_PARTS = 4
+"""Most parts of a picture that may be the animal."""
 
 
 @dataclass(frozen=True)
@@ -90,12 +92,15 @@ def foreground(
     return cv2.morphologyEx(grown.astype(np.uint8), cv2.MORPH_CLOSE, CLOSING) > 0
 
 
-def recognize(network: Appearance, target: ColorView, in_front: Region) -> Region:
-    """Return the animal's mask: of what is recognized near foreground (as its shadow is), the surest part."""
-    log_odds = network.log_odds(target.color)
-    animal = strongest((log_odds > 0) & dilated(in_front, REACH_PX), log_odds)
-    rng = np.random.default_rng(0)  # the same for every picture, so that no mask depends on the others
-    return outlined(target.color, animal, log_odds, rng)
+def recognize(network: Appearance, target: ColorView, in_front: Region) -> list[tuple[Region, float]]:
+    """Return the parts recognized near foreground (as the animal's shadow is), surest first, with their
+    evidence: the sum of log-odds.
+    """
+    log_odds, found = network.log_odds(target.color), []
+    for part, evidence in components((log_odds > 0) & dilated(in_front, REACH_PX), log_odds)[:MOST_PARTS]:
+        rng = np.random.default_rng(0)  # the same for every part, so that no mask depends on the others
+        found.append((outlined(target.color, part, log_odds, rng), evidence))
+    return found
 
 
 def _differing(both, limit: float) -> Bool[np.ndarray, "height width"]:
