@@ -7,7 +7,7 @@ the animal. The true cat flees by its rule (`stages.synthesize_capture.policy`).
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cache
@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 from benchmarks.behavior_builds import SESSION_S, TAKES, slice_sessions, train_model
 from pipeline.behavior.avoidance import clearance_of
 from pipeline.behavior.trajectories import RATE_HZ, BehaviorData, Context
+from pipeline.core.videos import Split
 from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.residents import Resident
 from pipeline.environments.world import AnimalWorld
@@ -28,7 +29,7 @@ from stages.read_trajectories.motion import CLIP_GAP_S, MeasuredMotion
 from stages.synthesize_capture import camera_motion, dwellings, gait, session
 from stages.synthesize_capture.camera_motion import ARM_M
 from stages.synthesize_capture.lives.lives import rest
-from stages.synthesize_capture.observer import AT_HOME
+from stages.synthesize_capture.observer import AT_HOME, ObserverStyle
 from stages.synthesize_capture.policy import DELAY_S, STEP_S, Policy, SeenWalker
 from stages.synthesize_capture.room import Room
 from stages.synthesize_capture.voxels import volume_of
@@ -44,6 +45,9 @@ HOMES, TEST_HOMES, TEST_SESSIONS = 24, 3, 4
 """Homes to learn from, a session each, further homes for testing, and sessions in each of these."""
 WALKS_UP = replace(AT_HOME, approach_m_s=(0.15, 1.3), approach_s=(4.0, 10.0))
 """A person who walks up to the cat at all speeds, slow ones for longer; `AT_HOME` knows none below 0.8 m/s."""
+ON = replace(WALKS_UP, approach_s=(10.0, 25.0))
+LEARNED_FROM = (ON, replace(ON, approach_m_s=(0.1, 0.5)))
+"""Persons of the takes to learn from, in turn: both walk on until they reach the cat, the second slowly."""
 MODEL = TrainingConfig(
     export=False,
     ensemble_size=1,
@@ -77,14 +81,21 @@ def session_names() -> dict[str, tuple[int, int]]:
 
 
 def simulated_session(
-    home: Room, rng: np.random.Generator, watch: Callable[[Policy], None] = lambda _: None
+    home: Room,
+    rng: np.random.Generator,
+    persons: Sequence[ObserverStyle] = (WALKS_UP,),
+    watch: Callable[[Policy], None] = lambda _: None,
 ) -> MeasuredMotion:
-    """Simulate cat and person in a home in several takes; ``watch`` is called with the cat after every step."""
+    """Simulate cat and person in a home in several takes, with these ``persons`` in turn.
+
+    ``watch`` is called with the cat after every step.
+    """
     time = np.arange(round(SESSION_S / TAKES * RATE_HZ)) / RATE_HZ
     sample = np.round(time / session.STEP_S).astype(int)
     roots, bones, cameras = [], [], []
-    for _ in range(TAKES):
-        take = session.simulate_session(home, rng, SESSION_S / TAKES, WALKS_UP, watch=watch)
+    for take_number in range(TAKES):
+        person = persons[take_number % len(persons)]
+        take = session.simulate_session(home, rng, SESSION_S / TAKES, person, watch=watch)
         motion = gait.poses(take.animal, time)
         roots.append(motion.world_from_agent)
         bones.append(motion.agent_from_bone.astype(np.float32))
@@ -98,12 +109,16 @@ def simulated_build(out: Path) -> None:
     """Simulate sessions, slice them into windows and train the model, unless ``out`` has it."""
     if (out / "behavior" / "behavior.json").is_file():
         return
-    sessions = (
-        (name, "train" if number < HOMES else "test", simulated_session(*home_of(number, session_number)))
-        for name, (number, session_number) in session_names().items()
-    )
-    slice_sessions(sessions, out)
+    slice_sessions(_sessions(), out)
     train_model(out, MODEL, "behavior")
+
+
+def _sessions() -> Iterator[tuple[str, Split, MeasuredMotion]]:
+    for name, (home, number) in session_names().items():
+        if home < HOMES:
+            yield name, "train", simulated_session(*home_of(home, number), LEARNED_FROM)
+        else:
+            yield name, "test", simulated_session(*home_of(home, number))
 
 
 def remembered(cat: Policy) -> Policy:
@@ -116,7 +131,7 @@ def remembered(cat: Policy) -> Policy:
 def lived(name: str) -> list[Policy]:
     """Simulate a session again, and return the cat as it was after every step."""
     cats: list[Policy] = []
-    simulated_session(*home_of(*session_names()[name]), lambda cat: cats.append(remembered(cat)))
+    simulated_session(*home_of(*session_names()[name]), watch=lambda cat: cats.append(remembered(cat)))
     return cats
 
 

@@ -64,7 +64,7 @@ class PlanSamplingConfig:
     """Warp paths to end at the goals that condition them."""
     body_noise_std: float = 0.25
     """Standard deviation of the initial noise of bodies. Of 0.1 to 1 it has the least joint error of the best
-    of 16 in each of three sessions left out of training (built-in cat; `docs/behavior.md`)."""
+    of 16 in each of three sessions left out of training (built-in cat; `docs/experiments/behavior.md`)."""
     path_noise_std: float = 1.0
     """Standard deviation of the initial noise of paths. At 0, in one step, a path is the mean of all paths to
     its goal."""

@@ -3,7 +3,7 @@
 A global scene code hardly retains where things are. `MapAttention` has heads that attend around the noisy
 goal, as far as its noise level allows, and heads that attend where the perception code directs them;
 `GoalLikelihood` is the likelihood of the noisy goal if the animal rests, as it mostly does, or joins another.
-They were evaluated on held-out homes, see `docs/behavior.md`.
+They were evaluated on held-out homes, see `docs/experiments/behavior.md`.
 """
 
 from itertools import pairwise
