@@ -12,7 +12,7 @@ import pytest
 from pipeline.workflow import dag
 
 ROOT = Path(__file__).parent.parent
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 AGENTS = {path.stem for path in (ROOT / "agents").glob("*.toml")} | {"luna", "hen", "toy_plain"}
 TARGETS = set(re.search(r"^COMMANDS := (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)[1].split())
@@ -84,10 +84,20 @@ def test_every_command_exists(page: str, line: str) -> None:
                 ), line
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@cache
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", BLOCK.sub("", page.read_text()), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_link_targets_exist(page: Path) -> None:
-    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
-        assert target.startswith("http") or (page.parent / target).exists(), target
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        file, _, anchor = target.partition("#")
+        place = page.parent / file if file else page
+        assert target.startswith("http") or place.exists(), target
+        assert not anchor or target.startswith("http") or anchor in anchors(place), target
     for key in re.findall(r"`(layout|scene_splats|scene_faces)", page.read_text()):
         assert key in (ROOT / "stages/export_simulator/config.py").read_text(), key
 
