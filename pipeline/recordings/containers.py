@@ -140,7 +140,7 @@ class FolderContainer(Container):
             with open(self.path(name), "rb") as file:
                 return _within(file.read(max_bytes + 1), max_bytes, self.place(name))
         except OSError as error:
-            raise errors.damaged(self.place(name), error.strerror or str(error)) from error
+            raise errors.unreadable(self.place(name), error) from error
 
 
 class ZipContainer(Container):

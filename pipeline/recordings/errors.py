@@ -11,6 +11,14 @@ def damaged(where: str, why: str) -> InputError:
     return InputError("CAP-001", what, where, "export it from the phone again")
 
 
+def unreadable(where: str, error: Exception) -> InputError:
+    """Return the error for a file that cannot be read: SYS-003 without access, else it counts as damaged."""
+    why = str(getattr(error, "strerror", None) or error)
+    if isinstance(error, PermissionError):
+        return InputError("SYS-003", f"the recording cannot be read: {why}", where, "check who may read it")
+    return damaged(where, why)
+
+
 def broken_metadata(where: str, why: str) -> InputError:
     """Return the error for invalid metadata, as after a change of the format."""
     remedy = "export it again, or correct it if written by hand; if a newer app wrote it, report its version"

@@ -152,7 +152,7 @@ class Movie:
         try:
             container = av.open(str(self._path), options=_GUARDS, metadata_errors="replace")
         except (av.error.FFmpegError, OSError) as error:
-            raise errors.damaged(self.where, f"not a readable video: {error.strerror or error}") from error
+            raise errors.unreadable(self.where, error) from error
         with container:
             if not container.streams.video:
                 raise errors.no_frames(self.where, "the file holds no pictures")

@@ -1,5 +1,6 @@
 """Malicious or damaged files give an error code, or the correct result, within bounded time and memory."""
 
+import errno
 import io
 import json
 import os
@@ -25,6 +26,21 @@ from tests.pipeline.recordings import made_formats
 from tests.stages.extract_frames.made_recordings import walk
 
 HUGE = int("9" * 400)
+
+
+def test_file_without_permission_is_not_called_damaged(tmp_path, monkeypatch):
+    """Root may read everything, so the system's answer is given by hand."""
+
+    def refused(name, *_, **__):
+        raise PermissionError(errno.EACCES, "Permission denied", str(name))
+
+    (tmp_path / "session.mp4").write_bytes(bytes(100))
+    monkeypatch.setattr(movies.av, "open", refused)
+    monkeypatch.setattr(containers, "open", refused, raising=False)
+    with pytest.raises(InputError, match="SYS-003.*session.mp4"):
+        open_recording(tmp_path / "session.mp4")
+    with pytest.raises(InputError, match="SYS-003.*session.mp4"):
+        containers.FolderContainer(tmp_path).read("session.mp4")
 
 
 def _archive(path: Path, members: dict[str, bytes]) -> Path:
