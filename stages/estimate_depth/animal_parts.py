@@ -15,7 +15,7 @@ from stages.estimate_depth.foreground import MIN_GAP_S
 from stages.estimate_depth.views import View
 
 STATIC_COST = 2.0
-"""Cost of what every other frame that visible its place shown there, too; in units of the log of evidence."""
+"""Cost of a place at which all other frames that see it have such a part, too; in units of log evidence."""
 JUMP_COST, MAX_M_S, SLACK_M = 10.0, 4.0, 0.3
 """Cost of a jump: faster than an animal that runs, beyond the error of contacts, meters."""
 WEAK = 4.0
