@@ -102,5 +102,13 @@ def test_link_targets_exist(page: Path) -> None:
         assert key in (ROOT / "stages/export_simulator/config.py").read_text(), key
 
 
+@pytest.mark.parametrize("measured", sorted(path.name for path in (ROOT / "docs/experiments").iterdir()))
+def test_guide_has_one_table_of_figures_and_leads_to_the_others(measured: str) -> None:
+    guide = (ROOT / "docs" / measured).read_text()
+    metrics = re.search(r"^## Metrics\n(.*?)(?=^## |\Z)", guide, re.MULTILINE | re.DOTALL)
+    assert metrics is not None and len(re.findall(r"^\|-", metrics[1], re.MULTILINE)) == 1
+    assert f"](experiments/{measured})" in guide
+
+
 def test_pictures_are_small() -> None:
     assert sum(path.stat().st_size for path in (ROOT / "docs/pictures").iterdir()) < 400_000, "bytes in total"
