@@ -110,5 +110,17 @@ def test_guide_has_one_table_of_figures_and_leads_to_the_others(measured: str) -
     assert f"](experiments/{measured})" in guide
 
 
+def test_cited_commits_exist() -> None:
+    def git(*arguments: str) -> str:
+        return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True).stdout.strip()
+
+    if git("rev-parse", "--is-shallow-repository") != "false":
+        pytest.skip("no history here")
+    cited = {word for page in PAGES for word in re.findall(r"\b[0-9a-f]{7,8}\b", page.read_text())}
+    hashes = {word for word in cited if re.search("[a-f]", word) and re.search("[0-9]", word)}
+    known = git("rev-list", "HEAD").split()
+    assert not {word for word in hashes if not any(commit.startswith(word) for commit in known)}
+
+
 def test_pictures_are_small() -> None:
     assert sum(path.stat().st_size for path in (ROOT / "docs/pictures").iterdir()) < 400_000, "bytes in total"
