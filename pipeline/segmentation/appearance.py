@@ -177,12 +177,12 @@ def balanced(
 
 
 def components(
-    inside: Bool[np.ndarray, "height width"], log_odds: Float[np.ndarray, "height width"]
+    inside: Bool[np.ndarray, "height width"], log_odds: Float[np.ndarray, "height width"], most: int
 ) -> list[tuple[Bool[np.ndarray, "height width"], float]]:
-    """Return the connected components of a mask with their evidence, the sum of log-odds; most first."""
+    """Return up to ``most`` connected components of a mask and their evidence, the sum of log-odds, by it."""
     count, part = cv2.connectedComponents(inside.astype(np.uint8), connectivity=8)
     evidence = np.bincount(part.ravel(), np.maximum(log_odds, 0).ravel(), count)
-    order = 1 + np.argsort(-evidence[1:], kind="stable")
+    order = 1 + np.argsort(-evidence[1:], kind="stable")[:most]
     return [(part == number, float(evidence[number])) for number in order]
 
 
@@ -190,7 +190,7 @@ def strongest(
     inside: Bool[np.ndarray, "height width"], log_odds: Float[np.ndarray, "height width"]
 ) -> Bool[np.ndarray, "height width"]:
     """Return the connected component of a mask with the most evidence."""
-    found = components(inside, log_odds)
+    found = components(inside, log_odds, 1)
     return found[0][0] if found else inside
 
 

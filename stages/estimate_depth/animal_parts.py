@@ -36,17 +36,19 @@ class Part:
     """Sum of its log-odds."""
 
     @property
-    def point_world(self) -> Float[np.ndarray, "3"]:
-        """Return the contact of the largest component, NaN if unknown."""
-        first = self.contacts[0] if self.contacts else None
-        return np.full(3, np.nan) if first is None else first.point_world
+    def contact(self) -> Contact | None:
+        """Return the contact of the largest component."""
+        return self.contacts[0] if self.contacts else None
 
 
 def follow(
     parts: Sequence[Sequence[Part]], views: Sequence[View], timestamp_s: Float[np.ndarray, "frame"]
 ) -> list[Part | None]:
     """Choose the animal's part in every frame by a Viterbi path; None where there is none, or a weak one."""
-    points = [np.array([each.point_world for each in group]).reshape(-1, 3) for group in parts]
+    none = Contact(np.full(3, np.nan), certain=False)
+    points = [
+        np.array([(one.contact or none).point_world for one in group]).reshape(-1, 3) for group in parts
+    ]
     evidence = [np.log([max(each.evidence, 1e-3) for each in group]) for group in parts]
     frames = np.array([frame for frame, group in enumerate(parts) if group], int)
     if not len(frames):

@@ -12,7 +12,7 @@ from pipeline.geometry import contact, subsampling
 from pipeline.geometry.meshes import RayCaster
 from pipeline.mapping import plane_sweep
 from pipeline.mapping.plane_sweep import SweepView
-from pipeline.segmentation.appearance import Appearance
+from pipeline.segmentation.appearance import Appearance, components
 from stages.estimate_depth import foreground, standing, tracking
 from stages.estimate_depth.animal_parts import Part, follow
 from stages.estimate_depth.foreground import ColorView
@@ -98,12 +98,11 @@ def of_session(
         )
         parts.append([_part(mask, evidence, target.view, room.caster) for mask, evidence in found])
     animal = follow([each or [] for each in parts], [each.view for each in shown], timestamp_s)
-    largest = [each.contacts[0] if each and each.contacts else None for each in animal]
+    largest = [each and each.contact for each in animal]
     carried, found = contact.between(timestamp_s, largest, MAX_CONTACT_GAP_S), []
     for frame, target in enumerate(shown):
-        own = animal[frame] or Part((), (), 0.0)
-        depth = _with_animal(frame, target, own, carried[frame], length_m, depth_net)
-        found.append(None if parts[frame] is None else depth)
+        own = frame, target, animal[frame] or Part((), (), 0.0), carried[frame], length_m, depth_net
+        found.append(None if parts[frame] is None else _with_animal(*own))
     return found
 
 
@@ -114,10 +113,8 @@ def _part(mask: Bool[np.ndarray, "height width"], evidence: float, view: View, c
 
 def _blobs(mask: Bool[np.ndarray, "height width"]) -> list[Bool[np.ndarray, "height width"]]:
     """Return the connected components, largest first."""
-    count, label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
-    sizes = np.bincount(label.ravel(), minlength=count)[1:]
-    order = 1 + np.argsort(-sizes, kind="stable")
-    return [label == blob for blob in order if sizes[blob - 1] >= contact.MIN_AREA_PX]
+    found = components(mask, np.ones(mask.shape), mask.size)
+    return [blob for blob, area_px in found if area_px >= contact.MIN_AREA_PX]
 
 
 def _with_animal(frame, target: ColorView, animal: Part, carried, length_m, depth_net) -> FrameDepth:

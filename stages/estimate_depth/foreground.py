@@ -97,7 +97,8 @@ def recognize(network: Appearance, target: ColorView, in_front: Region) -> list[
     evidence: the sum of log-odds.
     """
     log_odds, found = network.log_odds(target.color), []
-    for part, evidence in components((log_odds > 0) & dilated(in_front, REACH_PX), log_odds)[:MOST_PARTS]:
+    recognized = (log_odds > 0) & dilated(in_front, REACH_PX)
+    for part, evidence in components(recognized, log_odds, MOST_PARTS):
         rng = np.random.default_rng(0)  # the same for every part, so that no mask depends on the others
         found.append((outlined(target.color, part, log_odds, rng), evidence))
     return found
