@@ -20,7 +20,7 @@ from pipeline.core.errors import InputError
 from pipeline.core.progress import log
 from pipeline.geometry import cameras, rigid
 from pipeline.mapping.icp import DepthImage, depth_image
-from pipeline.mapping.odometry import align_gravity, chain_alignments, correct_drift
+from pipeline.mapping.odometry import Guess, align_gravity, chain_alignments, correct_drift
 from pipeline.recordings import errors, extraction
 from pipeline.recordings.extraction import ExtractionPlan
 from pipeline.recordings.formats import open_recording
@@ -125,7 +125,7 @@ class Sequence:
         if self.plan.odometry_from_camera is not None:
             given = self.plan.odometry_from_camera[list(self.rows)]
             return given if self.plan.gravity_known else align_gravity(self.view, given)
-        chained = chain_alignments(self.view, lambda _, last: last, len(self.rows))
+        chained = chain_alignments(self.view, lambda _, last: Guess(last), len(self.rows))
         found = correct_drift(self.view, self.timestamp_s, chained)
         log(f"{self.recording.where}: no poses; depth is aligned, residual {1000 * found.residual_m:.1f} mm")
         return align_gravity(self.view, found.world_from_camera)

@@ -109,20 +109,30 @@ def correct_drift(
     return CorrectedOdometry(poses, len(residuals), residual_m)
 
 
+@dataclass(frozen=True)
+class Guess:
+    """The initial motion of an alignment."""
+
+    first_from_second: Float[np.ndarray, "4 4"]
+    agrees: Callable[[Float[np.ndarray, "4 4"]], bool] = lambda motion: True
+    """Whether an aligned motion agrees with what the guess was made of."""
+
+
 def chain_alignments(
-    view: Callable[[int], DepthImage],
-    guess: Callable[[int, Float[np.ndarray, "4 4"]], Float[np.ndarray, "4 4"]],
-    count: int,
+    view: Callable[[int], DepthImage], guess: Callable[[int, Float[np.ndarray, "4 4"]], Guess], count: int
 ) -> Float[np.ndarray, "frame 4 4"]:
     """Estimate odometry of ``count`` frames by aligning each depth image to its predecessor.
 
-    ``guess(i, last)`` is the initial pose of frame i+1 in frame i; ``last`` is the previous motion.
+    ``guess(i, last)`` is the initial pose of frame i+1 in frame i; ``last`` is the previous motion. Where the
+    alignment is unreliable or does not agree with it, the guess is kept.
     """
     steps, last = [], np.eye(4)
     for index in range(count - 1):
         start = guess(index, last)
-        result = align_views(view(index), view(index + 1), start, reach_m=REACH_M, iterations=ICP_ITERATIONS)
-        last = result.target_from_source if is_reliable(result) else start
+        motion, views = start.first_from_second, (view(index), view(index + 1))
+        result = align_views(*views, motion, reach_m=REACH_M, iterations=ICP_ITERATIONS)
+        accepted = is_reliable(result) and start.agrees(result.target_from_source)
+        last = result.target_from_source if accepted else motion
         steps.append(last)
     return rigid.accumulate(np.array(steps).reshape(-1, 4, 4))
 

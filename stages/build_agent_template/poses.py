@@ -11,7 +11,7 @@ from pipeline.data.clips import Clip, Masks, usable_depth
 from pipeline.geometry import rigid
 from pipeline.geometry.ground import GroundPlane, fit_ground
 from pipeline.mapping.icp import depth_views
-from pipeline.mapping.odometry import CorrectedOdometry, align_gravity, chain_alignments, correct_drift
+from pipeline.mapping.odometry import CorrectedOdometry, Guess, align_gravity, chain_alignments, correct_drift
 
 STRIDE = 2
 LOOPS = 5
@@ -41,7 +41,7 @@ def register_turnaround(clip: Clip, masks: Masks) -> Turnaround:
     view = depth_views(partial(usable_depth, clip), clip.depth_intrinsics, STRIDE)
     odometry = clip.odometry_from_camera
     if odometry is None:
-        odometry = chain_alignments(view, lambda _, last: last, len(clip))
+        odometry = chain_alignments(view, lambda _, last: Guess(last), len(clip))
     odometry_fit = correct_drift(view, clip.timestamp_s, odometry, loops=LOOPS)
     poses = odometry_fit.world_from_camera
     if clip.odometry_from_camera is None or not clip.gravity_known:

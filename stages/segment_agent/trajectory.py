@@ -11,15 +11,17 @@ from jaxtyping import Float, UInt8
 
 from pipeline.data.clips import Clip, back_project_pixels, usable_depth
 from pipeline.data.flow import STRIDE_PX, open_flow
-from pipeline.geometry import cameras
+from pipeline.geometry import cameras, rigid
 from pipeline.geometry.align import ransac_rigid
 from pipeline.mapping.icp import depth_views
-from pipeline.mapping.odometry import align_gravity, chain_alignments, correct_drift
+from pipeline.mapping.odometry import Guess, align_gravity, chain_alignments, correct_drift
 from stages.segment_agent import free_space, movers
 
 DEPTH_STRIDE = 3
 INLIER_M, ITERATIONS = 0.03, 200
 """RANSAC over flow correspondences: inlier threshold and iterations"""
+AGREEING = 0.9
+"""least inliers of ICP's motion, share of those of flow's: ICP follows what is close, such as an animal"""
 MOVING_STRIDE = 4
 """stride of depth samples that are tested for motion, pixels"""
 OPENING, DILATION = np.ones((2, 2), np.uint8), np.ones((5, 5), np.uint8)
@@ -91,8 +93,8 @@ def motion_from_flow(
     flow: Float[np.ndarray, "height width 2"],
     rng: np.random.Generator,
     depth_of: DepthOf,
-) -> Float[np.ndarray, "4 4"]:
-    """Return ``first_from_second`` of a frame and the next, by RANSAC on flow and depth."""
+) -> Guess:
+    """Return the motion between a frame and the next, by RANSAC on flow and depth."""
     height, width = flow.shape[:2]
     pixel = cameras.pixel_grid(height, width) * STRIDE_PX
     first, second = (
@@ -100,7 +102,13 @@ def motion_from_flow(
         for row, at in ((frame, pixel), (frame + 1, pixel + flow))
     )
     known = np.isfinite(first[:, 0]) & np.isfinite(second[:, 0])
-    first_from_second, _ = ransac_rigid(
-        second[known], first[known], threshold_m=INLIER_M, iterations=ITERATIONS, rng=rng
+    first, second = first[known], second[known]
+    first_from_second, inlier = ransac_rigid(
+        second, first, threshold_m=INLIER_M, iterations=ITERATIONS, rng=rng
     )
-    return first_from_second
+
+    def agrees(motion: Float[np.ndarray, "4 4"]) -> bool:
+        apart_m = np.linalg.norm(rigid.apply(motion, second) - first, axis=-1)
+        return bool((apart_m < INLIER_M).sum() >= AGREEING * inlier.sum())
+
+    return Guess(first_from_second, agrees)

@@ -9,6 +9,7 @@ from pipeline.geometry.ground import fit_ground
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 from pipeline.mapping.icp import align_views, depth_image
 from pipeline.mapping.odometry import (
+    Guess,
     RelativePose,
     align_gravity,
     chain_alignments,
@@ -124,12 +125,19 @@ def test_chained_alignment_needs_no_odometry(circle):
     poses, views = circle
     rng, relative = np.random.default_rng(4), rigid.inverse(poses[:-1]) @ poses[1:]
     guesses = relative @ rigid.exp(rng.normal(0, [0.02] * 3 + [0.03] * 3, (len(relative), 6)))
-    found = chain_alignments(views.__getitem__, lambda frame, last: guesses[frame], 12)
+    found = chain_alignments(views.__getitem__, lambda frame, last: Guess(guesses[frame]), 12)
     guessed = np.stack([np.linalg.multi_dot([np.eye(4), np.eye(4), *guesses[:frame]]) for frame in range(12)])
     truth = rigid.inverse(poses[0]) @ poses[:12]
     error = np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1).max()
     assert error < 0.75 * np.linalg.norm(guessed[:, :3, 3] - truth[:, :3, 3], axis=1).max()
     assert error < 0.12, "meters over a walk of 1.2 m along plain walls"
+
+
+def test_refuted_alignments_are_not_used(circle):
+    poses, views = circle
+    relative = rigid.inverse(poses[:-1]) @ poses[1:]
+    found = chain_alignments(views.__getitem__, lambda frame, _: Guess(relative[frame], lambda _: False), 5)
+    np.testing.assert_allclose(found, rigid.inverse(poses[0]) @ poses[:5], atol=1e-9)
 
 
 def test_gravity_is_estimated(circle):

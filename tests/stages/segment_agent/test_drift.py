@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from pipeline.data.clips import Clip
+from pipeline.data.flow import STRIDE_PX
 from pipeline.geometry import cameras
-from stages.segment_agent import free_space, locate
+from stages.segment_agent import free_space, locate, trajectory
 from stages.segment_agent.config import AnimalConfig
 from stages.segment_agent.free_space import DepthNoise, References
 
@@ -93,3 +94,18 @@ def test_drift_is_assumed_where_nothing_overlaps(tmp_path):
     poses, agent = scenery.session()
     scenery.record(tmp_path, poses[:4], np.full_like(agent[:4], np.nan), poses[:4])
     assert free_space.gather(Clip.open(tmp_path), poses[:4], 4).drift_m == free_space.DRIFT_M
+
+
+def test_motion_that_flow_does_not_show_is_refuted(tmp_path):
+    """As that of ICP, which follows an animal close to the camera."""
+    poses, agent = scenery.session()
+    scenery.record(tmp_path, poses, np.full_like(agent, np.nan), poses)
+    clip, motion = Clip.open(tmp_path), scenery.rigid.inverse(poses[0]) @ poses[1]
+    pixel = STRIDE_PX * cameras.pixel_grid(*(side // STRIDE_PX for side in clip.color_size))
+    points = trajectory.back_project_pixels(clip, 0, pixel.reshape(-1, 2), clip.depth(0))
+    there, _ = cameras.project(scenery.rigid.apply(scenery.rigid.inverse(motion), points), clip.intrinsics[1])
+    flow = there.reshape(pixel.shape) - pixel
+    guess = trajectory.motion_from_flow(clip, 0, flow, np.random.default_rng(0), clip.depth)
+    assert np.linalg.norm(guess.first_from_second[:3, 3] - motion[:3, 3]) < 0.02
+    assert guess.agrees(motion)
+    assert not guess.agrees(motion @ scenery.rigid.exp(np.array([0, 0, 0, 0.08, 0, 0])))
