@@ -28,7 +28,7 @@ BACK_SHARE = 0.55
 LARGEST_SHARE = 2.5
 """Largest extent of an animal in lengths; larger foreground is light, a curtain or a person."""
 MAX_FOREGROUND = 0.35
-"""Share of foreground above which the camera pose is taken as wrong."""
+"""Share of foreground, without what is recognized, above which the camera pose is taken as wrong."""
 MAX_CONTACT_GAP_S = 2.0
 """Longest time over which contact points are interpolated, seconds."""
 SWEPT_PX, SOURCES, PLANES, ANGLES_DEG = 224, 4, 96, (3.0, 22.0)
@@ -90,12 +90,12 @@ def of_session(
         distant = times[np.abs(timestamp_s[times] - timestamp_s[frame]) > foreground.MIN_GAP_S]
         seen = [walk[number] for number in tracking.walk_views(target.view, room)]
         in_front = foreground.foreground(target, seen, [shown[other] for other in distant])
-        if in_front.mean() > MAX_FOREGROUND:
+        found = [] if recognizer is None else foreground.recognize(recognizer, target, in_front)
+        unknown = np.logical_and.reduce([in_front, *(~mask for mask, _ in found)])
+        if unknown.mean() > MAX_FOREGROUND:
             parts.append(None)
             continue
-        found = (
-            [(in_front, 1.0)] if recognizer is None else foreground.recognize(recognizer, target, in_front)
-        )
+        found = [(in_front, 1.0)] if recognizer is None else found
         parts.append([_part(mask, evidence, target.view, room.caster) for mask, evidence in found])
     animal = follow([each or [] for each in parts], [each.view for each in shown], timestamp_s)
     largest = [each and each.contact for each in animal]

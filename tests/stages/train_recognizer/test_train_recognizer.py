@@ -100,6 +100,22 @@ def test_small_animal_has_finer_outlines_in_magnified_pictures(network):
     assert np.mean(found[recognizer.Recognizer]) > np.mean(found[Appearance]) + 0.02
 
 
+def test_an_animal_close_to_the_camera_is_recognized_as_a_whole(monkeypatch):
+    """By scales at which it is not larger than in training; a small one beside it by the finer ones."""
+
+    def of_size(self, color):
+        count, part, boxes, _ = cv2.connectedComponentsWithStats((color[..., 0] > 128).astype(np.uint8))
+        fits = [index for index in range(1, count) if 20 < np.sqrt(boxes[index, 4]) < 120]
+        return np.where(np.isin(part, fits), 6.0, -6.0).astype(np.float32)
+
+    monkeypatch.setattr(Appearance, "log_odds", of_size)
+    color = np.zeros((240, 320, 3), np.uint8)
+    color[40:140, 40:140] = color[200:212, 280:292] = 255
+    found = recognizer.Recognizer().log_odds(color) > 0
+    assert (found == (color[..., 0] > 0)).mean() > 0.99
+    assert found[206, 286], "12 pixels"
+
+
 def test_animals_are_turned_about_the_chosen_pixel():
     rng = np.random.default_rng(5)
     color = rng.integers(0, 256, (61, 61, 3), np.uint8)
