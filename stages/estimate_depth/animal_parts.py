@@ -18,8 +18,11 @@ STATIC_COST = 2.0
 """Cost of a place at which all other frames that see it have such a part, too; in units of log evidence."""
 JUMP_COST, MAX_M_S, SLACK_M = 10.0, 4.0, 0.3
 """Cost of a jump: faster than an animal that runs, beyond the error of contacts, meters."""
-WEAK = 4.0
-"""Difference of cost to the median evidence of a recording from which on a part is not the animal."""
+TYPICAL, WEAK = 0.9, 4.4
+"""Quantile of a recording's log evidence that the whole animal has; cost from which on a part is not the
+animal: an 80th of it, since furniture may hide the rest."""
+LEAST_M2 = 1e-6
+"""Floor of evidence, square meters."""
 SAME_M, MIN_FRAMES = 0.3, 5
 """Contacts this close are at one place; least number of frames that a share is taken of."""
 
@@ -33,7 +36,7 @@ class Part:
     contacts: Sequence[Contact | None]
     """Of each component, with the map."""
     evidence: float
-    """Sum of its log-odds."""
+    """Integral of its log-odds over its area, square meters: small things look like parts of an animal."""
 
     @property
     def contact(self) -> Contact | None:
@@ -49,7 +52,7 @@ def follow(
     points = [
         np.array([(one.contact or none).point_world for one in group]).reshape(-1, 3) for group in parts
     ]
-    evidence = [np.log([max(each.evidence, 1e-3) for each in group]) for group in parts]
+    evidence = [np.log([max(each.evidence, LEAST_M2) for each in group]) for group in parts]
     frames = np.array([frame for frame, group in enumerate(parts) if group], int)
     if not len(frames):
         return [None] * len(parts)
@@ -62,7 +65,7 @@ def follow(
         return JUMP_COST * (moved_m > MAX_M_S * (timestamp_s[after] - timestamp_s[before]) + SLACK_M)
 
     path = viterbi.viterbi_decode(cost, change)
-    limit = WEAK - float(np.median([each.max() for each in evidence if len(each)]))
+    limit = WEAK - float(np.quantile([each.max() for each in evidence if len(each)], TYPICAL))
     chosen: list[Part | None] = [None] * len(parts)
     for frame, costs, state in zip(frames.tolist(), cost, path, strict=True):
         chosen[frame] = parts[frame][state] if costs[state] < limit else None

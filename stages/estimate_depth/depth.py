@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from pipeline.core.progress import track
-from pipeline.geometry import contact, subsampling
+from pipeline.geometry import contact, rigid, subsampling
 from pipeline.geometry.meshes import RayCaster
 from pipeline.mapping import plane_sweep
 from pipeline.mapping.plane_sweep import SweepView
@@ -107,8 +107,15 @@ def of_session(
 
 
 def _part(mask: Bool[np.ndarray, "height width"], evidence: float, view: View, caster: RayCaster) -> Part:
+    """Return a part, its ``evidence`` scaled from pixels to square meters where it stands."""
     blobs, camera = _blobs(mask), (view.intrinsics, view.world_from_camera)
-    return Part(blobs, [contact.find(blob, *camera, caster) for blob in blobs], evidence)
+    contacts = [contact.find(blob, *camera, caster) for blob in blobs]
+    if contacts and contacts[0] is not None:
+        z_m = rigid.apply(rigid.inverse(view.world_from_camera), contacts[0].point_world[None])[0, 2]
+    else:
+        behind = view.depth[mask & (view.depth > 0)]
+        z_m = np.median(behind) if len(behind) else 0.0
+    return Part(blobs, contacts, evidence * float(z_m / view.intrinsics[0, 0]) ** 2)
 
 
 def _blobs(mask: Bool[np.ndarray, "height width"]) -> list[Bool[np.ndarray, "height width"]]:

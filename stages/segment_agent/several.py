@@ -27,7 +27,7 @@ from stages.segment_agent.identity import Identities, Portrait
 from stages.segment_agent.locate import AppearanceOf, find_mover
 from stages.segment_agent.masks import Segmentation
 from stages.segment_agent.segmenter import Mask, Segmenter, with_color_histogram
-from stages.segment_agent.trajectory import estimate_without_movers
+from stages.segment_agent.trajectory import estimate_trajectory
 from stages.segment_agent.windows import Sphere, Window, tracked, working_picture, working_size
 
 QUANTIZATION = 127 / identity.MAX_LOG_ODDS
@@ -98,7 +98,7 @@ def segment(
 
     Raises InputError MSK-007 if unknown animals prevail.
     """
-    path = estimate_without_movers(clip, flow, config.references, config.seed)
+    path = estimate_trajectory(clip, flow, np.random.default_rng(config.seed))
     poses, scores = path.world_from_camera, IdentityScores(clip, network, config.height_px)
     references, persons = people.gather_without_people(clip, poses, config.references)
     stranger_margin = scores.of(len(network.names))

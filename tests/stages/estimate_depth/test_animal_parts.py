@@ -54,6 +54,12 @@ def test_box_is_not_the_animal_where_that_is_hidden(views):
     assert found == [None if frame in hidden else ANIMAL for frame in range(COUNT)]
 
 
+def test_what_is_far_smaller_is_not_the_animal_while_it_is_away(views):
+    parts = [[part(walk(frame), ANIMAL if frame < COUNT // 3 else 0.01 * ANIMAL)] for frame in range(COUNT)]
+    found = evidence_of(follow(parts, views, TIME_S))
+    assert found == [ANIMAL if frame < COUNT // 3 else None for frame in range(COUNT)]
+
+
 def test_what_jumps_there_and_back_is_not_the_animal(views):
     """Evidence alone prefers the flash, by less than two jumps cost."""
     far_m = MAX_M_S * 0.1 + SLACK_M + 0.5

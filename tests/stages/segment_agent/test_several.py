@@ -11,9 +11,9 @@ import pytest
 
 from pipeline.core.errors import InputError
 from pipeline.core.videos import Video
-from pipeline.data.clips import Clip, Masks, usable_depth
+from pipeline.data.clips import Clip, Masks
 from pipeline.segmentation.appearance import Example
-from stages.segment_agent import bodies, free_space, identity, masks, several, stage, trajectory
+from stages.segment_agent import bodies, free_space, identity, masks, several, stage
 from stages.segment_agent.config import AnimalConfig, Config, LearningConfig
 from stages.segment_agent.identities import config as identities_config
 from stages.segment_agent.identities import stage as identities
@@ -216,26 +216,6 @@ def together(tmp_path_factory):
     other[:, 2, 3] += 0.45
     folder = tmp_path_factory.mktemp("together") / "frames"
     return folder, scenery.record(folder, poses, agent, scenery.drifted(poses), world_from_other=other)
-
-
-def test_poses_are_estimated_again_without_what_moves(together, tmp_path, monkeypatch):
-    folder, truth = together
-    clip, given = Clip.open(folder), []
-
-    def estimate(clip, flow, rng, depth_of=None):
-        given.append(depth_of)
-        return trajectory.CameraPath(truth.world_from_camera, 0, 0.0)
-
-    monkeypatch.setattr(trajectory, "estimate_trajectory", estimate)
-    trajectory.estimate_without_movers(clip, Path("none"), 40, 0)
-    assert given == [None], "the device knows where it is"
-    without = replace(clip, odometry_from_camera=None)
-    trajectory.estimate_without_movers(without, Path("none"), 40, 0)
-    depth = np.stack([given[-1](frame) for frame in range(len(clip))])
-    usable = np.stack([usable_depth(clip, frame, keep_steps=False) for frame in range(len(clip))]) > 0
-    animals = (truth.masks | truth.others) & usable
-    assert (depth[animals] == 0).mean() > 0.8
-    assert (depth[usable & ~animals] > 0).mean() > 0.9
 
 
 def test_nothing_is_learned_if_an_animal_that_is_here_has_no_sure_bodies(network, portraits, together):
