@@ -105,7 +105,10 @@ def test_motion_that_flow_does_not_show_is_refuted(tmp_path):
     points = trajectory.back_project_pixels(clip, 0, pixel.reshape(-1, 2), clip.depth(0))
     there, _ = cameras.project(scenery.rigid.apply(scenery.rigid.inverse(motion), points), clip.intrinsics[1])
     flow = there.reshape(pixel.shape) - pixel
-    guess = trajectory.motion_from_flow(clip, 0, flow, np.random.default_rng(0))
+    sure, rng = np.full(flow.shape[:2], 255, np.uint8), np.random.default_rng(0)
+    guess = trajectory.motion_from_flow(clip, 0, flow, sure, rng)
     assert np.linalg.norm(guess.first_from_second[:3, 3] - motion[:3, 3]) < 0.02
     assert guess.agrees(motion)
-    assert not guess.agrees(motion @ scenery.rigid.exp(np.array([0, 0, 0, 0.08, 0, 0])))
+    other = motion @ scenery.rigid.exp(np.array([0, 0, 0, 0.08, 0, 0]))
+    assert not guess.agrees(other)
+    assert trajectory.motion_from_flow(clip, 0, flow, 0 * sure, rng).agrees(other), "flow is uncertain"

@@ -130,7 +130,7 @@ def test_recording_without_odometry_is_segmented(tmp_path):
     flow = tmp_path / "flow"
     flow.mkdir()
     forward = np.zeros((39, scenery.COLOR_SIZE[0] // 4, scenery.COLOR_SIZE[1] // 4, 2), np.float16)
-    npz.save(flow / "flow_1_fw.npz", flow=forward)
+    npz.save(flow / "flow_1_fw.npz", flow=forward, confidence=np.zeros(forward.shape[:3], np.uint8))
     found, truth = make(tmp_path / "frames", "turnaround", poses, agent, None, flow)
     assert (
         np.mean([iou(mask.labels == 255, true) for mask, true in zip(found, truth.masks, strict=True)]) > 0.6
