@@ -24,6 +24,8 @@ class Evidence:
     animal: Bool[np.ndarray, "height width"]
     moving: Bool[np.ndarray, "height width"]
     """clearly moving, at depth steps too"""
+    seen_through: Bool[np.ndarray, "height width"]
+    """moving in spite of the poses' drift, which makes rims of furniture move"""
     room: Bool[np.ndarray, "height width"]
     color_log_odds: Float[np.ndarray, "height width"] | float = 0.0
     """part of `log_odds` due to color change alone: thin paws and tails, but also gloss and shadows"""
@@ -74,11 +76,28 @@ def motion_evidence(references: References) -> EvidenceOf:
         certainty = np.where(static, seen, 1.0) * np.where(window.trusted, 1.0, doubted)
         log_odds[elsewhere], color[elsewhere] = -ROOM, 0.0
         certainty[~(animal | static | elsewhere)] = UNKNOWN
-        moving = animal & movers.clearly_moving(votes)
-        room = log_odds <= -SURE_ROOM * ROOM
-        return Evidence(log_odds, certainty, animal & window.trusted, moving, room, color)
+        moving, room = animal & movers.clearly_moving(votes), log_odds <= -SURE_ROOM * ROOM
+        through = _seen_through(animal, points, references, frame)
+        return Evidence(log_odds, certainty, animal & window.trusted, moving, through, room, color)
 
     return evidence_of
+
+
+def _seen_through(
+    animal: Bool[np.ndarray, "height width"],
+    points_world: Float[np.ndarray, "height width 3"],
+    references: References,
+    frame: int,
+) -> Bool[np.ndarray, "height width"]:
+    """Return parts of ``animal`` that are wider than rims due to drift, and seen through in spite of it."""
+    spacing_m = np.linalg.norm(np.diff(points_world, axis=1), axis=-1)[animal[:, 1:] & animal[:, :-1]]
+    found, side_px = np.zeros(animal.shape, bool), 1
+    if len(spacing_m):
+        side_px += int(references.drift_m / np.median(spacing_m))
+    opened = cv2.morphologyEx(animal.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side_px,) * 2, np.uint8))
+    for part in movers.components(opened > 0):
+        found |= part & free_space.seen_through(references, points_world[part], frame)
+    return found
 
 
 def view_evidence(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> EvidenceOf:
@@ -89,7 +108,8 @@ def view_evidence(world_from_camera: Float[np.ndarray, "frame 4 4"]) -> Evidence
         ray = window.points_world - eye
         off_m = np.linalg.norm(np.cross(sphere.center_world - eye, ray), axis=-1)
         outside = off_m >= sphere.radius_m * np.linalg.norm(ray, axis=-1)
-        return Evidence(np.where(outside, -ROOM, 0.0), np.where(outside, 1.0, UNKNOWN), none, none, outside)
+        log_odds, certainty = np.where(outside, -ROOM, 0.0), np.where(outside, 1.0, UNKNOWN)
+        return Evidence(log_odds, certainty, none, none, none, outside)
 
     return evidence_of
 

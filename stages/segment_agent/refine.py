@@ -33,8 +33,9 @@ MIN_COLORS, PRIOR, PRIOR_BINS, SMOOTHING = 50, 0.02, 200, (0.25, 0.5, 0.25)
 """minimum pixels of a histogram; weight of its uniform prior, and bins that share it; smoothing kernel"""
 MIN_CERTAINTY = 0.05
 """filtered certainty below which evidence fades"""
-SURE_SHARE, HOLE_SHARE = 0.05, 0.05
-"""minimum share of sure pixels in a component; largest hole that is filled, as a share of the mask"""
+SURE_SHARE, HOLE_SHARE, MOVED_SHARE = 0.05, 0.05, 0.2
+"""minimum share of sure pixels in a component; largest hole that is filled, as a share of the mask; share of
+a component seen through at other times for which it is animal whatever it looks like"""
 
 
 class ColorHistogram:
@@ -95,13 +96,16 @@ def label(
 
 
 def remove_strays(
-    labels: UInt8[np.ndarray, "height width"], log_ratio: Float[np.ndarray, "height width"]
+    labels: UInt8[np.ndarray, "height width"],
+    log_ratio: Float[np.ndarray, "height width"],
+    seen_through: Bool[np.ndarray, "height width"],
 ) -> UInt8[np.ndarray, "height width"]:
-    """Remove components, except the largest, that look like the room: rims that seem to move."""
+    """Remove components, except the largest, that look like the room and of which little is seen through."""
     component, area = _components((labels > 0).astype(np.uint8), 8)
     if len(area) < 3:
         return labels
-    stray = np.bincount(component.ravel(), log_ratio.ravel(), len(area)) / area < 0
+    stray = np.bincount(component.ravel(), log_ratio.ravel(), len(area)) < 0
+    stray &= np.bincount(component.ravel(), seen_through.ravel(), len(area)) < MOVED_SHARE * area
     stray[[0, 1 + area[1:].argmax()]] = False
     return np.where(stray[component], 0, labels).astype(np.uint8)
 

@@ -149,7 +149,8 @@ class Segmenter:
         strict = (log_odds > sure_at) & (evidence.animal | (log_ratio > 0))
         relaxed = strict | ((log_odds > SURE) & evidence.moving)
         for sure, enough_px in ((strict, SMALL_PX), (relaxed, np.inf)):
-            labels = refine.remove_strays(refine.label(log_odds, sure, self.edges), log_ratio)
+            labels = refine.label(log_odds, sure, self.edges)
+            labels = refine.remove_strays(labels, log_ratio, evidence.seen_through)
             inside = labels == 255
             if inside.sum() >= enough_px or (
                 inside.any() and ((log_ratio > 0) | evidence.moving)[inside].mean() >= MIN_SUPPORT

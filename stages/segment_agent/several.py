@@ -234,6 +234,7 @@ def identity_evidence(evidence_of: EvidenceOf, margin_of: AppearanceOf) -> Evide
             np.where(other_animal, np.maximum(evidence.certainty, 0.5), evidence.certainty),
             evidence.animal & ~other_animal,
             evidence.moving & ~other_animal,
+            evidence.seen_through & ~other_animal,
             evidence.room | other_animal,
             np.where(other_animal, 0.0, evidence.color_log_odds),
         )

@@ -172,7 +172,7 @@ def cluster_evidence(cluster: Cluster, ground: GroundPlane, whole: bool = True) 
             uncertain = near & ~inside & (height > CLEARANCE_M)
             log_odds[uncertain], certainty[uncertain] = 0.0, UNKNOWN
         sure = window.trusted & (log_odds > 2)
-        return Evidence(log_odds, certainty, sure, sure, log_odds <= -2)
+        return Evidence(log_odds, certainty, sure, sure, sure, log_odds <= -2)
 
     return evidence_of
 
@@ -188,6 +188,6 @@ def foreground_evidence(clip: Clip, standing: EvidenceOf, size: tuple[int, int])
         inside = mask[window.rows, window.columns] > 0
         sure = standing(frame, window, sphere).animal & inside
         log_odds = np.where(inside, SURE, -SURE)
-        return Evidence(log_odds, np.ones(inside.shape), sure, sure, ~inside)
+        return Evidence(log_odds, np.ones(inside.shape), sure, sure, sure, ~inside)
 
     return evidence_of

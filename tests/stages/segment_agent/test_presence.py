@@ -11,14 +11,14 @@ import pytest
 
 from pipeline.geometry import rigid
 from pipeline.segmentation.grabcut import SURE
-from stages.segment_agent import free_space, movers, segmenter, writing
-from stages.segment_agent.config import AnimalConfig
+from stages.segment_agent import free_space, masks, movers, refine, segmenter, writing
+from stages.segment_agent.config import AnimalConfig, Config, LearningConfig
 from stages.segment_agent.evidence import Evidence
 from stages.segment_agent.free_space import DepthNoise, References
 from stages.segment_agent.movers import Candidate
 from stages.segment_agent.refine import Edges
 from stages.segment_agent.segmenter import Segmenter
-from stages.segment_agent.windows import Window
+from stages.segment_agent.windows import Sphere, Window
 from stages.segment_agent.writing import Summary
 
 INTRINSICS = np.array([[80.0, 0, 50], [0, 80.0, 40], [0, 0, 1]])
@@ -97,7 +97,7 @@ def test_presence_is_decided_by_appearance_and_motion(similarity, moved, presume
     shape = (10, 10)
     moving = np.arange(100).reshape(shape) < 100 * moved
     no = np.zeros(shape, bool)
-    evidence = Evidence(np.zeros(shape), np.ones(shape), moving, moving, no)
+    evidence = Evidence(np.zeros(shape), np.ones(shape), moving, moving, moving, no)
     instance = cast(Segmenter, SimpleNamespace())
     inside = ~no
     found = Segmenter._presence(instance, evidence, np.full(shape, similarity), inside, presumed)
@@ -134,13 +134,13 @@ def test_appearance_decides_without_geometry():
     animal = np.zeros(shape, bool)
     animal[20:40, 20:60] = True
     like = np.where(animal, 2.4, -4.0)
-    evidence = Evidence(np.zeros(shape), np.full(shape, 0.05), unknown, unknown, unknown)
+    evidence = Evidence(np.zeros(shape), np.full(shape, 0.05), unknown, unknown, unknown, unknown)
     window = cast(Window, SimpleNamespace(color=np.full((*shape, 3), 128, np.uint8)))
     instance = cast(Segmenter, SimpleNamespace(edges=Edges()))
     labels, _ = Segmenter._by_appearance(instance, window, evidence, like, SURE)
     assert ((labels == 255) & animal).sum() > 0.9 * animal.sum()
     assert not (labels == 255)[~animal].any()
-    static = Evidence(np.full(shape, -3.0), np.ones(shape), unknown, unknown, ~unknown)
+    static = Evidence(np.full(shape, -3.0), np.ones(shape), unknown, unknown, unknown, ~unknown)
     labels, _ = Segmenter._by_appearance(instance, window, static, like, SURE)
     assert not (labels == 255).any()
 
@@ -152,10 +152,42 @@ def test_specular_surfaces_are_labeled_by_appearance():
     animal[20:40, 10:40], gloss[20:40, 40:75] = True, True
     like = np.where(animal, 2.0, -3.0)
     color_change = np.where(animal | gloss, 6.0, 0.0)
-    evidence = Evidence(color_change - 2.0, np.ones(shape), animal, no, no, color_change)
+    evidence = Evidence(color_change - 2.0, np.ones(shape), animal, no, no, no, color_change)
     window = cast(Window, SimpleNamespace(color=np.full((*shape, 3), 128, np.uint8)))
     labels, _ = Segmenter._by_appearance(
         cast(Segmenter, SimpleNamespace(edges=Edges())), window, evidence, like, SURE
     )
     assert ((labels == 255) & animal).sum() > 0.8 * animal.sum()
     assert (labels == 255)[gloss].mean() < 0.1
+
+
+def test_a_part_that_the_appearance_has_not_learned_stays_if_it_is_seen_through():
+    shape = (40, 80)
+    body, head, through = (np.zeros(shape, bool) for _ in range(3))
+    body[10:30, 40:70], head[5:15, 10:20] = True, True
+    labels = np.where(body | head, np.uint8(255), np.uint8(0))
+    like = np.where(body, 2.0, -2.0)
+    assert ((refine.remove_strays(labels, like, through) == 255) == body).all(), "a rim of furniture"
+    through[5:8, 10:20] = True
+    assert (refine.remove_strays(labels, like, through) == labels).all()
+
+
+@pytest.mark.parametrize(("needed", "steps"), [(1, [10]), (4, [10, 20, 40]), (9, [10, 20, 40])])
+def test_an_undertrained_appearance_is_trained_longer_before_it_is_given_up(needed, steps, monkeypatch):
+    """Its recall suffices after ``needed`` times the steps of the settings."""
+    labels, tried = np.full((20, 20), 255, np.uint8), []
+
+    def learn(examples, options, rng, room):
+        tried.append(options.steps)
+        found = 1.0 if options.steps >= 10 * needed else -1.0
+        return SimpleNamespace(log_odds=lambda color: np.full(color.shape[:2], found))
+
+    monkeypatch.setattr(masks, "learn", learn)
+    instance = SimpleNamespace(
+        spheres=[Sphere(np.zeros(3), 1.0)] * 4,
+        working_mask=lambda frame: SimpleNamespace(labels=labels),
+        working_picture=lambda frame: np.zeros((20, 20, 3), np.uint8),
+    )
+    options = Config(learning=LearningConfig(steps=10))
+    found = masks.learn_appearance(instance, None, options, np.random.default_rng(0))
+    assert tried == steps and (found is not None) == (needed <= 4)
