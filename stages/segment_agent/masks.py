@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, assert_never
 
@@ -32,10 +33,14 @@ from stages.segment_agent.trajectory import CameraPath, estimate_trajectory
 from stages.segment_agent.turnaround import EDGES, axes_focus, find_standing, foreground_evidence
 from stages.segment_agent.windows import Sphere, project_sphere, tracked, working_size
 
+LEARNING_ROUNDS, MIN_GROWTH = 3, 1.25
+"""rounds of learning the appearance, and growth of the number of tracked frames for which there is another:
+first masks may show the animal only close by or from one side"""
 POSITIVES_PER_NEGATIVE = 3
 """ratio of training pictures with the animal to those without it"""
-MIN_RECALL = 0.6
-"""minimum recall on training pictures: an undertrained network would suppress the animal"""
+MIN_RECALL, ATTEMPTS = 0.6, 3
+"""minimum recall on training pictures, since an undertrained network would suppress the animal; attempts to
+reach it, each from other initial weights and with twice the steps"""
 GROWTH = 2.0
 """factor on the search radius of presumed spheres once the appearance is known, and of a mapped foreground"""
 STATIC_STRIDE = 3
@@ -141,14 +146,19 @@ def _session_segmenter(
         spheres, resting = find_resting(clip, poses, placed, config.height_px, rng)
         evidence_of = resting
     segmenter = with_color_histogram(Segmenter(clip, poses, spheres, evidence_of, config.height_px))
-    network = learn_appearance(segmenter, references, config, rng)
-    if network is None:
-        return segmenter
-    room = free_space.masked(references, lambda frame: occlusion_mask(segmenter, frame, network))
-    found = find_mover(clip, poses, room, config.animal, placed, appearance_of(segmenter, network))
-    spheres = with_motion_radius(found, spheres)
-    evidence_of = motion_evidence(room) if resting is None else prefer_first(resting, motion_evidence(room))
-    return Segmenter(clip, poses, spheres, evidence_of, config.height_px, network)
+    for _ in range(LEARNING_ROUNDS):
+        network = learn_appearance(segmenter, references, config, rng)
+        if network is None:
+            break
+        room = free_space.masked(references, partial(occlusion_mask, segmenter, network=network))
+        found = find_mover(clip, poses, room, config.animal, placed, appearance_of(segmenter, network))
+        found, evidence_of = with_motion_radius(found, spheres), motion_evidence(room)
+        evidence_of = evidence_of if resting is None else prefer_first(resting, evidence_of)
+        grown = tracked(found).sum() > MIN_GROWTH * tracked(segmenter.spheres).sum()
+        segmenter = Segmenter(clip, poses, found, evidence_of, config.height_px, network)
+        if not grown:
+            break
+    return segmenter
 
 
 def _recognized_segmenter(
@@ -221,12 +231,16 @@ def learn_appearance(
         for frame in empty[:: max(1, -(-len(empty) * POSITIVES_PER_NEGATIVE // len(shown)))]
     ]
     elsewhere = () if known is None else known.examples
-    network = learn([*shown, *elsewhere], config.learning, rng, room=room)
-    if network is None:
-        return None
     probes = [each for each in shown[:: max(1, len(shown) // PROBES)] if (each.labels == 255).any()]
-    recall = [(network.log_odds(each.color)[each.labels == 255] > 0).mean() for each in probes]
-    return network if recall and float(np.mean(recall)) > MIN_RECALL else None
+    for attempt in range(ATTEMPTS if probes else 0):
+        learning = replace(config.learning, steps=config.learning.steps << attempt)
+        network = learn([*shown, *elsewhere], learning, rng, room=room)
+        if network is None:
+            break
+        recall = [(network.log_odds(each.color)[each.labels == 255] > 0).mean() for each in probes]
+        if np.mean(recall) > MIN_RECALL:
+            return network
+    return None
 
 
 def _credible_log_odds(
