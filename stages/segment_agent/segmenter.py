@@ -31,6 +31,8 @@ MIN_PRESUMED_PX = 25
 PRESENCE_PRESUMED, PRESENCE_TRACKED, PRESENCE_MOVED, PRESENCE_LIMIT = -2.5, 2.0, 3.0, 4.0
 """log-odds that a mask shows the animal: base value; added if tracked rather than presumed, and if all of it
 clearly moves; limit of its mean appearance, which is added too"""
+PRESENCE_THROUGH = 2.0
+"""log-odds that are added if all of a mask is seen through in spite of drift, too"""
 ABSENT_PRESUMED, ABSENT_TRACKED, ABSENT_UNTRACKED = 0.88, 0.04, 0.99
 """probability that less than 0.1 % of the view is animal if no mask is found: at a presumed sphere (456 of
 518), on the track (0 of 22), else (183 of 183); two semi-real kitchens, six of a cat; add-one smoothing"""
@@ -129,8 +131,9 @@ class Segmenter:
     ) -> float:
         """Return the log-odds that a mask shows the animal: by appearance, motion and track."""
         similarity = float(np.clip(log_ratio[inside], -PRESENCE_LIMIT, PRESENCE_LIMIT).mean())
-        moved = float(evidence.moving[inside].mean())
-        return PRESENCE_PRESUMED + PRESENCE_TRACKED * (not presumed) + similarity + PRESENCE_MOVED * moved
+        moved, through = (float(part[inside].mean()) for part in (evidence.moving, evidence.seen_through))
+        motion = PRESENCE_MOVED * moved + PRESENCE_THROUGH * through
+        return PRESENCE_PRESUMED + PRESENCE_TRACKED * (not presumed) + similarity + motion
 
     def _by_appearance(
         self, window: Window, evidence: Evidence, log_ratio: LogOdds, sure_at: float, doubt: float = DOUBT

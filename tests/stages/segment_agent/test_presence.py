@@ -83,21 +83,23 @@ def test_tracks_that_never_move_must_be_within_reach():
 
 
 @pytest.mark.parametrize(
-    ("similarity", "moved", "presumed", "present"),
+    ("similarity", "moved", "through", "presumed", "present"),
     [
-        (3.0, 0.0, False, True),
-        (1.0, 0.9, False, True),
-        (-2.0, 0.3, False, False),
-        (-1.0, 0.5, False, False),
-        (0.5, 0.0, True, False),
+        (3.0, 0.0, 0.0, False, True),
+        (1.0, 0.9, 0.0, False, True),
+        (-2.0, 0.3, 0.0, False, False),
+        (-1.0, 0.5, 0.0, False, False),
+        (0.5, 0.0, 0.0, True, False),
+        (-1.5, 0.9, 0.9, True, True),
+        (-1.5, 0.9, 0.0, True, False),
     ],
-    ids=["rests", "walks", "mug", "rim", "guess"],
+    ids=["rests", "walks", "mug", "rim", "guess", "tail", "drift"],
 )
-def test_presence_is_decided_by_appearance_and_motion(similarity, moved, presumed, present):
+def test_presence_is_decided_by_appearance_and_motion(similarity, moved, through, presumed, present):
     shape = (10, 10)
-    moving = np.arange(100).reshape(shape) < 100 * moved
+    moving, seen_through = (np.arange(100).reshape(shape) < 100 * share for share in (moved, through))
     no = np.zeros(shape, bool)
-    evidence = Evidence(np.zeros(shape), np.ones(shape), moving, moving, moving, no)
+    evidence = Evidence(np.zeros(shape), np.ones(shape), moving, moving, seen_through, no)
     instance = cast(Segmenter, SimpleNamespace())
     inside = ~no
     found = Segmenter._presence(instance, evidence, np.full(shape, similarity), inside, presumed)
