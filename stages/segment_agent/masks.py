@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, assert_never
 
@@ -32,6 +33,9 @@ from stages.segment_agent.trajectory import CameraPath, estimate_trajectory
 from stages.segment_agent.turnaround import EDGES, axes_focus, find_standing, foreground_evidence
 from stages.segment_agent.windows import Sphere, project_sphere, tracked, working_size
 
+LEARNING_ROUNDS, MIN_GROWTH = 3, 1.25
+"""rounds of learning the appearance, and growth of the number of tracked frames for which there is another:
+first masks may show the animal only close by or from one side"""
 POSITIVES_PER_NEGATIVE = 3
 """ratio of training pictures with the animal to those without it"""
 MIN_RECALL, ATTEMPTS = 0.6, 3
@@ -142,14 +146,19 @@ def _session_segmenter(
         spheres, resting = find_resting(clip, poses, placed, config.height_px, rng)
         evidence_of = resting
     segmenter = with_color_histogram(Segmenter(clip, poses, spheres, evidence_of, config.height_px))
-    network = learn_appearance(segmenter, references, config, rng)
-    if network is None:
-        return segmenter
-    room = free_space.masked(references, lambda frame: occlusion_mask(segmenter, frame, network))
-    found = find_mover(clip, poses, room, config.animal, placed, appearance_of(segmenter, network))
-    spheres = with_motion_radius(found, spheres)
-    evidence_of = motion_evidence(room) if resting is None else prefer_first(resting, motion_evidence(room))
-    return Segmenter(clip, poses, spheres, evidence_of, config.height_px, network)
+    for _ in range(LEARNING_ROUNDS):
+        network = learn_appearance(segmenter, references, config, rng)
+        if network is None:
+            break
+        room = free_space.masked(references, partial(occlusion_mask, segmenter, network=network))
+        found = find_mover(clip, poses, room, config.animal, placed, appearance_of(segmenter, network))
+        found, evidence_of = with_motion_radius(found, spheres), motion_evidence(room)
+        evidence_of = evidence_of if resting is None else prefer_first(resting, evidence_of)
+        grown = tracked(found).sum() > MIN_GROWTH * tracked(segmenter.spheres).sum()
+        segmenter = Segmenter(clip, poses, found, evidence_of, config.height_px, network)
+        if not grown:
+            break
+    return segmenter
 
 
 def _recognized_segmenter(

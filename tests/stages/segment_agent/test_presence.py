@@ -193,3 +193,28 @@ def test_an_undertrained_appearance_is_trained_longer_before_it_is_given_up(need
     options = Config(learning=LearningConfig(steps=10))
     found = masks.learn_appearance(instance, None, options, np.random.default_rng(0))
     assert tried == steps and (found is not None) == (needed <= 4)
+
+
+@pytest.mark.parametrize(
+    ("tracked", "rounds"),
+    [([4, 4], 1), ([4, 6, 6], 2), ([4, 6, 9, 12, 15], 3)],
+    ids=["as many", "more once", "at most three"],
+)
+def test_appearance_is_learned_again_while_much_more_is_tracked(tracked, rounds, monkeypatch):
+    """Numbers of tracked frames: by motion, then by each learned appearance."""
+    found, learned = iter(tracked), []
+
+    def find_mover(clip, poses, references, animal, prompt, appearance=None):
+        return [Sphere(np.zeros(3), 1.0)] * next(found)
+
+    def learn_appearance(segmenter, *_):
+        learned.append(len(segmenter.spheres))
+        return SimpleNamespace()
+
+    monkeypatch.setattr(masks, "find_mover", find_mover)
+    monkeypatch.setattr(masks, "learn_appearance", learn_appearance)
+    monkeypatch.setattr(masks, "with_color_histogram", lambda each: each)
+    monkeypatch.setattr(free_space, "masked", lambda references, hidden: references)
+    rng = np.random.default_rng(0)
+    last = masks._session_segmenter(None, None, None, None, Config(), rng)
+    assert learned == tracked[:rounds] and len(last.spheres) == tracked[rounds]
