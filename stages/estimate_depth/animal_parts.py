@@ -21,6 +21,8 @@ JUMP_COST, MAX_M_S, SLACK_M = 10.0, 4.0, 0.3
 TYPICAL, WEAK = 0.9, 4.4
 """Quantile of a recording's log evidence that the whole animal has; cost from which on a part is not the
 animal: an 80th of it, since furniture may hide the rest."""
+LEAST_M2 = 1e-6
+"""Floor of evidence, square meters."""
 SAME_M, MIN_FRAMES = 0.3, 5
 """Contacts this close are at one place; least number of frames that a share is taken of."""
 
@@ -50,7 +52,7 @@ def follow(
     points = [
         np.array([(one.contact or none).point_world for one in group]).reshape(-1, 3) for group in parts
     ]
-    evidence = [np.log([max(each.evidence, 1e-6) for each in group]) for group in parts]
+    evidence = [np.log([max(each.evidence, LEAST_M2) for each in group]) for group in parts]
     frames = np.array([frame for frame, group in enumerate(parts) if group], int)
     if not len(frames):
         return [None] * len(parts)

@@ -110,10 +110,11 @@ def _part(mask: Bool[np.ndarray, "height width"], evidence: float, view: View, c
     """Return a part, its ``evidence`` scaled from pixels to square meters where it stands."""
     blobs, camera = _blobs(mask), (view.intrinsics, view.world_from_camera)
     contacts = [contact.find(blob, *camera, caster) for blob in blobs]
-    behind = view.depth[mask & (view.depth > 0)]
-    z_m = np.median(behind) if len(behind) else 0.0
     if contacts and contacts[0] is not None:
         z_m = rigid.apply(rigid.inverse(view.world_from_camera), contacts[0].point_world[None])[0, 2]
+    else:
+        behind = view.depth[mask & (view.depth > 0)]
+        z_m = np.median(behind) if len(behind) else 0.0
     return Part(blobs, contacts, evidence * float(z_m / view.intrinsics[0, 0]) ** 2)
 
 
