@@ -112,7 +112,7 @@ class Container(ABC):
     def numbered(self, folder: str, *suffixes: str) -> dict[int, str]:
         """Return a folder's members named by frame number, by number; only with these suffixes, if any."""
         found = {}
-        for name in sorted(name for name in self.names if name.startswith(f"{folder}/")):
+        for name in sorted(name for name in self.names if name.rpartition("/")[0] == folder):
             number, suffix = frame_number(Path(name).stem), Path(name).suffix.lower()
             if number is not None and (not suffixes or suffix in suffixes):
                 found[number] = name
@@ -154,7 +154,7 @@ class ZipContainer(Container):
                 raise _unsafe(self.where, f"{declared} members, at most {MAX_MEMBERS} are read")
             self._archive = zipfile.ZipFile(path)
         except _UNREADABLE as error:
-            raise errors.damaged(self.where, str(error)) from error
+            raise errors.unreadable(self.where, error) from error
         _refuse_unsafe(self._archive.infolist(), self.where)
         self.names = frozenset(info.filename for info in self._archive.infolist() if not info.is_dir())
 

@@ -28,6 +28,10 @@ def open_recording(path: Path) -> Recording:
     movies = sorted(
         name for name in container.names if Path(name).suffix.lower() in VIDEO_SUFFIXES and "/" not in name
     )
+    if odometry := [name for name in container.names if name.lower() == "odometry.csv"]:
+        files = "rgb.mp4, odometry.csv, camera_matrix.csv and depth/"
+        why = f"{odometry[0]} is Stray Scanner's, whose files are named {files}, in lower case"
+        raise errors.broken_metadata(container.where, why)
     if len(movies) != 1:
         raise errors.broken_metadata(container.where, f"{len(movies)} videos in the folder instead of one")
     movie = Movie(path / movies[0])

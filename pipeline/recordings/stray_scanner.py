@@ -47,6 +47,8 @@ def open_recording(path: Path) -> Recording:
     depth = container.numbered("depth")
     if not depth:
         raise errors.no_depth(container.where, "depth/ holds no numbered pictures (links are not followed)")
+    errors.refuse_numbers_from_1(depth, len(movie), "depth/", container.where)
+    errors.refuse_numbers_from_1(rows.frame.tolist(), len(movie), "odometry.csv", container.where)
     complete = depth.keys() & set(movie.complete.tolist())
     valid = np.array([int(number) in complete for number in rows.frame], bool)
     if not valid.any():

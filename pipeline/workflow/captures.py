@@ -15,7 +15,7 @@ from typing import Any
 from pipeline.core import config
 from pipeline.core.errors import InputError
 from pipeline.core.videos import PERSON, ROLES, SPLITS, Role, Split, Video
-from pipeline.recordings.formats import UNDERSTOOD, format_of
+from pipeline.recordings.formats import UNDERSTOOD, format_of, has_depth
 from pipeline.workflow import dag
 from pipeline.workflow.artifact import MANIFEST
 from pipeline.workflow.dag import Flow
@@ -85,11 +85,21 @@ def named(path: Path, flow: Flow = "recordings") -> str:
     if path.suffix == ICLOUD:
         return f"{path.name!r} (only in iCloud: download it in Finder)"
     inner = find(path, flow)
+    if flow == "recordings" and inner and len(_visible(path)) > len(inner) and not has_depth(path / inner[0]):
+        return f"{path.name!r} ({inner[0]!r} has no folder depth/ beside it; alone, it is a plain video)"
     return f"{path.name!r} (move {inner[0]!r} out of it: that is one)" if inner else repr(path.name)
 
 
 def refuse_unknown_files(folder: Path, flow: Flow = "recordings") -> None:
-    """Raise CAP-003 if `folder` has files, but no recording that the flow can start from."""
+    """Raise CAP-003 if `folder` has files, but no recording that the flow can start from, CAP-042 if it is
+    no folder or a link that leads nowhere."""
+    for part in (folder.parent, folder):
+        if part.is_file() or (part.is_symlink() and not part.exists()):
+            what = (
+                "is a file, not a folder" if part.is_file() else f"links to {part.readlink()}, which is gone"
+            )
+            remedy = "connect the disk that holds it; or remove it for the built-in capture"
+            raise InputError("CAP-042", what, str(part), remedy)
     unknown = [name for name in unknown_files(folder, flow) if not name.endswith(SIDECAR)]
     if unknown:
         named_all = ", ".join(named(folder / name, flow) for name in unknown)
@@ -176,7 +186,7 @@ def assign(
             role=roles[name],
             split=splits.get(name, "none"),
             sha256=hashes[name],
-            synchronized_with=_partner(name, said, ids, where),
+            synchronized_with=_partner(name, said, ids, roles, where),
             offset_s=said[name].offset_s or 0.0,
             animal=animals.get(name),
         )
@@ -231,6 +241,8 @@ def _splits(sessions: Sequence[str], said: Mapping[str, Remarks], where: str) ->
         if remark.split is not None and wanted[name] not in allowed:
             what = f"{name!r} cannot be in the split {remark.split!r}"
             raise InputError("CAP-041", what, where, "sessions: train or test")
+    if sessions and all(wanted[name] == "test" for name in sessions):
+        raise InputError("CAP-041", "every session is in the split 'test'", where, "leave one for training")
     tested = any(wanted[name] == "test" for name in sessions) or len(sessions) < 2
     if not tested and wanted[sessions[-1]] is None:
         wanted[sessions[-1]] = "test"
@@ -269,7 +281,9 @@ def _ids(order: Iterable[str], known: Mapping[str, str]) -> dict[str, str]:
     return ids
 
 
-def _partner(name: str, said: Mapping[str, Remarks], ids: Mapping[str, str], where: str) -> str | None:
+def _partner(
+    name: str, said: Mapping[str, Remarks], ids: Mapping[str, str], roles: Mapping[str, Role], where: str
+) -> str | None:
     partner = said[name].synchronized_with
     if partner is None:
         return None
@@ -277,4 +291,7 @@ def _partner(name: str, said: Mapping[str, Remarks], ids: Mapping[str, str], whe
     if partner not in ids or partner == name:
         what, remedy = f"{name!r} shares no clock with {partner!r}", f"recordings: {', '.join(sorted(ids))}"
         raise InputError("CAP-041", what, where, remedy)
+    if (roles[name], roles[partner]) != ("heldout", "session"):
+        what = f"{name!r} ({roles[name]}) cannot be synchronized with {partner!r} ({roles[partner]})"
+        raise InputError("CAP-041", what, where, "synchronized_with: of a held-out phone, its session")
     return ids[partner]

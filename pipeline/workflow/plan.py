@@ -21,6 +21,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from pipeline.core import videos
 from pipeline.core.errors import InputError, exit_code
 from pipeline.recordings.formats import has_depth
 from pipeline.workflow import artifact, captures, dag, jobs, recipes, sources, stamps
@@ -52,18 +53,31 @@ def read(home: Home, cache: sources.Cache) -> Plan:
         hashes = {name: sources.recording_digest(folder / name, digest_of) for name in said}
     else:
         captures.refuse_unknown_files(folder, flow)
+        _refuse_lost(folder, home.base)
         said = recipes.builtin_remarks(flow, recipe, where)
         hashes = dict.fromkeys(said)
-    videos = captures.assign(said, _known_ids(home.base), hashes, str(folder) if names else where, flow)
+    recordings = captures.assign(said, _known_ids(home.base), hashes, str(folder) if names else where, flow)
     if names and flow == "recordings":
-        without_depth = {v for v in videos if v.role in dag.AGENT and not has_depth(folder / v.file)}
-        videos = tuple(replace(video, mapped=video in without_depth) for video in videos)
-    mapped = any(video.mapped for video in videos)
+        without_depth = {v for v in recordings if v.role in dag.AGENT and not has_depth(folder / v.file)}
+        recordings = tuple(replace(video, mapped=video in without_depth) for video in recordings)
+    mapped = any(video.mapped for video in recordings)
     touched = jobs.touched_by(tables, changed, mapped) if home.variant else frozenset(dag.NODES)
     if home.tables:
         touched = frozenset(n.artifact for n in dag.FLOW if n.trials != "none")
     trials = tuple(recipes.trials(recipe.get(recipes.TABLES_STAGE, {}))) if home.tables else ()
-    return jobs.with_animals(Plan(home, videos, not names, changed, touched, flow, trials))
+    return jobs.with_animals(Plan(home, recordings, not names, changed, touched, flow, trials))
+
+
+def _refuse_lost(folder: Path, home: Home) -> None:
+    """Raise CAP-042 if `folder` is empty, but its build is of recordings, as when their disk is unmounted."""
+    try:
+        built = [video.file for video in videos.read(home.plan / "videos.json") if video.sha256]
+    except InputError:  # never planned, or damaged
+        return
+    if built:
+        what = f"is empty, but {home.folder} was built from {', '.join(built)}"
+        remedy = f"connect their disk or copy them back; or remove {home.folder} for the built-in capture"
+        raise InputError("CAP-042", what, str(folder), remedy)
 
 
 def write(plan: Plan, cache: sources.Cache, code: sources.Cache) -> None:

@@ -21,6 +21,8 @@ RATE_HZ, SIDE_PX = 10.0, 640
 """of the pictures"""
 DEPTH_SIDE_PX = 192
 """longer side of the sampled depth"""
+MIN_DEPTH_VALID = 0.2
+"""share of known depth below which a build leaves a frame out (`[extract_frames] min_depth_valid`)"""
 BLURRED = 4.0
 """absolute sharpness below which a picture is blurred"""
 
@@ -126,6 +128,10 @@ def sample(
             beyond = float((np.isfinite(raw) & (raw >= max_depth_m)).mean())
             shots.append(_shot(plan, row, frame, beyond))
     _refuse_empty(recording, shots)
+    usable = sum(float((shot.depth > 0).mean()) >= MIN_DEPTH_VALID for shot in shots)
+    if usable * len(plan.chosen) < MIN_FRAMES * len(rows):
+        why = f"{MIN_DEPTH_VALID:.0%} of the depth is known in {usable} of {len(rows)} sampled frames"
+        raise errors.no_frames(recording.where, why)
     agreement = extraction.picture_agreement_of(recording, plan, max_depth_m=max_depth_m)
     return RecordingSample(recording, plan, shots, 1 - len(shots) / len(rows), agreement, calibrated)
 

@@ -616,6 +616,30 @@ def _no_depth_anywhere(path, made):
     return path
 
 
+def _upper_case(path, made):
+    made_formats.stray(path, made)
+    (path / "rgb.mp4").rename(path / "RGB.MP4")
+    return path
+
+
+def _depth_from_1(path, made):
+    made_formats.stray(path, made)
+    for file in sorted((path / "depth").iterdir(), reverse=True):
+        file.rename(file.with_stem(f"{int(file.stem) + 1:06d}"))
+    return path
+
+
+def _odometry_from_1(path, made):
+    made_formats.stray(path, made)
+    head, *rows = (path / "odometry.csv").read_text().splitlines()
+    column = [each.strip() for each in head.split(",")].index("frame")
+    cells = [row.split(",") for row in rows]
+    for number, row in enumerate(cells, start=1):
+        row[column] = f"{number:06d}"
+    (path / "odometry.csv").write_text("\n".join([head, *map(",".join, cells)]))
+    return path
+
+
 FAULTS = {
     "CAP-001": _cut_video,
     "CAP-003": lambda path, made: path,
@@ -623,6 +647,9 @@ FAULTS = {
     "CAP-003  ": _zip_of_record3d,
     "CAP-004": _new_odometry,
     "CAP-004 ": _new_polycam,
+    "CAP-004    ": _upper_case,
+    "CAP-004     ": _depth_from_1,
+    "CAP-004      ": _odometry_from_1,
     "CAP-006": _no_depth,
     "CAP-007": _unmatched,
     "CAP-007 ": _no_depth_anywhere,
@@ -646,6 +673,14 @@ def test_unusable_recordings_are_refused_with_a_remedy(tmp_path, code):
     assert refused.value.code == code.strip()
     assert refused.value.remedy
     assert (refused.value.remedy == "rename it to .r3d") == (FAULTS[code] is _zip_of_record3d)
+
+
+def test_folders_inside_of_depth_are_left_alone(tmp_path):
+    made = walk(6)
+    path = made_formats.video_and_depth(tmp_path / "a", made)
+    other = made_formats.png(made_formats.millimeters(np.full_like(made.depth(0), 0.5)))
+    made_formats.put(path / "depth" / "raw", {f"{frame:06d}.png": other for frame in range(6)})
+    np.testing.assert_allclose(open_recording(path).read_depth(2), made.depth(2), atol=1e-3)
 
 
 @pytest.mark.parametrize(

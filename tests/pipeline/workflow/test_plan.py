@@ -287,6 +287,9 @@ def test_unknown_agents_are_refused_with_a_reason(small_checkout):
         (["new", "clean", "test", "clean"], {}, "REC-004"),
         (["plan", "toy"], {"captures/toy/session.heic": "x"}, "CAP-003"),
         (["plan", "toy"], {"captures/toy/.walkthrough.r3d.icloud": "x"}, "CAP-003"),
+        (["plan", "toy"], {"captures/toy": "a file"}, "CAP-042"),
+        (["plan", "toy"], {**FILES, "captures/toy/a.r3d.toml": "split = 'test'\n"}, "CAP-041"),
+        (["plan", "toy"], {**FILES, "captures/toy/a.r3d.toml": "synchronized_with = 'b.r3d'\n"}, "CAP-041"),
         (["plan", "toy"], {"captures/toy/walkthrough.r3d": "x", "captures/toy/a.r3d": "x"}, "CAP-040"),
     ],
 )
@@ -300,6 +303,22 @@ def test_refusals_have_no_side_effects(small_checkout, arguments, files, code):
     assert "\n  -> " in refused.stderr
     assert "Traceback" not in refused.stderr
     assert small_checkout.tree() == before
+
+
+def test_lost_recordings_do_not_become_the_built_in_capture(small_checkout):
+    small_checkout.record(*RECORDED)
+    assert small_checkout.plan().returncode == 0
+    captures, elsewhere = small_checkout.folder / "captures/toy", small_checkout.folder / "disk"
+    captures.rename(elsewhere)
+    captures.symlink_to(elsewhere)
+    assert small_checkout.plan().returncode == 0
+    elsewhere.rename(small_checkout.folder / "unplugged")
+    refused = small_checkout.plan()
+    assert refused.returncode == 2 and "CAP-042" in refused.stderr and "which is gone" in refused.stderr
+    captures.unlink()
+    captures.mkdir()
+    refused = small_checkout.plan()
+    assert refused.returncode == 2 and "is empty, but build/toy was built from" in refused.stderr
 
 
 def test_control_characters_in_names_are_escaped(small_checkout):

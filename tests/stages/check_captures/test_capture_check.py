@@ -403,12 +403,16 @@ def test_check_refuses_what_the_build_refuses(tmp_path, capsys):
         _made(3.0).write(tmp_path / f"{name}.r3d")
     movie(tmp_path / "heldout.mp4", 12)
     movie(tmp_path / "short.mp4", 3)
+    unknown, inner = _made(3.0), _made(3.0).depth
+    unknown.depth = lambda frame: np.where(np.arange(24) % 6 > 0, 0, inner(frame)).astype("<f4")
+    unknown.write(tmp_path / "far.r3d")
     (tmp_path / "turnaround_cat.r3d.toml").write_text("splt = 'test'")
     assert front.main([str(tmp_path)]) == 2
     output = capsys.readouterr().out
     for expected in (
         "heldout\n  CAP-006 ",
         "session\n  CAP-007 no usable frames: 3 pictures",
+        "session\n  CAP-007 no usable frames: 20% of the depth is known in 0 of ",
         "turnaround_cat.r3d.toml: unknown key",
     ):
         assert expected in output, output
