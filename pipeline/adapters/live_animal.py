@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from pipeline.behavior.simulator import Simulator, SimulatorState
 from pipeline.behavior.trajectories import RATE_HZ
+from pipeline.core import threads
 from pipeline.core.errors import InputError
 from pipeline.environments.config import EnvironmentConfig
 from pipeline.environments.residents import Resident
@@ -29,6 +30,7 @@ class LiveAnimal:
         self.reset(seed)
 
     @classmethod
+    @threads.single_threaded()  # forked processes hang in PyTorch's threads
     def open(
         cls, build: Path, *, home: Path | None = None, seed: int = 0, device: str = "cpu"
     ) -> "LiveAnimal":
@@ -38,6 +40,7 @@ class LiveAnimal:
         settings = {"sampling": how.sampling, "chaining": how.chaining}
         return cls(Simulator(resident.sampler, *where, resident.ego, **settings), seed)
 
+    @threads.single_threaded()
     def reset(self, seed: int) -> None:
         """Begin again at time 0."""
         self.time_s = 0.0
@@ -53,6 +56,7 @@ class LiveAnimal:
         now = self.time_s, root, np.stack(bones)
         return SimulatorState(*now, self.after.goal_world, self.after.blocked)
 
+    @threads.single_threaded()
     def advance(self, seconds: float, observer_world: Float[np.ndarray, "3"]) -> SimulatorState:
         """Advance time with the observer's eyes at a position (world, meters) and return the new pose.
 

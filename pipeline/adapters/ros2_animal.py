@@ -43,7 +43,9 @@ class AnimalNode:
     def see(self, message: Any) -> None:
         """Keep where the observer is."""
         place = message.pose.position
-        self.observer_world = ZUP_FROM_WORLD[:3, :3].T @ np.array([place.x, place.y, place.z])
+        seen = ZUP_FROM_WORLD[:3, :3].T @ np.array([place.x, place.y, place.z])
+        if np.isfinite(seen).all():  # a tracker that has lost the observer may send NaN
+            self.observer_world = seen
 
     def step(self) -> None:
         """Let 0.1 s pass and publish."""

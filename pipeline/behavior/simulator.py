@@ -7,6 +7,7 @@ simulates many animals in one batch, `Simulator` one.
 
 from collections import deque
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -27,6 +28,7 @@ from pipeline.behavior.trajectories import (
     as_companions,
     blended_frames,
 )
+from pipeline.core.errors import InputError
 from pipeline.geometry import rigid
 
 
@@ -104,7 +106,9 @@ class AnimalBatch:
             self.companions[some] = context.companions
         if self.video is not None and context.video is not None:
             self.video[some] = context.video
-        for frame in range(len(self.past)):
+        for frame, before in enumerate(self.past):
+            # frames that `step` returned stay as they were
+            self.past[frame] = PoseFrames(before.root.copy(), before.bones.copy())
             self.past[frame].root[some] = context.world_from_agent[:, frame : frame + 1]
             self.past[frame].bones[some] = bones[:, frame : frame + 1]
             self.observer[frame][some] = context.observer_world[:, frame]
@@ -129,7 +133,7 @@ class AnimalBatch:
 
         ``companions`` are the past tracks of those from outside, as many as in `begin`.
         """
-        self.observer.append(np.array(observer, float))
+        self.observer.append(_observer(observer, (len(self.played), 3)))
         self.companions = companions
         due = np.flatnonzero(self._must_replan())
         if len(due):
@@ -326,6 +330,26 @@ class AnimalBatch:
         return goals[best], paths[best], blocked.min(1)
 
 
+def checked_numbers(
+    given: Any, shape: tuple[int, ...], *, name: str, remedy: str
+) -> Float[np.ndarray, "*batch number"]:
+    """Return a new array of what a caller gave. Raises SIM-012 unless it is finite and of this shape."""
+    try:
+        numbers, received = np.array(given, float), ""
+    except (TypeError, ValueError) as error:
+        numbers, received = np.empty(0), str(error)
+    if numbers.shape != shape or not np.isfinite(numbers).all():
+        received = received or (str(numbers.tolist()) if numbers.shape == shape else f"shape {numbers.shape}")
+        what = f"{name} are no {' x '.join(map(str, shape))} finite numbers: {received}"
+        raise InputError("SIM-012", what, "step", remedy)
+    return numbers
+
+
+def _observer(given: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "*animal 3"]:
+    remedy = "give positions of eyes in the world of the build, meters"
+    return checked_numbers(given, shape, name="coordinates of an observer", remedy=remedy)
+
+
 class Simulator:
     """A gymnasium-style environment of one animal; the action is the observer's position in the world."""
 
@@ -358,7 +382,7 @@ class Simulator:
         context, _ = self.data.windows(window)
         seen = context.observer_world
         if observer is not None:
-            seen = np.tile(np.asarray(observer, float), (1, self.data.past, 1))
+            seen = np.tile(_observer(observer, (3,)), (1, self.data.past, 1))
         context = replace(context, observer_world=seen, observer_rotation=None)
         self.animals.begin(context, rng, companions=None if companions is None else companions[None])
         self.frame = 0
@@ -382,7 +406,7 @@ class Simulator:
     ) -> SimulatorState:
         """Advance by 0.1 s with the observer at this position (meters, world) and these ``companions``."""
         others = None if companions is None else companions[None]
-        now = self.animals.step(np.asarray(observer, float)[None], others)
+        now = self.animals.step(_observer(observer, (3,))[None], others)
         self.frame += 1
         return self._state(now)
 

@@ -43,6 +43,9 @@ def read_ply(path: Path) -> Mesh:
     """Read a binary triangle mesh. Raises InputError ART-020 for damaged and other files."""
     try:
         return _parse(Path(path).read_bytes())
+    except (FileNotFoundError, IsADirectoryError) as error:
+        why = f"cannot be read: {error.strerror}"
+        raise InputError("ART-020", why, str(path), "build it again") from error
     except (ValueError, IndexError, KeyError, TypeError, OverflowError) as error:
         what, remedy = f"not a binary PLY of triangles: {error}", "export it as binary little-endian PLY"
         raise InputError("ART-020", what, str(path), remedy) from error

@@ -64,8 +64,8 @@ class PersonAnimalEnv(ParallelEnv):
         """Begin at a recorded moment, the person a few meters off."""
         if seed is not None or not hasattr(self, "rng"):
             self.rng = np.random.default_rng(seed)
-        self.agents, self.frame = list(self.possible_agents), 0
         self.world.begin(1, self.rng, (options or {}).get("split", "train"))
+        self.agents, self.frame = list(self.possible_agents), 0
         known = {name: float(self.world.share_known_of(name)[0]) for name in self.world.batches}
         known[PERSON] = known[self.world.target]
         return self._observations(), {agent: {"share_known": known[agent]} for agent in self.agents}

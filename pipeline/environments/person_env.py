@@ -7,7 +7,6 @@ import gymnasium
 import numpy as np
 
 from pipeline.behavior.trajectories import RATE_HZ
-from pipeline.core import threads
 from pipeline.environments import spaces
 from pipeline.environments.rendering import PictureWindow, bird_view, known_mode
 from pipeline.environments.world import AnimalWorld
@@ -22,7 +21,6 @@ class PersonEnv(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": RATE_HZ}  # noqa: RUF012
 
-    @threads.single_threaded()  # forked processes hang in PyTorch's threads
     def __init__(self, build: str | Path | AnimalWorld, *, render_mode: str | None = None, **opening: Any):
         """Open a build (`build/<agent>`); ``opening`` is what `AnimalWorld.opened` takes."""
         self.world = AnimalWorld.opened(build, **opening)
@@ -31,17 +29,15 @@ class PersonEnv(gymnasium.Env):
         self.action_space = spaces.person_action_space(self.world)
         self.window: PictureWindow | None = None
 
-    @threads.single_threaded()
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Begin at a recorded moment, the person a few meters off."""
         super().reset(seed=seed)
-        self.frame = 0
         self.world.begin(1, self.np_random, (options or {}).get("split", "train"))
+        self.frame = 0
         self._show()
         about = "distance_m", "share_known", "home"
         return self._observation(), {name: getattr(self.world, name)[0].item() for name in about}
 
-    @threads.single_threaded()
     def step(self, action: Any):
         """Let 0.1 s pass; an action (2 or 3 numbers in -1..1) is a part of the highest speeds."""
         spaces.require_reset(self)

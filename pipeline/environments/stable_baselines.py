@@ -41,9 +41,10 @@ class PersonStableVecEnv(VecEnv):
 
     def reset(self) -> dict[str, Float[np.ndarray, "person ..."]]:
         """Begin all episodes."""
-        self.frame, self.split = np.zeros(self.num_envs, int), self._options[0].get("split", self.split)
+        split = self._options[0].get("split", self.split)
         self._reset_options()
-        self.world.begin(self.num_envs, self.rng, self.split)
+        self.world.begin(self.num_envs, self.rng, split)
+        self.frame, self.split = np.zeros(self.num_envs, int), split
         self._inform()
         return spaces.person_observation(self.world)
 

@@ -33,9 +33,10 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None):
         """Begin all episodes; one seed (of a list, its first) determines all of them."""
         super().reset(seed=seed[0] if isinstance(seed, list) else seed)
-        self.split = (options or {}).get("split", "train")
+        split = (options or {}).get("split", "train")
+        self.world.begin(self.num_envs, self.np_random, split)
+        self.split = split
         self.frame, self.ended = np.zeros(self.num_envs, int), np.zeros(self.num_envs, bool)
-        self.world.begin(self.num_envs, self.np_random, self.split)
         info = {name: getattr(self.world, name) for name in ("distance_m", "share_known", "home")}
         return spaces.person_observation(self.world), info
 
@@ -55,6 +56,7 @@ class PersonVectorEnv(gymnasium.vector.VectorEnv):
             "distance_m": self.world.distance_m,
             "reached": lived & outcome.reached,
             "flees": lived & outcome.flees,
+            "plans_per_step": np.full(self.num_envs, self.world.plans_per_step),
             "home": self.world.home,
         }
         return spaces.person_observation(self.world), reward, terminated, truncated, info

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.behavior.model import bones_from_channels
-from pipeline.behavior.simulator import AnimalBatch
+from pipeline.behavior.simulator import AnimalBatch, checked_numbers
 from pipeline.behavior.trajectories import RATE_HZ, TEST, TRAIN, Context
+from pipeline.core import devices, threads
 from pipeline.core.config import from_table
 from pipeline.core.errors import InputError
 from pipeline.environments.config import EnvironmentConfig
@@ -91,9 +92,10 @@ class AnimalWorld:
             assert not (given or config or settings), "a world that is open has its homes and settings"
             return build
         config = from_table(EnvironmentConfig, settings, where="environment", base=config)
-        return cls.load(Path(build), config, homes=given, device=device)
+        return cls.load(Path(build), config, homes=given, device=devices.choose(device))
 
     @classmethod
+    @threads.single_threaded()  # forked processes hang in PyTorch's threads
     def load(
         cls, build: Path, config: EnvironmentConfig, *, homes: Sequence[Path] = (), device: str = "cpu"
     ) -> "AnimalWorld":
@@ -113,19 +115,23 @@ class AnimalWorld:
             world.camera = RgbdCamera.load(list(bodies.values()), shown or [bodies[target]])
         return world
 
+    @threads.single_threaded()
     def begin(self, count: int, rng: np.random.Generator, split: str = "train") -> None:
         """Begin ``count`` lives; ``rng`` draws windows, starts and all plans from here on."""
+        self._windows(split)
         self.rng, self.steps = rng, 0
         self.persons = Persons(np.zeros((count, 2)), np.zeros(count), np.zeros((count, 2)))
         self.video = np.zeros(count, int)
         for name, context in self._drawn(np.arange(count), split).items():
             self.batches[name].begin(context, rng, companions=context.companions)
 
+    @threads.single_threaded()
     def restart(self, some: Int[np.ndarray, "some"], split: str = "train") -> None:
         """Begin some lives anew, by their indices."""
         for name, context in self._drawn(some, split).items():
             self.batches[name].restart(some, context)
 
+    @threads.single_threaded()
     def step(self, action: Any) -> StepOutcome:
         """Move the persons by their actions (person x command, -1..1 of the highest speeds) and let the
         animals live for 0.1 s.
@@ -239,11 +245,13 @@ class AnimalWorld:
         wish = wish / np.maximum(np.linalg.norm(wish, axis=-1, keepdims=True), 1.0)
         step = to_world(wish, persons.heading) * c.speed_m_s / RATE_HZ
         begin = persons.position.copy()
+        parts = max(2, int(np.ceil(c.speed_m_s / RATE_HZ / min(f.cell_m for f in self.floors))))
         for axes in ([1.0, 1.0], [1.0, 0.0], [0.0, 1.0]):
             stuck = (persons.position == begin).all(-1)
             target = begin + step * axes
-            # a wall of one voxel is thinner than a step
-            free = stuck & ~self._blocked(target) & ~self._blocked((begin + target) / 2)
+            free = stuck & ~self._blocked(target)
+            for share in np.arange(1, parts) / parts:  # a wall of one voxel is thinner than a step
+                free &= ~self._blocked(begin + share * (target - begin))
             persons.position[free] = target[free]
         persons.velocity = (persons.position - begin) * RATE_HZ
 
@@ -279,11 +287,16 @@ class AnimalWorld:
             for name, context in contexts.items()
         }
 
-    def _moments(self, count: int, split: str) -> Int[np.ndarray, "some"]:
-        """Draw windows; where there are several homes, each is as likely as another."""
-        windows = self.habitat.data.indices(SPLITS.get(split, -1))
+    def _windows(self, split: Any) -> Int[np.ndarray, "window"]:
+        """Return the windows of a split. Raises REC-002 where there are none."""
+        windows = self.habitat.data.indices(SPLITS.get(split, -1) if isinstance(split, str) else -1)
         if not len(windows):
             raise InputError("REC-002", f"no window of the split {split!r}", "reset", "train or test")
+        return windows
+
+    def _moments(self, count: int, split: str) -> Int[np.ndarray, "some"]:
+        """Draw windows; where there are several homes, each is as likely as another."""
+        windows = self._windows(split)
         home = self.habitat.home_of_window[windows]
         homes = np.unique(home)
         if len(homes) == 1:
@@ -294,7 +307,7 @@ class AnimalWorld:
     def _start(
         self, here: Mapping[str, Float[np.ndarray, "2"]], floor: PersonFloor
     ) -> Float[np.ndarray, "2"]:
-        """Draw a free place around the target, on no other animal; the last drawn where none is free."""
+        """Draw a free place around the target, on no other animal; if none is free, return the nearest."""
         near, far = sorted(self.config.start_m)
         animal = place = here[self.target]
         others = [(at, self.batches[name].clearance_m) for name, at in here.items() if name != self.target]
@@ -303,22 +316,15 @@ class AnimalWorld:
             place = animal + distance * np.array([np.sin(angle), np.cos(angle)])
             apart = (np.linalg.norm(place - at) >= clearance_m for at, clearance_m in others)
             if not floor.blocks(place[None])[0] and all(apart):
-                break
-        return place
+                return place
+        free = floor.corner + (np.argwhere(~floor.blocked) + 0.5) * floor.cell_m
+        return free[np.linalg.norm(free - place, axis=1).argmin()] if len(free) else place
 
 
 def checked(action: Any, shape: tuple[int, int]) -> Float[np.ndarray, "person command"]:
     """Return actions as numbers. Raises SIM-012 where they are not finite or of another shape."""
-    try:
-        numbers, received = np.asarray(action, float), ""
-    except (TypeError, ValueError) as error:
-        numbers, received = np.empty(0), str(error)
-    if numbers.shape != shape or not np.isfinite(numbers).all():
-        received = received or (str(numbers.tolist()) if numbers.shape == shape else f"shape {numbers.shape}")
-        what = f"actions are no {shape[0]} x {shape[1]} finite numbers: {received}"
-        remedy = "look for what made the policy diverge: learning rate, rewards, observations"
-        raise InputError("SIM-012", what, "step", remedy)
-    return numbers
+    remedy = "look for what made the policy diverge: learning rate, rewards, observations"
+    return checked_numbers(action, shape, name="actions", remedy=remedy)
 
 
 ANIMAL_NUMBERS = 7

@@ -170,7 +170,9 @@ def test_ros_messages_have_the_axes_of_rep_103(animal):
     )
     topics = FakeNode()
     node = AnimalNode(topics, messages, animal)
-    topics.heard["observer"](Message(pose=SimpleNamespace(position=SimpleNamespace(x=1.0, y=2.0, z=1.4))))
+    for x in (1.0, np.nan):
+        place = SimpleNamespace(x=x, y=2.0, z=1.4)
+        topics.heard["observer"](Message(pose=SimpleNamespace(position=place)))
     np.testing.assert_allclose(node.observer_world, [1.0, 1.4, -2.0])
     assert topics.period_s == pytest.approx(0.1)
     topics.tick()

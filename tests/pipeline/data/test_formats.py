@@ -101,8 +101,9 @@ def test_meshes_round_trip_and_damage_is_refused(tmp_path):
         and np.array_equal(back.color, mesh.color)
     )
     (tmp_path / "a.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-8])
-    with pytest.raises(InputError, match="ART-020"):
-        ply.read_ply(tmp_path / "a.ply")
+    for unreadable in ("a.ply", "missing.ply", "."):
+        with pytest.raises(InputError, match="ART-020"):
+            ply.read_ply(tmp_path / unreadable)
 
 
 @pytest.mark.parametrize(("kind", "full"), [("<f4", 1), ("<f8", 1), ("u1", 255), ("<u2", 65535)])

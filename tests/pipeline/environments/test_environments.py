@@ -143,15 +143,21 @@ def test_opening_a_build_leaves_the_random_state_of_the_program(build):
 
 
 FORKED = """
-import sys, gymnasium, numpy as np, torch
+import multiprocessing, sys, gymnasium, numpy as np, torch
 torch.set_num_threads(2)
 torch.ones(400_000).exp().sum()
 how = {"build": sys.argv[1], "sequence_steps": 2, "candidates": 1, "vectorization_mode": "async"}
-how |= {"num_envs": 2, "vector_kwargs": {"context": "fork"}}
-envs = gymnasium.make_vec("pipeline.environments:AgentToSim/Cat-v0", **how)
+how |= {"id": "pipeline.environments:AgentToSim/Cat-v0", "vector_kwargs": {"context": "fork"}}
+envs = gymnasium.make_vec(num_envs=2, **how)
 envs.reset(seed=0)
 envs.step(np.zeros((2, 3), np.float32))
 envs.close()
+many = gymnasium.make_vec(num_envs=2, **{name: how[name] for name in ("id", "build", "sequence_steps", "candidates")})
+many.reset(seed=0)
+child = multiprocessing.get_context("fork").Process(target=many.reset)
+child.start()
+child.join()
+assert child.exitcode == 0
 assert torch.get_num_threads() == 2, "the setting of the program"
 """
 
@@ -178,8 +184,33 @@ def test_start_distances_may_be_given_in_any_order():
 def test_an_unknown_split_is_refused():
     from pipeline.environments.person_env import PersonEnv
 
+    animals = small_world().residents
+    env, untouched = (PersonEnv(AnimalWorld(animals, QUICK)) for _ in range(2))
+    for split in ("valid", ["test"]):
+        with pytest.raises(InputError, match="REC-002"):
+            env.reset(seed=0, options={"split": split})
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            env.step(np.zeros(3))
+    for each in (env, untouched):
+        each.reset(seed=0)
     with pytest.raises(InputError, match="REC-002.*'valid'"):
-        PersonEnv(small_world()).reset(seed=0, options={"split": "valid"})
+        env.reset(options={"split": "valid"})
+    went_on = [each.step(np.ones(3))[0]["animal"] for each in (env, untouched)]
+    np.testing.assert_array_equal(*went_on)
+
+
+def test_a_person_begins_at_the_nearest_free_place_where_none_is_drawn():
+    world = small_world(replace(QUICK, start_m=(40.0, 50.0)))
+    world.begin(3, np.random.default_rng(0))
+    assert not world.floors[0].blocks(world.persons.position).any()
+
+
+def test_fast_persons_stay_in_front_of_thin_walls():
+    world = small_world(replace(QUICK, speed_m_s=12.0))
+    world.begin(30, np.random.default_rng(0))
+    for _ in range(5):
+        world.step(np.tile([1.0, 0.0, 0.1], (30, 1)))
+    assert (np.abs(world.persons.position) < 2.0).all(), "the walls begin at 2 m"
 
 
 def test_an_unknown_render_mode_is_refused():

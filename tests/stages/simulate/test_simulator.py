@@ -376,3 +376,28 @@ def test_live_view_names_missing_requirements(simulator, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(InputError, match="make extras"):
         LiveView(simulator, look(), np.zeros(3), seed=1, port=8118)
+
+
+@pytest.mark.parametrize("observer", [[np.nan, 1.0, 0.0], [0.0, 1.0], 5.0, None, "here"])
+def test_unusable_observers_are_refused_and_leave_no_trace(simulator, observer):
+    eyes = np.array([0.5, 1.4, 0.5])
+    simulator.reset(0)
+    undisturbed = [simulator.step(eyes).world_from_agent for _ in range(4)]
+    simulator.reset(0)
+    simulator.step(eyes)
+    with pytest.raises(InputError, match="SIM-012"):
+        simulator.step(observer)
+    np.testing.assert_array_equal([simulator.step(eyes).world_from_agent for _ in range(3)], undisturbed[1:])
+    if observer is not None:
+        with pytest.raises(InputError, match="SIM-012"):
+            simulator.reset(0, observer=observer)
+
+
+def test_restarted_animals_leave_the_frames_that_were_returned(simulator):
+    animals, observer = simulator.animals, np.tile([0.5, 1.4, 0.5], (1, 1))
+    simulator.reset(0)
+    kept = [animals.step(observer).root for _ in range(3)]
+    before = np.array(kept)
+    context, _ = simulator.data.windows(np.array([5]))
+    animals.restart(np.array([0]), context)
+    np.testing.assert_array_equal(kept, before)
