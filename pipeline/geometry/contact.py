@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.geometry import cameras
-from pipeline.geometry.meshes import RayCaster, area_normals
+from pipeline.geometry.meshes import Mesh, RayCaster, area_normals
 
 LOWEST_SHARE = 0.03
 """Share of a mask's lowest pixels that is ignored as shadow or soft outline."""
@@ -29,11 +29,31 @@ class Contact:
     """False if its lowest part may be outside the picture, or is seen in front of a steep surface."""
 
 
+@dataclass(frozen=True)
+class StandingSurface:
+    """The surface that animals stand on: the scene mesh, and the floor plane where it has holes."""
+
+    caster: RayCaster
+    floor_m: float
+
+    def below(self, points_world: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point"]:
+        """Return the height of the first surface below each point, or of the floor, world y."""
+        hits = self.caster.cast(points_world, np.broadcast_to([0.0, -1.0, 0.0], points_world.shape))
+        return np.where(hits.face >= 0, points_world[:, 1] - hits.distance, self.floor_m)
+
+    def floor_alone(self) -> "StandingSurface":
+        """Return the floor plane without what the map shows on it."""
+        (left, _, front), (right, _, back) = (pick(self.caster.mesh.vertices, 0) for pick in (np.min, np.max))
+        corners = [(x, self.floor_m, z) for x in (left, right) for z in (front, back)]
+        mesh = Mesh(np.array(corners, np.float32), np.array([[0, 1, 2], [2, 1, 3]], np.int32))
+        return StandingSurface(RayCaster(mesh), self.floor_m)
+
+
 def find(
     mask: Bool[np.ndarray, "height width"],
     intrinsics: Float[np.ndarray, "3 3"],
     world_from_camera: Float[np.ndarray, "4 4"],
-    caster: RayCaster,
+    standing: StandingSurface,
 ) -> Contact | None:
     """Find where the lowest pixels of a mask touch the surface; None if their ray misses it."""
     rows, columns = np.nonzero(mask)
@@ -42,14 +62,14 @@ def find(
     lowest = float(np.quantile(rows, 1 - LOWEST_SHARE))
     pixel = np.array([np.median(columns[rows >= lowest]) + 0.5, lowest + 1.0])
     ray = cameras.unproject(pixel, intrinsics) @ world_from_camera[:3, :3].T
-    hit = caster.cast(world_from_camera[:3, 3], ray[None])
-    if hit.face[0] < 0:
-        return None
-    corner = caster.mesh.vertices[caster.mesh.faces[hit.face[0]]]
-    normal = area_normals(corner)
-    level = abs(normal[1]) > LEVEL_COSINE * max(float(np.linalg.norm(normal)), 1e-12)
-    inside = rows.max() < mask.shape[0] - BORDER_PX
-    return Contact(world_from_camera[:3, 3] + ray * hit.distance[0], bool(level and inside))
+    eye, inside = world_from_camera[:3, 3], rows.max() < mask.shape[0] - BORDER_PX
+    for surface in (standing, standing.floor_alone()):
+        hit = surface.caster.cast(eye, ray[None])
+        if hit.face[0] >= 0:
+            normal = area_normals(surface.caster.mesh.vertices[surface.caster.mesh.faces[hit.face[0]]])
+            level = abs(normal[1]) > LEVEL_COSINE * max(float(np.linalg.norm(normal)), 1e-12)
+            return Contact(eye + ray * hit.distance[0], bool(level and inside))
+    return None
 
 
 def depth_of(

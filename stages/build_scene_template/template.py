@@ -21,8 +21,9 @@ from stages.build_scene_template.config import Config
 
 MIN_POINTS = 100
 """Least number of depth points with a normal, and of faces of the fused mesh."""
-UP_COSINE, FLOOR_SHARE = 0.9, 0.05
-"""Least upward normal component of level surface, and quantile of its heights that is the floor's."""
+UP_COSINE, FLOOR_SHARE, FLOOR_BAND_M = 0.9, 0.05, 0.1
+"""Least upward normal component of level surface, quantile of its heights at which the floor begins, and how
+far up from there it reaches, meters: with a noisy sensor, the lowest surface lies below the floor."""
 
 
 @dataclass(frozen=True)
@@ -130,11 +131,12 @@ def _no_surface_error(clip: Clip) -> InputError:
 
 
 def floor_height(mesh: Mesh) -> float:
-    """Return a low quantile of the heights of upward-facing surface, world y."""
-    up = mesh.vertex_normals()[:, 1] > UP_COSINE
-    if up.any():
-        return float(np.quantile(mesh.vertices[up, 1], FLOOR_SHARE))
-    return float(mesh.vertices[:, 1].min())
+    """Return the median height of the lowest upward-facing surface, world y."""
+    height = mesh.vertices[mesh.vertex_normals()[:, 1] > UP_COSINE, 1]
+    if not len(height):
+        return float(mesh.vertices[:, 1].min())
+    above = height - np.quantile(height, FLOOR_SHARE)
+    return float(np.median(height[(above >= 0) & (above < FLOOR_BAND_M)]))
 
 
 def write_model(

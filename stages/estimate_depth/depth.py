@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.core.progress import track
 from pipeline.geometry import contact, rigid, subsampling
-from pipeline.geometry.meshes import RayCaster
+from pipeline.geometry.contact import StandingSurface
 from pipeline.mapping import plane_sweep
 from pipeline.mapping.plane_sweep import SweepView
 from pipeline.segmentation.appearance import Appearance, components
@@ -75,6 +75,7 @@ def of_session(
     timestamp_s: Float[np.ndarray, "frame"],
     room: MapViews,
     walk: Sequence[ColorView],
+    standing: StandingSurface,
     length_m: float,
     depth_net: DepthNet | None,
     recognizer: Appearance | None = None,
@@ -96,7 +97,7 @@ def of_session(
             parts.append(None)
             continue
         found = [(in_front, 1.0)] if recognizer is None else found
-        parts.append([_part(mask, evidence, target.view, room.caster) for mask, evidence in found])
+        parts.append([_part(mask, evidence, target.view, standing) for mask, evidence in found])
     animal = follow([each or [] for each in parts], [each.view for each in shown], timestamp_s)
     largest = [each and each.contact for each in animal]
     carried, found = contact.between(timestamp_s, largest, MAX_CONTACT_GAP_S), []
@@ -106,10 +107,12 @@ def of_session(
     return found
 
 
-def _part(mask: Bool[np.ndarray, "height width"], evidence: float, view: View, caster: RayCaster) -> Part:
+def _part(
+    mask: Bool[np.ndarray, "height width"], evidence: float, view: View, standing: StandingSurface
+) -> Part:
     """Return a part, its ``evidence`` scaled from pixels to square meters where it stands."""
     blobs, camera = _blobs(mask), (view.intrinsics, view.world_from_camera)
-    contacts = [contact.find(blob, *camera, caster) for blob in blobs]
+    contacts = [contact.find(blob, *camera, standing) for blob in blobs]
     if contacts and contacts[0] is not None:
         z_m = rigid.apply(rigid.inverse(view.world_from_camera), contacts[0].point_world[None])[0, 2]
     else:

@@ -15,8 +15,9 @@ from pipeline.core.progress import log, track
 from pipeline.core.videos import Video, role_of_animal
 from pipeline.data import ply
 from pipeline.data.clips import Clip, Pictures
-from pipeline.data.templates import SceneCameras
+from pipeline.data.templates import SceneCameras, read_floor
 from pipeline.geometry import cameras
+from pipeline.geometry.contact import StandingSurface
 from pipeline.geometry.meshes import RayCaster
 from pipeline.mapping.sift import Keypoints
 from pipeline.segmentation.recognizer import load
@@ -77,8 +78,9 @@ def run(
         case "session":
             time_s = pictures.timestamp_s[placed]
             depth_net = None if network is None else _depth_net(network, pictures, placed, found)
+            standing = StandingSurface(caster, read_floor(inputs.scene_template))
             nets = depth_net, None if inputs.recognizer is None else load(inputs.recognizer)
-            depths = depth.of_session(shown, time_s, room, walk_views, config.length_m, *nets)
+            depths = depth.of_session(shown, time_s, room, walk_views, standing, config.length_m, *nets)
         case role:
             assert_never(role)
     chosen = [number for number, each in enumerate(depths) if each is not None]

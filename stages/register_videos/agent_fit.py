@@ -13,7 +13,8 @@ from scipy.spatial import KDTree
 
 from pipeline.data.clips import Clip
 from pipeline.geometry import cameras, contact, picture_fit, rigid, subsampling
-from pipeline.geometry.meshes import Mesh, RayCaster
+from pipeline.geometry.contact import StandingSurface
+from pipeline.geometry.meshes import Mesh
 from pipeline.geometry.picture_fit import BodyPicture, ColoredBody
 from pipeline.geometry.size import body_length_m
 
@@ -70,26 +71,6 @@ class AgentModel:
     """Height of the root above the paws."""
     body: ColoredBody | None = None
     """What pictures without measured depth are compared with."""
-
-
-@dataclass(frozen=True)
-class StandingSurface:
-    """The surface that animals stand on: the scene mesh, and the floor plane where it has holes."""
-
-    caster: RayCaster
-    floor_m: float
-
-    def below(self, points_world: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point"]:
-        """Return the height of the first surface below each point, or of the floor, world y."""
-        hits = self.caster.cast(points_world, np.broadcast_to([0.0, -1.0, 0.0], points_world.shape))
-        return np.where(hits.face >= 0, points_world[:, 1] - hits.distance, self.floor_m)
-
-    def floor_alone(self) -> "StandingSurface":
-        """Return the floor plane without what the map shows on it."""
-        (left, _, front), (right, _, back) = (pick(self.caster.mesh.vertices, 0) for pick in (np.min, np.max))
-        corners = [(x, self.floor_m, z) for x in (left, right) for z in (front, back)]
-        mesh = Mesh(np.array(corners, np.float32), np.array([[0, 1, 2], [2, 1, 3]], np.int32))
-        return StandingSurface(RayCaster(mesh), self.floor_m)
 
 
 @dataclass(frozen=True)
@@ -184,7 +165,7 @@ def _contact_depth(
 
     Without a reliable contact point, and outside the mask, the inferred depth is kept.
     """
-    ground_contact = contact.find(inside, intrinsics, world_from_camera, standing.caster)
+    ground_contact = contact.find(inside, intrinsics, world_from_camera, standing)
     if ground_contact is None or not ground_contact.certain:
         return inferred
     back_m = model.stand_m + float(np.quantile(model.points_agent[:, 1], BACK_QUANTILE))

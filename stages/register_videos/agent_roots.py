@@ -15,10 +15,11 @@ from jaxtyping import Bool, Float, Int
 from pipeline.core.progress import track
 from pipeline.data.clips import Clip, Masks
 from pipeline.geometry import picture_fit, rigid, subsampling, viterbi
+from pipeline.geometry.contact import StandingSurface
 from pipeline.geometry.meshes import Mesh
 from pipeline.localization.localizer import Localizer
 from stages.register_videos import agent_fit, headings
-from stages.register_videos.agent_fit import AgentModel, AgentObservation, StandingSurface
+from stages.register_videos.agent_fit import AgentModel, AgentObservation
 from stages.register_videos.agent_tracking import Tracker
 from stages.register_videos.config import RootConfig
 from stages.register_videos.headings import RootHypotheses

@@ -10,12 +10,12 @@ from pipeline.core.progress import log
 from pipeline.data.clips import Clip, Masks
 from pipeline.data.poses import RegisteredPoses
 from pipeline.geometry import rigid
+from pipeline.geometry.contact import StandingSurface
 from pipeline.geometry.meshes import Mesh, RayCaster
 from pipeline.localization.localizer import Localizer
 from pipeline.mapping.visual_odometry import Odometry
 from stages.register_videos import alignment, odometry
 from stages.register_videos import votes as voting
-from stages.register_videos.agent_fit import StandingSurface
 from stages.register_videos.agent_roots import Roots, find_roots
 from stages.register_videos.alignment import AlignedCameras
 from stages.register_videos.comparison import AnimalSize, compare_sizes

@@ -55,6 +55,17 @@ def test_template_is_metric_upright_and_accurate(clip, tmp_path):
     assert (tmp_path / "colmap" / "images.txt").exists()
 
 
+def test_floor_is_the_middle_of_the_lowest_noisy_surface():
+    rng, size = np.random.default_rng(0), 40
+    x, z = (each.ravel() for each in np.meshgrid(np.arange(size), np.arange(size), indexing="ij"))
+    corner = np.flatnonzero((x < size - 1) & (z < size - 1))
+    faces = np.concatenate([corner[:, None] + [0, 1, size], corner[:, None] + [1, size + 1, size]])
+    floor = np.stack([0.2 * x, rng.normal(-0.7, 0.03, len(x)), 0.2 * z], axis=1)
+    table = floor + np.array([0, 0.75, 0])
+    surface = Mesh(np.concatenate([floor, table]).astype(np.float32), np.concatenate([faces, faces + len(x)]))
+    assert abs(template.floor_height(surface) + 0.7) < 0.01
+
+
 def test_scale_of_odometry_is_robust_to_noise_and_lost_frames():
     world, rng = walk(60), np.random.default_rng(0)
     odometry = world.copy()

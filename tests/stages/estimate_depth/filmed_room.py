@@ -66,6 +66,7 @@ def write_map(folder: Path, room: Mesh, path: np.ndarray) -> None:
     """Write the `scene_template` of a room and a walk-through."""
     folder.mkdir(parents=True)
     ply.write_ply(folder / "mesh.ply", room)
+    (folder / "world.json").write_text('{"floor": 0.0}')
     intrinsics = np.repeat(INTRINSICS[None], len(path), axis=0)
     every = np.ones(len(path), bool)
     SceneCameras(np.arange(len(path)) * 0.1, path, intrinsics, every, every).write(folder)

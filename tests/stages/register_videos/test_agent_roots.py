@@ -9,6 +9,7 @@ import trimesh
 
 from pipeline.data.clips import Clip
 from pipeline.geometry import rigid
+from pipeline.geometry.contact import StandingSurface
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 from pipeline.localization.localizer import PoseHypothesis
 from stages.register_videos import agent_fit
@@ -187,7 +188,7 @@ def test_localizer_poses_are_the_roots_as_they_are(tmp_path):
     ]
     answers[2] = []
     localizer = SimpleNamespace(localize=lambda *_: answers.pop(0))
-    standing = agent_fit.StandingSurface(RayCaster(animal()), 0.0)
+    standing = StandingSurface(RayCaster(animal()), 0.0)
     config, rng = RootConfig(initialization="localizer"), np.random.default_rng(0)
     clip = Clip.open(tmp_path / "frames")
     found = roots.find_roots(clip, masks, animal(), standing, localizer, cameras, config, rng)

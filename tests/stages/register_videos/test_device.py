@@ -4,10 +4,10 @@ import numpy as np
 import trimesh
 
 from pipeline.data.clips import Clip
+from pipeline.geometry.contact import StandingSurface
 from pipeline.geometry.meshes import Mesh, RayCaster
 from pipeline.localization import localizer as localizers
 from stages.register_videos import agent_roots, registration
-from stages.register_videos.agent_fit import StandingSurface
 from stages.register_videos.config import Config, RootConfig, VoteConfig
 from tests.simulated_device import DEVICE, is_on_device, simulated_device
 from tests.stages import room_with_animal, untrained_localizer

@@ -7,9 +7,9 @@ import pytest
 import trimesh
 
 from pipeline.geometry import cameras, rigid
+from pipeline.geometry.contact import StandingSurface
 from pipeline.geometry.meshes import Mesh, RayCaster, render_view
 from stages.register_videos import agent_roots
-from stages.register_videos.agent_fit import StandingSurface
 from stages.register_videos.config import RootConfig
 from tests.stages.register_videos.test_agent_roots import animal
 
