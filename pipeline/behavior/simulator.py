@@ -28,7 +28,7 @@ from pipeline.behavior.trajectories import (
     as_companions,
     blended_frames,
 )
-from pipeline.core.errors import InputError
+from pipeline.core.arguments import checked_numbers
 from pipeline.geometry import rigid
 
 
@@ -106,8 +106,7 @@ class AnimalBatch:
             self.companions[some] = context.companions
         if self.video is not None and context.video is not None:
             self.video[some] = context.video
-        for frame, before in enumerate(self.past):
-            # frames that `step` returned stay as they were
+        for frame, before in enumerate(self.past):  # what `step` returned stays as it was
             self.past[frame] = PoseFrames(before.root.copy(), before.bones.copy())
             self.past[frame].root[some] = context.world_from_agent[:, frame : frame + 1]
             self.past[frame].bones[some] = bones[:, frame : frame + 1]
@@ -328,21 +327,6 @@ class AnimalBatch:
         nearest = np.where(blocked == blocked.min(1, keepdims=True), off, np.inf).argmin(1)
         best = np.arange(len(frame)) * count + nearest
         return goals[best], paths[best], blocked.min(1)
-
-
-def checked_numbers(
-    given: Any, shape: tuple[int, ...], *, name: str, remedy: str
-) -> Float[np.ndarray, "*batch number"]:
-    """Return a new array of what a caller gave. Raises SIM-012 unless it is finite and of this shape."""
-    try:
-        numbers, received = np.array(given, float), ""
-    except (TypeError, ValueError) as error:
-        numbers, received = np.empty(0), str(error)
-    if numbers.shape != shape or not np.isfinite(numbers).all():
-        received = received or (str(numbers.tolist()) if numbers.shape == shape else f"shape {numbers.shape}")
-        what = f"{name} are no {' x '.join(map(str, shape))} finite numbers: {received}"
-        raise InputError("SIM-012", what, "step", remedy)
-    return numbers
 
 
 def _observer(given: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "*animal 3"]:

@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from pipeline.behavior.model import bones_from_channels
-from pipeline.behavior.simulator import AnimalBatch, checked_numbers
+from pipeline.behavior.simulator import AnimalBatch
 from pipeline.behavior.trajectories import RATE_HZ, TEST, TRAIN, Context
 from pipeline.core import devices, threads
+from pipeline.core.arguments import checked_numbers
 from pipeline.core.config import from_table
 from pipeline.core.errors import InputError
 from pipeline.environments.config import EnvironmentConfig
