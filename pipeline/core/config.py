@@ -84,12 +84,15 @@ def refuse_unknown(
 
 def refuse_impossible(value: Any, default: Any, *, where: str) -> None:
     """Raise REC-002 for non-finite numbers, unexpected negative ones, and a `NEVER_ZERO` of 0."""
+    remedy = f"give a number as the default is, {default!r}"
+    for item in value if isinstance(value, list | tuple) else [value]:
+        if isinstance(item, float) and not math.isfinite(item):
+            raise InputError("REC-002", f"{shown(value)} cannot be", where, remedy)
     if not isinstance(value, int | float) or not isinstance(default, int | float):
         return
     zero_size = where.endswith(NEVER_ZERO) and value == 0
     non_negative = default > 0 or (default == 0 and isinstance(default, int))
-    if not math.isfinite(value) or (non_negative and value < 0) or (default > 0 and zero_size):
-        remedy = f"give a number as the default is, {default!r}"
+    if (non_negative and value < 0) or (default > 0 and zero_size):
         raise InputError("REC-002", f"{shown(value)} cannot be", where, remedy)
 
 

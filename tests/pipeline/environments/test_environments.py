@@ -127,6 +127,7 @@ def test_animal_can_live_in_another_home(build, tmp_path):
         {"observations": "rgbd"},
         {"episode_s": "long"},
         {"sped_m_s": 1.0},
+        {"start_m": (float("nan"), 1.0)},
     ],
 )
 def test_invalid_settings_are_refused(build, settings):
