@@ -95,9 +95,7 @@ def refuse_unknown_files(folder: Path, flow: Flow = "recordings") -> None:
     no folder or a link that leads nowhere."""
     for part in (folder.parent, folder):
         if part.is_file() or (part.is_symlink() and not part.exists()):
-            what = (
-                "is a file, not a folder" if part.is_file() else f"links to {part.readlink()}, which is gone"
-            )
+            what = "is no folder" if part.is_file() else f"links to {part.readlink()}, which is gone"
             remedy = "connect the disk that holds it; or remove it for the built-in capture"
             raise InputError("CAP-042", what, str(part), remedy)
     unknown = [name for name in unknown_files(folder, flow) if not name.endswith(SIDECAR)]
