@@ -84,11 +84,13 @@ def refuse_unknown(
 
 def refuse_impossible(value: Any, default: Any, *, where: str) -> None:
     """Raise REC-002 for non-finite numbers, unexpected negative ones, and a `NEVER_ZERO` of 0."""
+    if not isinstance(default, int | float | tuple):
+        return
     remedy = f"give a number as the default is, {default!r}"
     for item in value if isinstance(value, list | tuple) else [value]:
         if isinstance(item, float) and not math.isfinite(item):
             raise InputError("REC-002", f"{shown(value)} cannot be", where, remedy)
-    if not isinstance(value, int | float) or not isinstance(default, int | float):
+    if not isinstance(value, int | float) or isinstance(default, tuple):
         return
     zero_size = where.endswith(NEVER_ZERO) and value == 0
     non_negative = default > 0 or (default == 0 and isinstance(default, int))
