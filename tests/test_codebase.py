@@ -7,7 +7,7 @@ import pytest
 from benchmarks import codebase_counts
 
 LIMITS = {
-    "lines": 60_040,
+    "lines": 60_080,
     "lines over 110 columns": 0,
     "recipe keys": 318,
     "packages over 16 modules": 0,

@@ -1,4 +1,4 @@
-"""Minimum-cost state sequences (Viterbi 1967)."""
+"""Minimum-cost state sequences (Viterbi 1967), and how likely each state is (forward-backward algorithm)."""
 
 from collections.abc import Callable, Sequence
 
@@ -25,3 +25,17 @@ def viterbi_decode(
     for pointer in reversed(pointers):
         path.append(int(pointer[path[-1]]))
     return np.array(path[::-1])
+
+
+def marginals(
+    cost: Float[np.ndarray, "step state"], change: Callable[[int], Float[np.ndarray, "state state"]]
+) -> Float[np.ndarray, "step state"]:
+    """Return the probability of each state at each step; costs as of `viterbi_decode`, negative log odds."""
+    forward, backward = -np.array(cost, float), np.zeros(np.shape(cost))
+    for index in range(1, len(cost)):
+        forward[index] += np.logaddexp.reduce(forward[index - 1][:, None] - change(index), axis=0)
+    for index in range(len(cost) - 2, -1, -1):
+        after = backward[index + 1] - cost[index + 1]
+        backward[index] = np.logaddexp.reduce(after - change(index + 1), axis=1)
+    total = forward + backward
+    return np.exp(total - np.logaddexp.reduce(total, axis=1, keepdims=True))

@@ -57,12 +57,14 @@ class Roots:
     """Cost of the pose (`agent_fit.cost`), body lengths; NaN where not visible."""
     share: Float[np.ndarray, "frame"]
     """Visible share, 0..1 (`AgentObservation.share`)."""
+    facing: Float[np.ndarray, "frame"]
+    """Probability that the heading is right."""
 
     @staticmethod
     def unseen(frames: int) -> "Roots":
         """Return roots of a recording without a visible animal."""
         none, unknown = np.zeros(frames), np.full(frames, np.nan)
-        return Roots(np.full((frames, 4, 4), np.nan), none > 0, unknown, none)
+        return Roots(np.full((frames, 4, 4), np.nan), none > 0, unknown, none, np.ones(frames))
 
 
 def find_roots(
@@ -97,7 +99,7 @@ def find_roots(
                 for pose, _ in _localized(clip, each, localizer)[:1]:
                     poses[each.frame], share[each.frame] = pose, each.share
                     cost[each.frame] = agent_fit.cost(each, model, pose[None])[0]
-            return Roots(poses, np.isfinite(cost), cost, share)
+            return Roots(poses, np.isfinite(cost), cost, share, roots.facing)
         case _:
             assert_never(config.initialization)
     if not hypotheses:
@@ -110,7 +112,8 @@ def find_roots(
                 behind[each.frame] = _hypotheses(clip, seen, model, localizer, index, config)
         hypotheses = _standing_on(hypotheses, behind)
         surface = {each.frame: floor for each in hypotheses if each is behind.get(each.frame)}
-    path = headings.choose_hypotheses(clip.timestamp_s, hypotheses, model.length_m)
+    faced = headings.decode_headings(clip.timestamp_s, hypotheses, model.length_m)
+    path = headings.choose_hypotheses(hypotheses, faced)
     for each, chosen in track(list(zip(hypotheses, path, strict=True)), "refining the animal"):
         frame, observation = each.frame, observe(each.frame)
         assert observation is not None, frame
@@ -120,7 +123,10 @@ def find_roots(
         cost[frame] = agent_fit.cost(observation, model, pose)[0]
     poses, cost = Tracker(clip.timestamp_s, poses, cost, share, observe, model).track()
     smoothed = smooth(clip.timestamp_s, poses, cost, share, config.smooth_s, model.length_m)
-    return Roots(smoothed, np.isfinite(cost), cost, share)
+    seen = np.array([each.frame for each in hypotheses])
+    facing = faced.probability_near(rigid.yaw(smoothed[seen]))
+    facing = np.interp(np.arange(len(clip)), seen, np.nan_to_num(facing))
+    return Roots(smoothed, np.isfinite(cost), cost, share, facing)
 
 
 def _apart_m(seen: AgentObservation, other: RootHypotheses) -> float:

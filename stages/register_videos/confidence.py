@@ -146,6 +146,7 @@ def kernel_mean(
 
 
 def agent_confidence(roots: Roots) -> Float[np.ndarray, "frame"]:
-    """Score each root 0..1 by excess cost and visible share; 0 where not visible."""
+    """Score each root 0..1 by excess cost, visible share and probability of the heading; 0 where unseen."""
     worse = excess_cost(roots.cost) / COST_SCALE
-    return np.where(roots.visible, np.exp(-0.5 * worse**2) * np.minimum(roots.share / ENOUGH_SHARE, 1.0), 0.0)
+    fitted = np.exp(-0.5 * worse**2) * np.minimum(roots.share / ENOUGH_SHARE, 1.0)
+    return np.where(roots.visible, fitted * roots.facing, 0.0)

@@ -31,6 +31,9 @@ phone's speed in it."""
 ENOUGH_SHARE, MISFIT_SCALE = 0.2, 6.0
 """Visible share of full weight, and excess of the best hypothesis' cost over the median that halves the
 weight, units."""
+INDEPENDENT, NEAR_DEG = 0.5, 50.0
+"""Share of the evidence that is independent, since errors of successive frames are alike; difference from a
+heading, degrees, within which the true one is counted as found."""
 MIN_SPAN_S, MAX_SPAN_S = 0.15, 1.2
 """Range of time differences over which velocities are measured, seconds."""
 
@@ -51,22 +54,40 @@ class RootHypotheses:
     eye_world: Float[np.ndarray, "3"]
 
 
-def choose_hypotheses(
-    timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypotheses], length_m: float
-) -> list[int]:
+@dataclass(frozen=True)
+class Headings:
+    """The animal's heading over time."""
+
+    likeliest_rad: Float[np.ndarray, "observation"]
+    probability: Float[np.ndarray, "observation heading"]
+    """Of `HEADINGS` grid headings."""
+
+    def probability_near(
+        self, heading_rad: Float[np.ndarray, "observation"]
+    ) -> Float[np.ndarray, "observation"]:
+        """Return the probability that the heading is about this one."""
+        near = np.abs(rigid.wrap(_grid() - heading_rad[:, None])) < np.deg2rad(NEAR_DEG)
+        return (self.probability * near).sum(1)
+
+
+def choose_hypotheses(candidates: list[RootHypotheses], headings: Headings) -> list[int]:
     """Choose the hypothesis of least cost per frame, including its difference from the decoded heading."""
-    decoded = decode_headings(timestamp_s, candidates, length_m)
-    return [int(_heading_cost(each, angle).argmin()) for each, angle in zip(candidates, decoded, strict=True)]
+    pairs = zip(candidates, headings.likeliest_rad, strict=True)
+    return [int(_heading_cost(each, angle).argmin()) for each, angle in pairs]
+
+
+def _grid() -> Float[np.ndarray, "heading"]:
+    return 2 * np.pi * np.arange(HEADINGS) / HEADINGS - np.pi
 
 
 def decode_headings(
     timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypotheses], length_m: float
-) -> Float[np.ndarray, "observation"]:
-    """Return the most likely heading of each observation, radians, by Viterbi decoding.
+) -> Headings:
+    """Return the most likely heading of each observation, by Viterbi decoding, and how likely each is.
 
     Decodes once for an animal of ``length_m`` that walks along its template's +z and once for -z.
     """
-    grid = 2 * np.pi * np.arange(HEADINGS) / HEADINGS - np.pi
+    grid = _grid()
     (velocity, novelty), weight = motion_cues(timestamp_s, candidates), weights(candidates)
     slow, fast = length_m * np.array(WALKING)
     walks = np.clip((np.hypot(*velocity[:, [0, 2]].T) - slow) / (fast - slow), 0, 1)
@@ -80,12 +101,13 @@ def decode_headings(
         tenths = max(elapsed_s / TURN_S, 1.0)
         return np.minimum(turn / tenths, FLIP_COST / np.sqrt(tenths))
 
-    def decoded(direction: float) -> tuple[Float[np.ndarray, "observation"], float]:
+    def decoded(direction: float) -> tuple[Headings, float]:
         opposition = 1 - direction * np.cos(grid - np.arctan2(*velocity[:, [0, 2]].T)[:, None])
         unary = weight[:, None] * visual + walking[:, None] * opposition / 2
         state = viterbi.viterbi_decode(unary, turn_cost)
         turns = sum(turn_cost(index)[state[index - 1], state[index]] for index in range(1, len(state)))
-        return grid[state], float(unary[np.arange(len(state)), state].sum() + turns)
+        likely = viterbi.marginals(INDEPENDENT * unary, lambda index: INDEPENDENT * turn_cost(index))
+        return Headings(grid[state], likely), float(unary[np.arange(len(state)), state].sum() + turns)
 
     (head_first, cost), (tail_first, reversed_cost) = decoded(1.0), decoded(-1.0)
     margin = max(FLIP_COST, REVERSED_SHARE * walking.sum())

@@ -30,7 +30,8 @@ def seen(
 
 
 def chosen(sights: list[RootHypotheses]) -> list[int]:
-    return headings.choose_hypotheses(np.arange(len(sights)) * 0.1, sights, LENGTH_M)
+    faced = headings.decode_headings(np.arange(len(sights)) * 0.1, sights, LENGTH_M)
+    return headings.choose_hypotheses(sights, faced)
 
 
 def test_walking_direction_determines_the_heading():
@@ -69,7 +70,7 @@ def test_noise_does_not_flip_the_heading():
         for frame in range(60)
     ]
     assert chosen(sights) == [0] * 60
-    faced = headings.decode_headings(np.arange(60) * 0.1, sights, LENGTH_M)
+    faced = headings.decode_headings(np.arange(60) * 0.1, sights, LENGTH_M).likeliest_rad
     assert np.abs(np.rad2deg(rigid.wrap(faced - np.deg2rad(1.5 * np.arange(60))))).mean() < 15, (
         "degrees, of 20 in single frames"
     )
@@ -79,3 +80,13 @@ def test_turn_within_a_second_is_tracked():
     yaw = np.clip((np.arange(40) - 15) * 20.0, 0, 180)
     sights = [seen(frame, yaw[frame], (0, 0, 0), -2.0, eye=(2, 1, 0.1 * frame)) for frame in range(40)]
     assert chosen(sights) == [0] * 40
+
+
+def test_headings_of_equal_evidence_are_as_likely_as_each_other():
+    """Front and back of an animal at rest fit equally well, until a clear view."""
+    for advantage, least, most in ((0.0, 0.3, 0.7), (-4.0, 0.95, 1.0)):
+        sights = [seen(frame, 30.0, (0, 0, 0), advantage, eye=(2, 1, 0.1 * frame)) for frame in range(20)]
+        faced = headings.decode_headings(np.arange(20) * 0.1, sights, LENGTH_M)
+        np.testing.assert_allclose(faced.probability.sum(1), 1.0)
+        likely = faced.probability_near(np.full(20, np.deg2rad(30.0)))
+        assert (likely > least).all() and (likely <= most + 1e-9).all()
