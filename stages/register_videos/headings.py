@@ -31,9 +31,8 @@ phone's speed in it."""
 ENOUGH_SHARE, MISFIT_SCALE = 0.2, 6.0
 """Visible share of full weight, and excess of the best hypothesis' cost over the median that halves the
 weight, units."""
-INDEPENDENT, NEAR_DEG = 0.5, 50.0
-"""Share of the evidence that is independent, since errors of successive frames are alike; difference from a
-heading, degrees, within which the true one is counted as found."""
+NEAR_DEG = 50.0
+"""Difference from a heading, degrees, within which the true one counts as found."""
 MIN_SPAN_S, MAX_SPAN_S = 0.15, 1.2
 """Range of time differences over which velocities are measured, seconds."""
 
@@ -106,7 +105,7 @@ def decode_headings(
         unary = weight[:, None] * visual + walking[:, None] * opposition / 2
         state = viterbi.viterbi_decode(unary, turn_cost)
         turns = sum(turn_cost(index)[state[index - 1], state[index]] for index in range(1, len(state)))
-        likely = viterbi.marginals(INDEPENDENT * unary, lambda index: INDEPENDENT * turn_cost(index))
+        likely = viterbi.marginals(unary, turn_cost)
         return Headings(grid[state], likely), float(unary[np.arange(len(state)), state].sum() + turns)
 
     (head_first, cost), (tail_first, reversed_cost) = decoded(1.0), decoded(-1.0)
