@@ -4,6 +4,7 @@ The body is modeled as a box: a vertical face at the contact point towards the c
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -41,8 +42,9 @@ class StandingSurface:
         hits = self.caster.cast(points_world, np.broadcast_to([0.0, -1.0, 0.0], points_world.shape))
         return np.where(hits.face >= 0, points_world[:, 1] - hits.distance, self.floor_m)
 
+    @cached_property
     def floor_alone(self) -> "StandingSurface":
-        """Return the floor plane without what the map shows on it."""
+        """The floor plane without what the map shows on it."""
         (left, _, front), (right, _, back) = (pick(self.caster.mesh.vertices, 0) for pick in (np.min, np.max))
         corners = [(x, self.floor_m, z) for x in (left, right) for z in (front, back)]
         mesh = Mesh(np.array(corners, np.float32), np.array([[0, 1, 2], [2, 1, 3]], np.int32))
@@ -63,7 +65,7 @@ def find(
     pixel = np.array([np.median(columns[rows >= lowest]) + 0.5, lowest + 1.0])
     ray = cameras.unproject(pixel, intrinsics) @ world_from_camera[:3, :3].T
     eye, inside = world_from_camera[:3, 3], rows.max() < mask.shape[0] - BORDER_PX
-    for surface in (standing, standing.floor_alone()):
+    for surface in (standing, standing.floor_alone):
         hit = surface.caster.cast(eye, ray[None])
         if hit.face[0] >= 0:
             normal = area_normals(surface.caster.mesh.vertices[surface.caster.mesh.faces[hit.face[0]]])

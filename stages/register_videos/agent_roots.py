@@ -105,7 +105,7 @@ def find_roots(
     if not hypotheses:
         return roots
     if clip.mapped:
-        floor, behind = standing.floor_alone(), {}
+        floor, behind = standing.floor_alone, {}
         for index, each in enumerate(hypotheses):
             seen = observe(each.frame, floor)
             if seen is not None and _apart_m(seen, each) > NEAR * model.length_m:

@@ -15,6 +15,7 @@ from pipeline.geometry import rigid, viterbi
 
 HEADINGS = 36
 """Number of grid headings: steps of 10 degrees."""
+GRID_RAD = 2 * np.pi * np.arange(HEADINGS) / HEADINGS - np.pi
 HEADING_SIGMA_DEG, MAX_FRAME_COST = 20.0, 12.0
 """Heading difference between hypothesis and grid that costs one unit, and largest cost of one frame."""
 MOTION_WEIGHT, WALKING = 4.0, (0.417, 1)
@@ -65,7 +66,7 @@ class Headings:
         self, heading_rad: Float[np.ndarray, "observation"]
     ) -> Float[np.ndarray, "observation"]:
         """Return the probability that the heading is about this one."""
-        near = np.abs(rigid.wrap(_grid() - heading_rad[:, None])) < np.deg2rad(NEAR_DEG)
+        near = np.abs(rigid.wrap(GRID_RAD - heading_rad[:, None])) < np.deg2rad(NEAR_DEG)
         return (self.probability * near).sum(1)
 
 
@@ -75,10 +76,6 @@ def choose_hypotheses(candidates: list[RootHypotheses], headings: Headings) -> l
     return [int(_heading_cost(each, angle).argmin()) for each, angle in pairs]
 
 
-def _grid() -> Float[np.ndarray, "heading"]:
-    return 2 * np.pi * np.arange(HEADINGS) / HEADINGS - np.pi
-
-
 def decode_headings(
     timestamp_s: Float[np.ndarray, "frame"], candidates: list[RootHypotheses], length_m: float
 ) -> Headings:
@@ -86,31 +83,30 @@ def decode_headings(
 
     Decodes once for an animal of ``length_m`` that walks along its template's +z and once for -z.
     """
-    grid = _grid()
     (velocity, novelty), weight = motion_cues(timestamp_s, candidates), weights(candidates)
     slow, fast = length_m * np.array(WALKING)
     walks = np.clip((np.hypot(*velocity[:, [0, 2]].T) - slow) / (fast - slow), 0, 1)
     walking = MOTION_WEIGHT * weight * walks
-    visual = np.stack([_heading_cost(each, grid[:, None]).min(1) for each in candidates])
+    visual = np.stack([_heading_cost(each, GRID_RAD[:, None]).min(1) for each in candidates])
     visual = novelty[:, None] * np.minimum(visual - visual.min(1, keepdims=True), MAX_FRAME_COST)
-    turn = (rigid.wrap(grid[:, None] - grid[None]) / np.deg2rad(TURN_DEG)) ** 2
+    turn = (rigid.wrap(GRID_RAD[:, None] - GRID_RAD[None]) / np.deg2rad(TURN_DEG)) ** 2
 
     def turn_cost(index: int) -> Float[np.ndarray, "before after"]:
         elapsed_s = timestamp_s[candidates[index].frame] - timestamp_s[candidates[index - 1].frame]
         tenths = max(elapsed_s / TURN_S, 1.0)
         return np.minimum(turn / tenths, FLIP_COST / np.sqrt(tenths))
 
-    def decoded(direction: float) -> tuple[Headings, float]:
-        opposition = 1 - direction * np.cos(grid - np.arctan2(*velocity[:, [0, 2]].T)[:, None])
+    def decoded(direction: float) -> tuple[np.ndarray, np.ndarray, float]:
+        opposition = 1 - direction * np.cos(GRID_RAD - np.arctan2(*velocity[:, [0, 2]].T)[:, None])
         unary = weight[:, None] * visual + walking[:, None] * opposition / 2
         state = viterbi.viterbi_decode(unary, turn_cost)
         turns = sum(turn_cost(index)[state[index - 1], state[index]] for index in range(1, len(state)))
-        likely = viterbi.marginals(unary, turn_cost)
-        return Headings(grid[state], likely), float(unary[np.arange(len(state)), state].sum() + turns)
+        return unary, state, float(unary[np.arange(len(state)), state].sum() + turns)
 
-    (head_first, cost), (tail_first, reversed_cost) = decoded(1.0), decoded(-1.0)
+    (*head_first, cost), (*tail_first, reversed_cost) = decoded(1.0), decoded(-1.0)
     margin = max(FLIP_COST, REVERSED_SHARE * walking.sum())
-    return tail_first if cost - reversed_cost > margin else head_first
+    unary, state = tail_first if cost - reversed_cost > margin else head_first
+    return Headings(GRID_RAD[state], viterbi.marginals(unary, turn_cost))
 
 
 def weights(candidates: list[RootHypotheses]) -> Float[np.ndarray, "observation"]:
